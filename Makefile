@@ -1,0 +1,32 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: run test bench check clean
+
+# The paper's closed loop for ten seconds, installed first where it is not.
+run: $(READY)
+	$(BIN)/rtloop run deploy/paper.toml --duration 10
+
+test: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports
+	$(BIN)/pytest
+
+bench: $(READY)
+	$(BIN)/python -m tests.benchmarks
+
+check: $(READY)
+	$(BIN)/rtloop check deploy/paper.toml
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
+	$(BIN)/python -m rtloop.warm
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info

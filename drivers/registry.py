@@ -1,0 +1,31 @@
+"""From the name of a kind to its driver: one table, extended by the entry-point group `rtloop.drivers`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+
+from drivers.base import Driver
+
+GROUP = "rtloop.drivers"
+BUILT_IN = {
+    "sim": "drivers.sim:SimDriver",
+}
+
+
+def kinds() -> dict[str, str]:
+    """Every known kind and where it is defined; a third party cannot replace a built-in kind."""
+    found = {point.name: point.value for point in entry_points(group=GROUP)}
+    return dict(sorted({**found, **BUILT_IN}.items()))
+
+
+def driver_class(kind: str) -> type[Driver]:
+    """The class of a kind.
+
+    Raises ValueError for an unknown kind, MissingExtra (from the driver's module) for a package that is not there.
+    """
+    known = kinds()
+    if kind not in known:
+        raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(known)}")
+    module, _, name = known[kind].partition(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,101 @@
+"""Kind `sim`: the simulated rig, called inline. One period of the rig passes for every tick, however long that takes.
+
+Plant number i lies between output `dac<i>` and input `adc<i>`; the truth that no laboratory sees is observed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numba import carray
+
+from drivers.base import Channel, Driver, Facts, Pointers, Wiring
+from hil.compiled import cfunc
+from hil.options import RigOptions
+from hil.pointers import SIGNATURE, address_pointer
+from hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
+
+CONTEXT = np.dtype([("count", np.int64), ("coefficients", np.int64), ("state", np.int64)])
+OBSERVED_PER_AXIS = 2
+
+
+class SimOptions(RigOptions):
+    """The rig's own options."""
+
+
+@cfunc(SIGNATURE)
+def sim_read(context, values):
+    """Volts, age 0, then true position and hysteresis of each plant."""
+    rig = carray(context, 1, CONTEXT)[0]
+    coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
+    state = carray(address_pointer(rig.state), rig.count, STATE)
+    out = carray(values, rig.count * (1 + OBSERVED_PER_AXIS) + 1)
+    out[rig.count] = 0.0
+    for i in range(rig.count):
+        out[i] = sample(coefficients[i], state[i])
+        observed = rig.count + 1 + i * OBSERVED_PER_AXIS
+        out[observed] = state[i].true_position_um
+        out[observed + 1] = state[i].hysteresis_um
+    return 0
+
+
+@cfunc(SIGNATURE)
+def sim_write(context, values):
+    """Let one period pass with the outputs at `values`."""
+    rig = carray(context, 1, CONTEXT)[0]
+    coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
+    state = carray(address_pointer(rig.state), rig.count, STATE)
+    out = carray(values, rig.count)
+    for i in range(rig.count):
+        advance(coefficients[i], state[i], out[i])
+    return 0
+
+
+class SimDriver(Driver):
+    """The simulated rig as a driver, for any number of axes and any rate."""
+
+    kind = "sim"
+    options_model = SimOptions  # type: ignore[assignment]
+
+    def __init__(self, options: RigOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        super().__init__(options, wiring, rate_hz)  # type: ignore[arg-type]
+        self._rig = build_rig(options, self._axes_by_plant(), 1.0 / rate_hz)
+        self._context = np.zeros(1, CONTEXT)
+
+    def _axes_by_plant(self) -> list[str]:
+        """Axis at each plant. Raises ValueError for a wiring that leaves the rig."""
+        names: dict[int, str] = {}
+        for axis, (input_name, output_name) in self.wiring.items():
+            plant = next((i for i in range(len(self.wiring)) if output_name == f"dac{i}"), None)
+            if plant is None or input_name != f"adc{plant}":
+                raise ValueError(
+                    f"channels.{axis}: input {input_name!r} with output {output_name!r}; on the simulated rig plant i "
+                    f"lies between 'dac<i>' and 'adc<i>', with i from 0 to {len(self.wiring) - 1}"
+                )
+            if plant in names:
+                raise ValueError(f"channels.{axis}: {output_name!r} is taken by axis {names[plant]}")
+            names[plant] = axis
+        return [names[i] for i in sorted(names)]
+
+    @property
+    def facts(self) -> Facts:
+        """As many channel pairs as there are axes."""
+        axes = self._axes_by_plant()
+        return Facts(
+            inputs=tuple(Channel(f"adc{i}") for i in range(len(axes))),
+            outputs=tuple(Channel(f"dac{i}") for i in range(len(axes))),
+            observed=tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um")),
+            exclusive=False,
+            real=False,
+        )
+
+    def open(self) -> Pointers:
+        """Pointers to the compiled rig."""
+        coefficients, state = self._rig
+        self._context["count"] = coefficients.size
+        self._context["coefficients"], self._context["state"] = coefficients.ctypes.data, state.ctypes.data
+        return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
+
+    def close(self) -> None:
+        """Nothing to let go: the rig exists only while it is called."""

@@ -1,0 +1,76 @@
+"""Ordered loads and stores on shared memory, for compiled code.
+
+The C11 memory model as LLVM implements it: a release store publishes everything written before it, an acquire load
+sees everything published before the value that it read.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+WORD = types.uint64
+ALIGNMENT = 8
+
+
+def _element_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    fields = context.make_array(array_type)(context, builder, array)
+    return cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
+
+
+def _is_words(array: Any) -> bool:
+    return isinstance(array, types.Array) and array.dtype == WORD and array.ndim == 1
+
+
+@intrinsic
+def load_acquire(typingctx: Any, array: Any, index: Any) -> Any:
+    """Word `index` of a uint64 array, ordered before every later load and store."""
+    if not _is_words(array):
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
+        return builder.load_atomic(pointer, "acquire", ALIGNMENT)
+
+    return WORD(array, types.intp), codegen
+
+
+@intrinsic
+def store_release(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """Set word `index` of a uint64 array, ordered after every earlier load and store."""
+    if not _is_words(array):
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
+        builder.store_atomic(arguments[2], pointer, "release", ALIGNMENT)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, WORD), codegen
+
+
+@intrinsic
+def fence_acquire(typingctx: Any) -> Any:
+    """No later load or store moves before an earlier load."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.fence("acquire")
+        return context.get_dummy_value()
+
+    return types.void(), codegen
+
+
+@intrinsic
+def fence_release(typingctx: Any) -> Any:
+    """No earlier load or store moves after a later store."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.fence("release")
+        return context.get_dummy_value()
+
+    return types.void(), codegen
+
+

@@ -1,0 +1,80 @@
+"""Compilation of the numeric kernels: one set of options, one cache that cannot go stale.
+
+numba decides whether a cached function is still valid by looking at the file that defines it, and only that one: a
+loop that calls an edited law would keep running the old law. The cache therefore lives in a folder named by a
+digest of every source file of the project, of the compiler's version and of the processor.
+
+The options keep results equal in bits from one machine to the next: no `fastmath`, no contraction, IEEE division.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import stat
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding
+import numba
+from numba import config as numba_config
+
+SOURCE_ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("hil", "drivers", "rtloop")
+
+
+def source_digest() -> str:
+    """Hexadecimal digest of all sources, the compiler's version and the processor."""
+    digest = hashlib.sha256()
+    for package in PACKAGES:
+        for path in sorted((SOURCE_ROOT / package).rglob("*.py")):
+            digest.update(path.relative_to(SOURCE_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    for fact in (numba.__version__, llvmlite.__version__, platform.python_version(), cpu_identity()):
+        digest.update(fact.encode() + b"\0")
+    return digest.hexdigest()[:24]
+
+
+def cpu_identity() -> str:
+    """The processor's model and instruction set, as the compiler sees them."""
+    return llvmlite.binding.get_host_cpu_name() + " " + llvmlite.binding.get_host_cpu_features().flatten()
+
+
+def _owned_folder(path: Path) -> bool:
+    """Make `path` if needed; True when it is ours alone to write, so that nobody else's code is loaded from it."""
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = path.stat()
+    except OSError:
+        return False
+    foreign = status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return not foreign and os.access(path, os.W_OK | os.X_OK)
+
+
+def _cache_folder() -> tuple[Path, bool]:
+    """The cache's folder, and whether it survives a restart of the machine."""
+    digest = source_digest()
+    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
+    if home and _owned_folder(Path(home) / "rtloop" / digest):
+        return Path(home) / "rtloop" / digest, True
+    shared = Path(tempfile.gettempdir()) / f"rtloop-{os.getuid()}"
+    if _owned_folder(shared) and _owned_folder(shared / digest):
+        return shared / digest, False
+    return Path(tempfile.mkdtemp(prefix="rtloop-")), False
+
+
+CACHE_FOLDER, CACHE_IS_PERSISTENT = _cache_folder()
+numba_config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def jit(function: Callable[..., Any]) -> Any:
+    """Compile a kernel on first use; `.py_func` is the same kernel uncompiled."""
+    return numba.njit(cache=True, error_model="numpy")(function)
+
+
+def cfunc(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a kernel to a C function whose `.address` other compiled code may call."""
+    return numba.cfunc(signature, cache=True, error_model="numpy")

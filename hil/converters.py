@@ -1,0 +1,73 @@
+"""ADC and DAC: n bits over ±range, and the whole periods that a written value takes to arrive.
+
+    code = rint(V / LSB), half to even, −2^(n−1) <= code <= 2^(n−1) − 1,      LSB = 2·range / 2^n
+
+The highest code is one LSB below the range, as in a two's complement converter. 0 bits is an ideal converter: no
+codes, but clipped to the range all the same.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hil.compiled import jit
+
+MAX_LATENCY = 16
+
+COEFFICIENTS = [
+    ("adc_lsb_v", "f8"),
+    ("adc_lowest_v", "f8"),
+    ("adc_highest_v", "f8"),
+    ("dac_lsb_v", "f8"),
+    ("dac_lowest_v", "f8"),
+    ("dac_highest_v", "f8"),
+    ("latency_ticks", "i8"),
+]
+STATE = [("dac_v", "f8"), ("queue_v", "f8", (MAX_LATENCY,)), ("queue_head", "i8")]
+
+
+def span(range_v: float, bits: int) -> tuple[float, float, float]:
+    """LSB (0 for an ideal converter), lowest and highest value [V]."""
+    if bits == 0:
+        return 0.0, -range_v, range_v
+    lsb_v = 2.0 * range_v / 2**bits
+    return lsb_v, -range_v, (2 ** (bits - 1) - 1) * lsb_v
+
+
+@jit
+def convert(lsb_v, lowest_v, highest_v, value_v):
+    """`value_v` as the converter renders it [V]. NaN stays NaN."""
+    if lsb_v > 0.0:
+        value_v = np.rint(value_v / lsb_v) * lsb_v
+    if value_v < lowest_v:
+        return lowest_v
+    if value_v > highest_v:
+        return highest_v
+    return value_v
+
+
+@jit
+def digitise(coefficients, value_v):
+    """The ADC's reading [V] of `value_v`."""
+    return convert(coefficients.adc_lsb_v, coefficients.adc_lowest_v, coefficients.adc_highest_v, value_v)
+
+
+@jit
+def drive(coefficients, state, value_v):
+    """Write `value_v` to the DAC and return the voltage at the actuator for the period that begins [V].
+
+    NaN holds the value written before. With a latency of n the actuator gets what was written n periods ago, and
+    0 V before there was any.
+    """
+    if not math.isnan(value_v):
+        state.dac_v = convert(coefficients.dac_lsb_v, coefficients.dac_lowest_v, coefficients.dac_highest_v, value_v)
+    latency = coefficients.latency_ticks
+    if latency == 0:
+        return state.dac_v
+    head = state.queue_head
+    arrived_v = state.queue_v[head]
+    state.queue_v[head] = state.dac_v
+    state.queue_head = head + 1 if head + 1 < latency else 0
+    return arrived_v

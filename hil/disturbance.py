@@ -1,0 +1,44 @@
+"""A disturbance Ω added to the actuator's displacement, y + Ω, as eq (7) of the paper adds the residual hysteresis.
+
+    Ω(t) = step + amplitude·sin(2π·frequency·(t − start))  from `start` on, held over each period
+
+The sine is a phasor turned by a fixed angle each period, computed once: no libm in the kernel. Rounding changes its
+amplitude by about 1e-16 a turn. Whoever owns the state may also set `disturbance_um`, which is added.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hil.compiled import jit
+
+COEFFICIENTS = [
+    ("disturbance_step_um", "f8"),
+    ("disturbance_cos", "f8"),
+    ("disturbance_sin", "f8"),
+]
+STATE = [("disturbance_um", "f8"), ("disturbance_wait", "i8"), ("sine_um", "f8"), ("cosine_um", "f8")]
+
+
+def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) -> dict[str, object]:
+    """The kernel's coefficients. Raises ValueError for a sine that the periods cannot render."""
+    if sine_um and sine_hz >= 0.5 / period_s:
+        raise ValueError(f"sine_hz {sine_hz:g}: allowed is less than {0.5 / period_s:g}, half the rate")
+    angle = 2 * math.pi * sine_hz * period_s
+    return {
+        "disturbance_step_um": step_um,
+        "disturbance_cos": math.cos(angle),
+        "disturbance_sin": math.sin(angle),
+    }
+
+
+@jit
+def step(coefficients, state):
+    """Ω [µm] for the period that begins."""
+    if state.disturbance_wait > 0:
+        state.disturbance_wait -= 1
+        return state.disturbance_um
+    sine_um, cosine_um = state.sine_um, state.cosine_um
+    state.sine_um = coefficients.disturbance_cos * sine_um + coefficients.disturbance_sin * cosine_um
+    state.cosine_um = coefficients.disturbance_cos * cosine_um - coefficients.disturbance_sin * sine_um
+    return state.disturbance_um + coefficients.disturbance_step_um + sine_um

@@ -1,0 +1,62 @@
+"""Prandtl-Ishlinskii hysteresis, the forward operator: y(t) = Σ p_i F_{r_i}[u](t), eq (4) of the paper.
+
+The play operator with threshold r >= 0 is y = max(u − r, min(u + r, y₋)) (Krasnosel'skii & Pokrovskii 1989;
+Kuhnen 2003). It is written with comparisons: a NaN drive then moves no play, and no sign of zero depends on how a
+compiler orders min and max.
+
+"The paper" is Rakotondrabe, Aljanaideh & Al Janaideh, "H∞ control for a smart micro-positioning system with an
+analytical model for the output of the inverse compensation". This module must not know an inverse.
+"""
+
+from __future__ import annotations
+
+from hil.compiled import jit
+
+MAX_PLAYS = 64
+
+THRESHOLDS_V = (0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9)
+"""r_i of eq (4)."""
+
+_INNER_UM_PER_V = (0.57, 1.3, -1.57, 1.25, -0.054)
+_OUTER_UM_PER_V = (0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09)
+
+NOMINAL_WEIGHTS_UM_PER_V = (2.55, *_INNER_UM_PER_V, -0.032, *_OUTER_UM_PER_V)
+"""p_i of eq (4)."""
+
+RESIDUAL_WEIGHTS_UM_PER_V = (2.3834, *_INNER_UM_PER_V, 0.25452, *_OUTER_UM_PER_V)
+"""Eq (4) with p_0 and p_6 changed, so that an inverse computed from (4) leaves a loop of h/H = 3.75 % at 40 µm: the
+real actuator differs from its model, and the paper's problem is what that leaves."""
+
+TRUTHS = {
+    "nominal": (THRESHOLDS_V, NOMINAL_WEIGHTS_UM_PER_V),
+    "residual": (THRESHOLDS_V, RESIDUAL_WEIGHTS_UM_PER_V),
+}
+"""Thresholds [V] and weights [µm/V] of the rigs that have a name."""
+
+COEFFICIENTS = [
+    ("play_count", "i8"),
+    ("thresholds_v", "f8", (MAX_PLAYS,)),
+    ("weights_um_per_v", "f8", (MAX_PLAYS,)),
+]
+STATE = [("plays_v", "f8", (MAX_PLAYS,))]
+
+
+@jit
+def play(drive_v, threshold_v, held_v):
+    """The play operator's next output [V]: `held_v` unless the drive pushes one of the two sides of the gap."""
+    if drive_v - threshold_v > held_v:
+        return drive_v - threshold_v
+    if drive_v + threshold_v < held_v:
+        return drive_v + threshold_v
+    return held_v
+
+
+@jit
+def step(coefficients, state, drive_v):
+    """Move every play to `drive_v` and return the displacement y [µm]."""
+    displacement_um = 0.0
+    for i in range(coefficients.play_count):
+        play_v = play(drive_v, coefficients.thresholds_v[i], state.plays_v[i])
+        state.plays_v[i] = play_v
+        displacement_um += coefficients.weights_um_per_v[i] * play_v
+    return displacement_um

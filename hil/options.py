@@ -1,0 +1,158 @@
+"""What a user may say about the rig: pydantic models with units in their names, nothing unknown, nothing infinite.
+
+They hold what can be judged without computing. `hil.rig.build_rig` judges the rest: repeated poles, improper
+dynamics, names of axes.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hil.converters import MAX_LATENCY
+from hil.creep import MAX_LAGS
+from hil.hysteresis import MAX_PLAYS
+
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+Root = Annotated[tuple[float, float], Field(strict=False)]
+"""[real part, imaginary part] in rad/s."""
+Factor = Annotated[tuple[float, ...], Field(strict=False, min_length=1, max_length=3)]
+"""Coefficients of 1, s or s², the highest power first."""
+
+
+class Options(BaseModel):
+    """Base of all models of the rig."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def _only_with(self, name: str, value: str, *fields: str) -> None:
+        """Raise ValueError for a field that is set although it would be ignored."""
+        for field in fields:
+            if getattr(self, field) not in ((), None):
+                raise ValueError(f"{field} is set, but {name} is {getattr(self, name)!r}: allowed with {value!r} only")
+
+
+class HysteresisOptions(Options):
+    """Prandtl-Ishlinskii model of the actuator: one that has a name, or thresholds and weights of one's own."""
+
+    truth: Literal["residual", "nominal", "custom"] = "residual"
+    thresholds_v: Numbers = ()
+    weights_um_per_v: Numbers = ()
+    history_v: Numbers = ()
+    """Drives that the actuator went through before it came to rest at 0 V: it then starts with memory of them."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.truth != "custom":
+            self._only_with("truth", "custom", "thresholds_v", "weights_um_per_v")
+            return self
+        thresholds, weights = self.thresholds_v, self.weights_um_per_v
+        if not 1 <= len(thresholds) <= MAX_PLAYS:
+            raise ValueError(f"thresholds_v has {len(thresholds)} numbers: allowed are 1 to {MAX_PLAYS}")
+        if len(weights) != len(thresholds):
+            raise ValueError(f"weights_um_per_v has {len(weights)} numbers: allowed are {len(thresholds)}")
+        if thresholds[0] < 0 or any(b <= a for a, b in pairwise(thresholds)):
+            raise ValueError(f"thresholds_v {list(thresholds)}: allowed are numbers >= 0 that increase")
+        return self
+
+
+class DynamicsOptions(Options):
+    """Vibration x/y = D(s): eq (5) of the paper, or factors, or zeros and poles; all in rad/s."""
+
+    form: Literal["paper", "factors", "zpk"] = "paper"
+    gain: float | None = None
+    numerator: Annotated[tuple[Factor, ...], Field(strict=False)] = ()
+    denominator: Annotated[tuple[Factor, ...], Field(strict=False)] = ()
+    zeros: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    resonance_shift: float = Field(default=0.0, ge=-0.9, le=9.0)
+    """Relative shift of the resonance's frequency at constant damping ratio and D(0)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.form != "factors":
+            self._only_with("form", "factors", "numerator", "denominator")
+        if self.form != "zpk":
+            self._only_with("form", "zpk", "zeros", "poles")
+        if (self.gain is None) != (self.form == "paper"):
+            raise ValueError(
+                f"gain is {self.gain} with form {self.form!r}: allowed, and needed, with 'factors' and 'zpk'"
+            )
+        for factor in (*self.numerator, *self.denominator):
+            if factor[0] == 0:
+                raise ValueError(f"factor {list(factor)}: its first number must not be 0")
+        return self
+
+
+class CreepOptions(Options):
+    """Creep y·(1 + Σ gain/(1 + time_constant·s)); none without gains."""
+
+    gains: Numbers = ()
+    time_constants_s: Numbers = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        gains, constants = self.gains, self.time_constants_s
+        if len(gains) > MAX_LAGS or len(gains) != len(constants):
+            raise ValueError(
+                f"gains has {len(gains)} and time_constants_s {len(constants)} numbers: "
+                f"allowed are equally many, at most {MAX_LAGS}"
+            )
+        if any(constant <= 0 for constant in constants):
+            raise ValueError(f"time_constants_s {list(constants)}: allowed are numbers > 0")
+        return self
+
+
+class SensorOptions(Options):
+    """The displacement sensor."""
+
+    um_per_v: float = Field(default=10.0, gt=0)
+    offset_um: float = 0.0
+    noise_um: float = Field(default=0.010, ge=0)
+    """White noise, rms. The paper gives none: one step of resolution, so that the last digit flickers."""
+    resolution_um: float = Field(default=0.010, ge=0)
+    """The paper's sensor: 10 nm; 0 is none."""
+    bandwidth_hz: float | None = Field(default=None, gt=0)
+    """First-order lag. None by default: D(s) was identified through the sensor and contains it already."""
+
+
+class ConverterOptions(Options):
+    """An ADC or a DAC; 0 bits is an ideal one, still clipped to its range."""
+
+    range_v: float = Field(default=10.0, gt=0)
+    bits: int = Field(default=16, ge=0, le=32)
+
+
+class DisturbanceOptions(Options):
+    """Ω added to the actuator's displacement from `start_s` on: a step and a sine."""
+
+    step_um: float = 0.0
+    sine_um: float = 0.0
+    """Amplitude."""
+    sine_hz: float = Field(default=1.0, gt=0)
+    start_s: float = Field(default=0.0, ge=0, le=1e9)
+
+
+class PlantOptions(Options):
+    """One axis of the rig; the defaults are the paper's."""
+
+    hysteresis: HysteresisOptions = HysteresisOptions()
+    creep: CreepOptions = CreepOptions()
+    disturbance: DisturbanceOptions = DisturbanceOptions()
+    dynamics: DynamicsOptions = DynamicsOptions()
+    sensor: SensorOptions = SensorOptions()
+    adc: ConverterOptions = ConverterOptions()
+    dac: ConverterOptions = ConverterOptions()
+
+
+class RigOptions(Options):
+    """The rig: `plant` for every axis, but `plants.AXIS` instead where there is one."""
+
+    plant: PlantOptions = PlantOptions()
+    plants: dict[str, PlantOptions] = {}
+    seed: int = Field(default=0, ge=0)
+    """Of all noise. Each axis has a stream of its own, by its name."""
+    latency_ticks: int = Field(default=0, ge=0, le=MAX_LATENCY)
+    """Periods more than the one that a held output always takes: 0 is written in tick k, seen from k + 1."""

@@ -1,0 +1,143 @@
+"""The rig: coefficients and state of every axis as fixed records, and the two kernels that move them.
+
+    sample    at the instant of tick k: what the ADC reads
+    advance   from tick k to k + 1, the DAC at the value written in tick k
+
+One record has room for every rig that the options allow, so that the kernels compile once. The rig holds no clock
+and no thread; time is the number of calls of `advance`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from hil import converters, creep, disturbance, dynamics, hysteresis, noise, sensor
+from hil.compiled import jit
+from hil.linear import modal_sum
+from hil.options import DynamicsOptions, PlantOptions, RigOptions
+
+_STAGES = (converters, hysteresis, creep, disturbance, dynamics, sensor, noise)
+
+COEFFICIENTS = np.dtype([field for stage in _STAGES for field in stage.COEFFICIENTS], align=True)
+"""What an axis is; no kernel writes it."""
+
+STATE = np.dtype(
+    [
+        *(field for stage in _STAGES for field in stage.STATE),
+        ("hysteresis_um", "f8"),  # y: hysteresis and creep, without the disturbance, in the period that ends here
+        ("true_position_um", "f8"),  # x, as no sensor sees it
+    ],
+    align=True,
+)
+"""What an axis remembers, and the truth that it lets an observer see."""
+
+
+def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tuple[np.recarray, np.recarray]:
+    """Coefficients and state, both of shape (len(axes),), at rest at 0 V, with `history_v` as the only memory.
+
+    Raises ValueError, naming the axis and the part, for what the options' own checks cannot see.
+    """
+    if not (math.isfinite(period_s) and period_s > 0):
+        raise ValueError(f"period_s: {period_s} is not a finite number > 0")
+    if len(set(axes)) != len(axes):
+        raise ValueError(f"axes: {list(axes)} names one twice")
+    for name in options.plants:
+        if name not in axes:
+            raise ValueError(f"plants.{name}: there is no such axis; there are {', '.join(axes) or 'none'}")
+    coefficients = np.zeros(len(axes), COEFFICIENTS).view(np.recarray)
+    state = np.zeros(len(axes), STATE).view(np.recarray)
+    for i, axis in enumerate(axes):
+        plant = options.plants.get(axis, options.plant)
+        with _naming(f"axis {axis}"):
+            fields = _coefficients_of(plant, period_s)
+        for field, value in fields.items():
+            coefficients[field][i] = value
+        coefficients["latency_ticks"][i] = options.latency_ticks
+        state["noise_word"][i] = noise.seed_word(options.seed, axis)
+        state["disturbance_wait"][i] = round(plant.disturbance.start_s / period_s)
+        state["cosine_um"][i] = plant.disturbance.sine_um
+        if plant.hysteresis.history_v:
+            _rest_after(plant.hysteresis.history_v, coefficients[i], state[i])
+    return coefficients, state
+
+
+def _rest_after(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
+    """Leave the axis as the drives `history_v` and then a long rest at 0 V leave it."""
+    displacement_um = 0.0
+    for drive_v in (*history_v, 0.0):
+        displacement_um = hysteresis.step(coefficients, state, drive_v)
+    state.lags_um[:] = displacement_um
+    state.hysteresis_um = creep.step(coefficients, state, displacement_um)
+    dynamics.settle(coefficients, state, state.hysteresis_um)
+
+
+def _coefficients_of(plant: PlantOptions, period_s: float) -> dict[str, object]:
+    """Every coefficient of one axis except what all axes share. Raises ValueError, naming the part."""
+    thresholds_v, weights_um_per_v = hysteresis.TRUTHS.get(
+        plant.hysteresis.truth, (plant.hysteresis.thresholds_v, plant.hysteresis.weights_um_per_v)
+    )
+    empty = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
+    fields: dict[str, object] = {
+        "play_count": len(thresholds_v),
+        "thresholds_v": (*thresholds_v, *empty),
+        "weights_um_per_v": (*weights_um_per_v, *empty),
+        "sensor_um_per_v": plant.sensor.um_per_v,
+        "sensor_offset_um": plant.sensor.offset_um,
+        "sensor_noise_um": plant.sensor.noise_um,
+        "sensor_resolution_um": plant.sensor.resolution_um,
+    }
+    for name, converter in (("adc", plant.adc), ("dac", plant.dac)):
+        span = converters.span(converter.range_v, converter.bits)
+        fields |= dict(zip((f"{name}_lsb_v", f"{name}_lowest_v", f"{name}_highest_v"), span, strict=True))
+    fields |= creep.discretise(plant.creep.gains, plant.creep.time_constants_s, period_s)
+    with _naming("dynamics"):
+        modal = modal_sum(*zeros_poles_gain(plant.dynamics))
+        fields |= dynamics.discretise(dynamics.with_sensor(modal, plant.sensor.bandwidth_hz), period_s)
+    with _naming("disturbance"):
+        omega = plant.disturbance
+        fields |= disturbance.discretise(omega.step_um, omega.sine_um, omega.sine_hz, period_s)
+    return fields
+
+
+@contextmanager
+def _naming(culprit: str) -> Iterator[None]:
+    """A ValueError raised inside begins with whose it is."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{culprit}: {error}") from error
+
+
+def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, float]:
+    """D(s) as zeros and poles [rad/s] and gain, the resonance's shift included."""
+    if options.form == "zpk":
+        zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (options.zeros, options.poles))
+        gain = options.gain or 0.0
+    else:
+        paper = options.form == "paper"
+        zeros, above = dynamics.roots_of_factors(dynamics.PAPER_NUMERATOR if paper else options.numerator)
+        poles, below = dynamics.roots_of_factors(dynamics.PAPER_DENOMINATOR if paper else options.denominator)
+        gain = (dynamics.PAPER_GAIN if paper else options.gain or 0.0) * above / below
+    if options.resonance_shift:
+        poles, gain = dynamics.shift_resonance(zeros, poles, gain, options.resonance_shift)
+    return zeros, poles, gain
+
+
+@jit
+def sample(coefficients, state):
+    """ADC's reading [V] at this instant, once a tick (each call draws noise); also the true position into `state`."""
+    true_um, sensed_um = dynamics.observe(coefficients, state)
+    state.true_position_um = true_um
+    return converters.digitise(coefficients, sensor.read(coefficients, state, sensed_um))
+
+
+@jit
+def advance(coefficients, state, dac_v):
+    """One period with `dac_v` [V] written to the DAC at its beginning; NaN holds what was written before."""
+    actuator_v = converters.drive(coefficients, state, dac_v)
+    state.hysteresis_um = creep.step(coefficients, state, hysteresis.step(coefficients, state, actuator_v))
+    dynamics.step(coefficients, state, state.hysteresis_um + disturbance.step(coefficients, state))

@@ -1,0 +1,34 @@
+"""The displacement sensor: offset, noise, resolution, volts. Its bandwidth is one of the modes of `hil.dynamics`.
+
+    reading = resolution · rint((position + offset + noise) / resolution)        V = reading / um_per_v
+
+The paper's sensor (Keyence LC2420) has 10 nm resolution, 100 nm precision and more than 1 kHz bandwidth.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hil import noise
+from hil.compiled import jit
+
+COEFFICIENTS = [
+    ("sensor_um_per_v", "f8"),
+    ("sensor_offset_um", "f8"),
+    ("sensor_noise_um", "f8"),
+    ("sensor_resolution_um", "f8"),
+]
+STATE: list[tuple[str, str]] = []
+
+
+@jit
+def read(coefficients, state, position_um):
+    """Volts that the sensor puts out for `position_um`; draws from the axis's noise once."""
+    reading_um = position_um + coefficients.sensor_offset_um
+    if coefficients.sensor_noise_um > 0.0:
+        value, state.noise_word = noise.draw(state.noise_word)
+        reading_um += coefficients.sensor_noise_um * value
+    resolution_um = coefficients.sensor_resolution_um
+    if resolution_um > 0.0:
+        reading_um = np.rint(reading_um / resolution_um) * resolution_um
+    return reading_um / coefficients.sensor_um_per_v

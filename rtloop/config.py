@@ -1,0 +1,211 @@
+"""The configuration file: TOML, checked as a whole, every fault reported at once with its key and what is allowed.
+
+    [loop]  [driver]  [driver.channels.AXIS]  [[axis]]  [[schedule]]  [recording]
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+
+from drivers.base import Wiring
+from drivers.errors import DriverError
+from drivers.registry import driver_class
+from hil.options import Options
+from rtloop.errors import ConfigError, RtloopError
+from rtloop.law.options import AxisOptions, ReferenceOptions
+
+ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
+HIGHEST_RATE_HZ = 1e6
+
+
+class LoopOptions(Options):
+    """How the ticks follow each other."""
+
+    rate_hz: float = Field(gt=0, le=HIGHEST_RATE_HZ)
+    mode: ModeName = "closed_loop"
+    """Mode of the first tick."""
+    spin_us: float = Field(default=0.0, ge=0, le=1e6)
+    """Spin instead of sleep for the last microseconds before a deadline."""
+    priority: int = Field(default=80, ge=1, le=99)
+    cpu: int | None = Field(default=None, ge=0)
+    require_realtime: bool = False
+    """Refuse to start where SCHED_FIFO or locked memory is not granted."""
+    heartbeat_timeout_s: float = Field(default=1.0, gt=0)
+    """The loop parks by itself when its supervisor was silent for so long."""
+
+
+class ChannelOptions(Options):
+    """Wiring and scale of an axis: position in µm = (volts − offset) · um_per_v."""
+
+    input: str
+    output: str
+    um_per_v: float
+    offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.um_per_v == 0:
+            raise ValueError("um_per_v: 0; any other number is allowed")
+        return self
+
+
+class ScheduleOptions(Options):
+    """One change at a tick."""
+
+    at_tick: int = Field(ge=0)
+    axis: str | None = None
+    mode: ModeName | None = None
+    reference: ReferenceOptions | None = None
+    reset_trip: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        said = [self.mode is not None, self.reference is not None, self.reset_trip]
+        if sum(said) != 1:
+            raise ValueError(f"{sum(said)} changes; exactly one of mode, reference, reset_trip is allowed in an entry")
+        if self.axis is not None and self.reference is None:
+            raise ValueError(f"axis {self.axis!r}: allowed with a reference only; mode and trip concern all axes")
+        return self
+
+
+class RecordingOptions(Options):
+    """Where recordings go, and when a new file begins."""
+
+    folder: str = "recordings"
+    rotate_mib: float | None = Field(default=None, gt=0)
+    rotate_s: float | None = Field(default=None, gt=0)
+    min_free_mib: float = Field(default=64.0, ge=0)
+
+
+class _Sections(Options):
+    loop: LoopOptions
+    axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
+    schedule: Annotated[tuple[ScheduleOptions, ...], Field(strict=False)] = ()
+    recording: RecordingOptions = RecordingOptions()
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A configuration whose every part is valid by itself; `rtloop.prepare` judges how the parts fit."""
+
+    name: str
+    folder: Path
+    text: str
+    loop: LoopOptions
+    axes: tuple[AxisOptions, ...]
+    schedule: tuple[ScheduleOptions, ...]
+    recording: RecordingOptions
+    driver_kind: str
+    driver_options: Options
+    channels: Mapping[str, ChannelOptions]
+
+    @property
+    def wiring(self) -> dict[str, Wiring]:
+        """Channels of each axis, in the order of the axes."""
+        return {axis.name: Wiring(self.channels[axis.name].input, self.channels[axis.name].output) for axis in self.axes}
+
+
+class InputFileError(RtloopError):
+    """The file is missing or unreadable."""
+
+    exit_code = 66
+
+
+def load(path: str | Path) -> Configuration:
+    """Read and check a file. Raises InputFileError, or ConfigError with all faults."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputFileError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise InputFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
+    return parse(text, path.stem, path.parent, str(path))
+
+
+def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
+    """Check a configuration's text; relative paths in it start at `folder`. Raises ConfigError with all faults."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+    driver = raw.pop("driver", None)
+    faults: list[str] = []
+    sections = _validated(TypeAdapter(_Sections), raw, "", faults)
+    kind, options, channels = _driver(driver, faults)
+    if sections is not None:
+        faults += _cross_faults(sections, channels)
+    if faults or sections is None or options is None:
+        raise ConfigError(source, faults)
+    return Configuration(
+        name, folder, text, sections.loop, sections.axis, sections.schedule, sections.recording, kind, options, channels
+    )
+
+
+def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
+    """Kind, options and channels of the section [driver]."""
+    if not isinstance(raw, dict):
+        faults.append("driver: missing; a section [driver] with kind and channels is needed")
+        return "", None, {}
+    rest = dict(raw)
+    kind = rest.pop("kind", None)
+    channels = _validated(TypeAdapter(dict[str, ChannelOptions]), rest.pop("channels", {}), "driver.channels", faults)
+    if not isinstance(kind, str):
+        faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; the name of a driver is needed")
+        return "", None, channels or {}
+    try:
+        model = driver_class(kind).options_model
+    except (ValueError, DriverError) as error:
+        faults.append(f"driver.kind: {error}")
+        return kind, None, channels or {}
+    return kind, _validated(TypeAdapter(model), rest, "driver", faults), channels or {}
+
+
+def _validated(adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[str]) -> Any:
+    """The validated value, or None with its faults appended."""
+    try:
+        return adapter.validate_python(raw)
+    except ValidationError as error:
+        faults += [_fault(detail, prefix, raw) for detail in error.errors(include_url=False)]
+        return None
+
+
+def _fault(detail: Any, prefix: str, raw: Any) -> str:
+    """One line: key, value, what is allowed."""
+    path = [prefix] if prefix else []
+    node = raw
+    for part in detail["loc"]:
+        known = (isinstance(node, dict) and part in node) or (isinstance(node, list) and isinstance(part, int))
+        if known and isinstance(node, dict | list):
+            node = node[part]  # type: ignore[index]
+            name = node.get("name") if isinstance(part, int) and isinstance(node, dict) else None
+            path.append(str(name if isinstance(name, str) else part))
+        elif detail["type"] in ("missing", "extra_forbidden") and part == detail["loc"][-1]:
+            path.append(str(part))
+    where = ".".join(path)
+    if detail["type"] == "missing":
+        return f"{where}: missing; it is needed"
+    if detail["type"] == "extra_forbidden":
+        return f"{where}: unknown key"
+    message = detail["msg"].removeprefix("Value error, ")
+    value = detail["input"]
+    shown = f" {value!r}:" if isinstance(value, str | int | float | bool) else ""
+    return f"{where}:{shown} {message[0].lower()}{message[1:]}" if not shown else f"{where}:{shown} {message}"
+
+
+def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -> list[str]:
+    """What concerns names in more than one section."""
+    names = [axis.name for axis in sections.axis]
+    faults = [f"axis.{name}: named twice" for name in sorted(set(names)) if names.count(name) > 1]
+    faults += [f"driver.channels.{name}: missing; the axis needs input, output, um_per_v" for name in names if name not in channels]
+    faults += [f"driver.channels.{name}: there is no axis of this name" for name in channels if name not in names]
+    for entry in sections.schedule:
+        if entry.axis is not None and entry.axis not in names:
+            faults.append(f"schedule.axis: {entry.axis!r} is not an axis; there are {', '.join(names)}")
+    return faults

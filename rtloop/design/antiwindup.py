@@ -1,0 +1,102 @@
+"""How a controller's states follow an output that was not applied as computed.
+
+    v = c·x + d e        computed        x⁺ = A x + b e
+    x ← x + m (v_applied − v)            before the states step on
+
+With c·m = 1 the corrected states explain the applied output exactly: c·x + d e = v_applied. While the output is held
+by a limit, the states obey x⁺ = A(I − m c)x + …, which must be stable.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_discrete_are
+
+from hil.linear import Real
+from rtloop.design.realisation import Form, System, blocks
+
+
+def antiwindup(system: System, form: Form) -> Real:
+    """m (n,) = W cᵀ/(c W cᵀ), so that c·m = 1 and A(I − m c) is stable. Zero where c is, empty for order 0.
+
+    Proof, for the modal form: A consists of rotations scaled by |λ| ≤ 1, and W of one positive number per block, so
+    that W^½ commutes with A. In the coordinates W^-½ x, A is still A, whose norm is the largest |λ|, and I − m c
+    becomes I − q qᵀ with q = W^½ cᵀ/‖W^½ cᵀ‖: an orthogonal projection, of norm 1. The norm of the product, and with
+    it the spectral radius, is at most the largest |λ|: below 1 for a stable controller, whatever the positive weights.
+
+    The weight |β/(1 − λ)|² of a mode with input β is the square of the state's response to a constant input: slow
+    modes take up most of a correction, and the choice does not depend on how the states are scaled. For an integrator
+    it is infinite, so that it takes up all.
+
+    Where m is zero outside one set of blocks, before which c is zero and A is triangular, A(I − m c) stays triangular,
+    and the argument is needed in that set only: modes that are not stable by themselves if there are any, otherwise,
+    in a cascade, the last section. Several unstable modes get for W the error covariance of a stationary Kalman
+    filter that measures v almost without noise.
+
+    Raises ValueError where the spectral radius is not below 1.
+    """
+    correction = np.zeros(system.b.size)
+    chosen = _chosen(system, form)
+    if chosen.size == 0:
+        return correction
+    part = System(system.a[np.ix_(chosen, chosen)], system.b[chosen], system.c[chosen], system.d)
+    spread = _weights(part) @ part.c
+    if (weight := float(part.c @ spread)) > 0:
+        correction[chosen] = spread / weight
+    radius = _radius(system.a - np.outer(system.a @ correction, system.c))
+    if not radius < 1:
+        raise ValueError(
+            f"controller: while its output is limited its states have spectral radius {radius:.9g}; below 1 is needed"
+        )
+    return correction
+
+
+def steady_state_gain(system: System) -> Real:
+    """States per unit of a constant input, (I − A)⁻¹ b, (n,); 0 for an integrating state (λ = 1), which has none."""
+    resting = np.ones(system.b.size, dtype=bool)
+    for block in blocks(system.a):
+        resting[block] = block.stop - block.start == 2 or system.a[block.start, block.start] != 1.0
+    gain = np.zeros(system.b.size)
+    kept = np.eye(int(resting.sum())) - system.a[np.ix_(resting, resting)]
+    gain[resting] = np.linalg.solve(kept, system.b[resting])
+    return gain
+
+
+def _chosen(system: System, form: Form) -> npt.NDArray[np.intp]:
+    """The states that take up the correction."""
+    states = np.arange(system.b.size)
+    seen = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
+    loose = [block for block in blocks(system.a) if _radius(system.a[block, block]) >= 1]
+    if loose:
+        return np.concatenate([states[block] for block in loose])
+    if form == "modal":
+        return states if np.any(seen) else states[:0]
+    return next((states[block] for block in blocks(system.a) if np.any(seen[block])), states[:0])
+
+
+def _weights(part: System) -> Real:
+    """W, symmetric and positive."""
+    found = blocks(part.a)
+    if len(found) > 1 and any(_radius(part.a[block, block]) >= 1 for block in found):
+        return _covariance(part)
+    weights = np.empty(part.b.size)
+    for block in found:
+        away = abs(1 - np.linalg.eigvals(part.a[block, block])[0])
+        weights[block] = np.sum(part.b[block] ** 2) / away**2 if len(found) > 1 else 1.0
+        if block.stop - block.start == 2:  # a section close to a double pole is an uneven rotation
+            weights[block.start + 1] *= -part.a[block.start + 1, block.start] / part.a[block.start, block.start + 1]
+    return np.diag(np.maximum(weights, 1e-12 * weights.max()) if weights.max() > 0 else weights + 1)
+
+
+def _covariance(part: System) -> Real:
+    """W = A W Aᵀ − A W cᵀ(c W cᵀ + small)⁻¹c W Aᵀ + I. Raises ValueError where c does not see every mode."""
+    noise = 1e-9 * float(part.c @ part.c)
+    try:
+        return solve_discrete_are(part.a.T, part.c[:, None], np.eye(part.b.size), np.array([[noise]]))
+    except (np.linalg.LinAlgError, ValueError):
+        raise ValueError("controller: no anti-windup exists for its unstable modes; a stable one is needed") from None
+
+
+def _radius(a: Real) -> float:
+    return float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))

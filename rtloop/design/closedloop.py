@@ -1,0 +1,136 @@
+"""Controller and plant joined into one loop, in continuous time or sample by sample.
+
+    r ──(+)── e ──► C ──► v ──► (delay) ──► D ──┬──► x          L = C·D,   S = 1/(1 + L)
+          ▲ −                                   │
+          └─────────────────────────────────────┘
+
+The plant has no direct feedthrough, so there is no algebraic loop, and in discrete time the sample that a computed
+command needs to show in x is in the plant already: `delay_ticks` counts what comes on top.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.linear import Complex, Real
+from rtloop.design.discretise import DiscreteController, discretised
+from rtloop.design.realisation import System, beside_imaginary_axis, realise
+from rtloop.design.transfer import Transfer
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz."""
+
+    controller: System
+    plant: System
+    static_gain: float
+    roots: Complex
+    period_s: float | None = None
+
+    def open(self, hz: npt.ArrayLike) -> Complex:
+        """L at frequencies (k,) in Hz."""
+        beside_axis = 1e-12 + 1j  # an undamped root on the axis itself has no response
+        points = 2 * np.pi * beside_axis * np.atleast_1d(np.asarray(hz, dtype=float))
+        points = points if self.period_s is None else np.exp(points * self.period_s)
+        return self.controller.response(points) * self.plant.response(points)
+
+    def sensitivity(self, hz: npt.ArrayLike) -> Real:
+        """|S| at frequencies (k,) in Hz."""
+        return 1.0 / np.abs(1.0 + self.open(hz))
+
+    @cached_property
+    def matrices(self) -> tuple[Real, Real, Real, Real]:
+        """A, b, C (2, n), d (2,) from the reference to (x, v)."""
+        ac, bc, cc, dc = self.controller
+        ap, bp, cp, _ = self.plant
+        a = np.block([[ac, -np.outer(bc, cp)], [np.outer(bp, cc), ap - dc * np.outer(bp, cp)]])
+        c = np.vstack([np.concatenate([0 * cc, cp]), np.concatenate([cc, -dc * cp])])
+        return a, np.concatenate([bc, dc * bp]), c, np.array([0.0, dc])
+
+    @cached_property
+    def poles(self) -> Complex:
+        """Closed-loop poles, in s or in z."""
+        return np.linalg.eigvals(self.matrices[0]).astype(complex)
+
+    @property
+    def is_stable(self) -> bool:
+        """Every pole to the left of the imaginary axis, or inside the unit circle."""
+        inside = self.poles.real < 0 if self.period_s is None else np.abs(self.poles) < 1
+        return bool(np.all(inside))
+
+    @cached_property
+    def rates(self) -> Complex:
+        """Closed-loop poles as rates in s (rad/s): themselves, or log(z)/T."""
+        if self.period_s is None:
+            return self.poles
+        return _rates(self.poles, self.period_s)
+
+    @cached_property
+    def frequencies(self) -> Real:
+        """A grid in Hz for looking at L and S: even on a logarithmic scale, and dense where a root is near the axis."""
+        roots = np.concatenate([self.roots, self.rates])
+        sizes = np.abs(roots[roots != 0]) / (2 * math.pi)
+        lowest, highest = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
+        top = 10 * highest if self.period_s is None else 0.5 / self.period_s
+        grids = [np.geomspace(min(0.01 * lowest, 1e-3 * top), top, 1500)]
+        offsets = np.tan(np.linspace(-1.5, 1.5, 60))
+        upper = roots[roots.imag > 0]
+        widths = np.maximum(np.abs(upper.real), 1e-6 * np.abs(upper))
+        grids += [np.abs(upper.imag[:, None] + np.outer(widths, offsets)).ravel() / (2 * math.pi)]
+        hz = np.unique(np.concatenate(grids))
+        return hz[(hz > 0) & (hz <= top)]
+
+
+def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
+    """The loop of C(s) and D(s). Raises ValueError for a plant with direct feedthrough."""
+    _check(plant)
+    roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
+    return Loop(_realised(controller), _realised(plant), (controller * plant).dc_gain, roots)
+
+
+def discrete_loop(controller: DiscreteController, plant: Transfer, delay_ticks: int = 0) -> Loop:
+    """The loop as it runs: D(s) behind a zero-order hold at the controller's period, `delay_ticks` samples before it.
+
+    Raises ValueError for a plant with direct feedthrough and for a negative delay.
+    """
+    _check(plant)
+    if delay_ticks < 0:
+        raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
+    period_s = controller.period_s
+    sampled = discretised(plant, period_s, "zoh").system
+    images = np.concatenate([controller.zeros, controller.poles])
+    roots = np.concatenate([_rates(images, period_s), plant.poles])
+    return Loop(controller.system, _delayed(sampled, delay_ticks), controller.dc_gain * plant.dc_gain, roots, period_s)
+
+
+def _rates(images: Complex, period_s: float) -> Complex:
+    """log(z)/T, without what dies within a sample."""
+    return (np.log(images[np.abs(images) > 1e-9].astype(complex)) / period_s).astype(complex)
+
+
+def _realised(transfer: Transfer) -> System:
+    points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
+    return realise(transfer.zeros, transfer.poles, transfer.gain, points)[0]
+
+
+def _check(plant: Transfer) -> None:
+    if not plant.is_strictly_proper:
+        raise ValueError(
+            f"plant: {plant.zeros.size} zeros and {plant.order} poles give it direct feedthrough; "
+            "a plant with fewer zeros than poles is allowed"
+        )
+
+
+def _delayed(plant: System, ticks: int) -> System:
+    """The plant behind a chain of `ticks` samples."""
+    for _ in range(ticks):
+        n = plant.b.size
+        a = np.block([[plant.a, plant.b[:, None]], [np.zeros((1, n + 1))]])
+        plant = System(a, np.eye(n + 1)[-1], np.append(plant.c, 0.0), 0.0)
+    return plant

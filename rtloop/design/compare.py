@@ -1,0 +1,121 @@
+"""C(z) against C(s): what discretisation did to a controller, in numbers and in plain words.
+
+A controller that cancels a lightly damped resonance lives by its notch standing exactly there. Deviations of C(z) in
+phase and magnitude near half the sampling rate are unavoidable; a notch that has moved is not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from hil.linear import Complex, Real
+from rtloop.design.discretise import DiscreteController
+from rtloop.design.transfer import Transfer
+
+LIGHT_DAMPING = 0.2
+"""Damping ratio below which a pair of roots counts as a notch (zeros) or a resonance (poles)."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Where a lightly damped pair stood and where it stands: undamped natural frequencies in Hz (NaN: gone)."""
+
+    kind: Literal["notch", "resonance"]
+    frequency_hz: float
+    discrete_hz: float
+    damping: float
+
+    @property
+    def relative(self) -> float:
+        """Shift as a fraction of the frequency, positive upwards."""
+        return self.discrete_hz / self.frequency_hz - 1
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """`max_deviation` is the largest |C(z) − C(s)|/|C(s)|, at `max_deviation_hz`, over frequencies below `up_to_hz`."""
+
+    max_deviation: float
+    max_deviation_hz: float
+    up_to_hz: float
+    shifts: tuple[Shift, ...]
+    warnings: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self) | {"shifts": [asdict(s) | {"discrete_hz": _or_none(s.discrete_hz)} for s in self.shifts]}
+
+
+def compare(
+    transfer: Transfer,
+    discrete: DiscreteController,
+    up_to_hz: float | None = None,
+    largest_shift: float = 0.002,
+    largest_part_of_half_width: float = 0.5,
+) -> Comparison:
+    """Deviation below `up_to_hz` (default: half the sampling rate) and shifts of notches and resonances.
+
+    A warning for each that moves by more than `largest_shift` of its frequency, or by more than
+    `largest_part_of_half_width` of its half-width, which is damping × frequency.
+    """
+    nyquist_hz = 0.5 / discrete.period_s
+    limit_hz = min(up_to_hz or nyquist_hz, nyquist_hz)
+    hz = _frequencies(transfer, limit_hz)
+    reference = transfer.response(2j * np.pi * hz)
+    error = np.abs(discrete.response(hz) - reference)
+    deviation = np.divide(error, np.abs(reference), out=np.zeros_like(error), where=reference != 0)
+    worst = int(np.argmax(deviation))
+    shifts = _shifts("notch", transfer.zeros, discrete.zeros, discrete.period_s)
+    shifts += _shifts("resonance", transfer.poles, discrete.poles, discrete.period_s)
+    moved = [shift for shift in shifts if not _within(shift, largest_shift, largest_part_of_half_width)]
+    warnings = [_warning(shift, discrete) for shift in moved]
+    return Comparison(float(deviation[worst]), float(hz[worst]), limit_hz, tuple(shifts), warnings)
+
+
+def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
+    """A grid that does not step over a narrow notch."""
+    hz = [np.geomspace(1e-5 * limit_hz, 0.9999 * limit_hz, 1000)]
+    for root in _light_pairs(np.concatenate([transfer.zeros, transfer.poles])):
+        hz.append((abs(root) + np.linspace(-5, 5, 41) * max(-root.real, 1e-4 * abs(root))) / (2 * math.pi))
+    grid = np.unique(np.concatenate(hz))
+    return grid[(grid > 0) & (grid < limit_hz)]
+
+
+def _light_pairs(roots: Complex) -> list[complex]:
+    return [complex(root) for root in roots if root.imag > 0 and abs(root.real) < LIGHT_DAMPING * abs(root)]
+
+
+def _shifts(kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float) -> list[Shift]:
+    """Each lightly damped pair beside the nearest image, brought back to s by log(z)/T; an image serves once."""
+    back = list(np.log(images[images.imag > 0]) / period_s)
+    shifts: list[Shift] = []
+    for root in _light_pairs(roots):
+        image = min(back, key=lambda other, root=root: abs(other - root), default=complex(math.nan))
+        back = [other for other in back if other is not image]
+        hz, image_hz = abs(root) / (2 * math.pi), float(abs(image)) / (2 * math.pi)
+        shifts.append(Shift(kind, hz, image_hz if hz < 0.5 / period_s else math.nan, abs(root.real) / abs(root)))
+    return shifts
+
+
+def _within(shift: Shift, largest_shift: float, largest_part: float) -> bool:
+    allowed = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
+    return abs(shift.relative) <= allowed  # False for NaN
+
+
+def _warning(shift: Shift, discrete: DiscreteController) -> str:
+    name = f"{discrete.method} at {1 / discrete.period_s:g} Hz"
+    if math.isnan(shift.discrete_hz):
+        return f"{name} cannot keep the {shift.kind} at {shift.frequency_hz:.1f} Hz; it needs a higher sampling rate"
+    part = f", {abs(shift.relative) / shift.damping:.1f} times its half-width" if shift.damping > 1e-5 else ""
+    return (
+        f"{name} moves the {shift.kind} at {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
+        f"({100 * shift.relative:+.2f} %{part}); prewarp there, or use 'matched' or 'foh'"
+    )
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,158 @@
+"""Analysis of the loop of a controller and a plant: on paper, C(s)·D(s), and as it will run, C(z) with delay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
+from rtloop.design.discretise import DiscreteController
+from rtloop.design.margins import margins
+from rtloop.design.step import step_metrics
+from rtloop.design.transfer import Transfer
+
+TIMES_S = (0.001, 0.002, 0.003, 0.005, 0.010)
+"""When the step response is reported."""
+
+
+@dataclass(frozen=True)
+class LoopAnalysis:
+    """What there is to know about one loop. Percentages and |S| refer to the reference; NaN: undefined or unstable.
+
+    `max_re_pole` (rad/s) is NaN in discrete time, `max_abs_pole` in continuous time. `static_error_percent` is
+    100·|S(0)|. The settling time is that to ±5 % of the final value, and overshoot counts from it.
+    """
+
+    period_s: float | None
+    delay_ticks: int
+    stable: bool
+    max_re_pole: float
+    max_abs_pole: float
+    static_error_percent: float
+    crossover_hz: float
+    phase_margin_deg: float
+    gain_margin: float
+    gain_margin_hz: float
+    max_sensitivity: float
+    max_sensitivity_hz: float
+    sensitivity_1hz: float
+    settling_time_s: float
+    overshoot_percent: float
+    peak_command: float
+    step_times_s: tuple[float, ...]
+    step_position: tuple[float, ...]
+    poles: tuple[complex, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: poles as [real, imaginary], null for what is undefined or without limit."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: _plain(value) for name, value in values.items()}
+
+
+class Tolerance(NamedTuple):
+    """How far the plant's resonance may move before the loop turns unstable, in percent of its frequency."""
+
+    down_percent: float
+    up_percent: float
+
+
+def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
+    """C(s) and D(s) without sampling or delay. Raises ValueError for a plant with direct feedthrough."""
+    return _analyse(continuous_loop(controller, plant), 0, times_s)
+
+
+def analyse_discrete(
+    controller: DiscreteController, plant: Transfer, delay_ticks: int = 0, times_s: Sequence[float] = TIMES_S
+) -> LoopAnalysis:
+    """C(z) and D(s) behind a zero-order hold, at the controller's period, with `delay_ticks` samples between them.
+
+    No delay is the least there can be: a command computed from a sample shows in the next one. Raises ValueError for
+    a plant with direct feedthrough.
+    """
+    return _analyse(discrete_loop(controller, plant, delay_ticks), delay_ticks, times_s)
+
+
+def resonance_shift_tolerated(
+    controller: Transfer | DiscreteController, plant: Transfer, delay_ticks: int = 0, largest_percent: float = 50.0
+) -> Tolerance:
+    """By how much the plant's most lightly damped pair of poles may move, at constant damping ratio and static gain.
+
+    In continuous time for a Transfer, as it runs for a DiscreteController. (0, 0) if the loop is unstable as it
+    stands; `largest_percent` where no limit is met before it. The instability nearest to the nominal plant counts.
+    """
+
+    def stable(percent: float) -> bool:
+        shifted = with_resonance_shifted(plant, percent)
+        if isinstance(controller, Transfer):
+            return continuous_loop(controller, shifted).is_stable
+        return discrete_loop(controller, shifted, delay_ticks).is_stable
+
+    if not stable(0.0):
+        return Tolerance(0.0, 0.0)
+    return Tolerance(_reach(lambda p: stable(-p), largest_percent), _reach(stable, largest_percent))
+
+
+def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
+    """The plant with its most lightly damped pole pair's frequency changed, damping ratio and static gain kept.
+
+    Raises ValueError for a plant without complex poles.
+    """
+    upper = np.flatnonzero(plant.poles.imag > 0)
+    if not upper.size:
+        raise ValueError("plant: it has no complex poles; at least one resonance is needed")
+    pair = plant.poles[upper]
+    lightest = pair[np.argmin(-pair.real / np.abs(pair))]
+    moved = (plant.poles == lightest) | (plant.poles == np.conj(lightest))
+    factor = 1 + percent / 100
+    gain = plant.gain * factor ** int(moved.sum())
+    return Transfer(plant.zeros, np.where(moved, factor * plant.poles, plant.poles), gain)
+
+
+def _analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float]) -> LoopAnalysis:
+    continuous = loop.period_s is None
+    poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]
+    with_margins = margins(loop)._asdict()
+    step = step_metrics(loop, times_s)
+    return LoopAnalysis(
+        period_s=loop.period_s,
+        delay_ticks=delay_ticks,
+        stable=loop.is_stable,
+        max_re_pole=float(poles.real.max(initial=-math.inf)) if continuous else math.nan,
+        max_abs_pole=math.nan if continuous else float(np.abs(poles).max(initial=0.0)),
+        static_error_percent=100 * abs(1 / (1 + loop.static_gain)) if loop.static_gain != -1 else math.inf,
+        sensitivity_1hz=float(loop.sensitivity(1.0)[0]),
+        settling_time_s=step.settling_time_s,
+        overshoot_percent=step.overshoot_percent,
+        peak_command=step.peak_command,
+        step_times_s=tuple(float(t) for t in times_s),
+        step_position=step.position_at,
+        poles=tuple(complex(p) for p in poles),
+        **with_margins,
+    )
+
+
+def _reach(stable: Callable[[float], bool], largest: float) -> float:
+    """The smallest percentage at which `stable` fails: stepwise outwards, then by bisection to 1e-4."""
+    step = 0.25
+    low = 0.0
+    while stable(min(low + step, largest)):
+        low += step
+        if low >= largest:
+            return largest
+    high = min(low + step, largest)
+    while high - low > 1e-4:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,82 @@
+"""Robustness of a loop in the frequency domain: crossover, margins, the peak of the sensitivity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from hil.linear import Complex, Real
+from rtloop.design.closedloop import Loop
+
+
+class Margins(NamedTuple):
+    """Frequencies in Hz, phase in degrees, gain as a factor; NaN where |L| never crosses 1, inf for no limit."""
+
+    crossover_hz: float
+    phase_margin_deg: float
+    gain_margin: float
+    gain_margin_hz: float
+    max_sensitivity: float
+    max_sensitivity_hz: float
+
+
+def margins(loop: Loop) -> Margins:
+    """The lowest crossover, the smallest phase margin of all, the smallest factor > 1 that reaches −1, max |S|."""
+    hz = loop.frequencies
+    response = loop.open(hz)
+    crossings = [_bisect(lambda f: abs(loop.open(f)[0]) - 1, *ends) for ends in _sign_changes(hz, np.abs(response) - 1)]
+    phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossings]
+    gain, gain_hz = _gain_margin(loop, hz, response)
+    peak, peak_hz = _highest(loop.sensitivity, hz)
+    crossover = crossings[0] if crossings else math.nan
+    return Margins(crossover, min(phases, default=math.inf), gain, gain_hz, peak, peak_hz)
+
+
+def _gain_margin(loop: Loop, hz: Real, response: Complex) -> tuple[float, float]:
+    """Where L is real, negative and above −1: inside the grid and at its ends, where symmetry makes L(z = ±1) real."""
+    found = [_bisect(lambda f: loop.open(f)[0].imag, *ends) for ends in _sign_changes(hz, np.imag(response))]
+    values = [(complex(loop.open(f)[0]), f) for f in found]
+    values.append((complex(loop.static_gain), 0.0))
+    if loop.period_s is not None:
+        values.append((complex(loop.open(hz[-1])[0].real), float(hz[-1])))
+    margins_ = [(-1 / value.real, f) for value, f in values if -1 < value.real < -1e-12]
+    return min(margins_, default=(math.inf, math.nan))
+
+
+def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
+    """Neighbours on the grid between which `values` changes its sign."""
+    at = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    return [(float(hz[i]), float(hz[i + 1])) for i in at]
+
+
+def _bisect(function: Callable[[float], float], low: float, high: float) -> float:
+    """A zero of `function` between two points where its signs differ."""
+    negative_low = function(low) < 0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if (function(middle) < 0) == negative_low else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _highest(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
+    """Maximum of `function` and where: every peak of the grid that comes near the highest is refined by itself."""
+    values = function(hz)
+    inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    near = [i for i in inner if values[i] > 0.9 * values.max()]
+    best = (float(values.max()), float(hz[np.argmax(values)]))
+    return max([best, *(_refined(function, float(hz[i - 1]), float(hz[i + 1])) for i in near)])
+
+
+def _refined(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
+    """The peak between two points, by narrowing the grid around its highest point six times."""
+    best = (-math.inf, low)
+    for _ in range(6):
+        hz = np.linspace(low, high, 21)
+        values = function(hz)
+        i = int(np.argmax(values))
+        best = max(best, (float(values[i]), float(hz[i])))
+        low, high = float(hz[max(i - 1, 0)]), float(hz[min(i + 1, 20)])
+    return best

@@ -1,0 +1,171 @@
+"""Real, well-conditioned state spaces from zeros, poles and gain, in s or in z alike.
+
+Where the poles are apart, a system is a sum of modes: block-diagonal, each pole held to full precision. Where poles
+repeat or cluster, the residues of such a sum grow without bound and cancel; there a cascade of first and second-order
+sections is built instead. It is upper quasi-triangular, and its sections never see each other's poles.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.linear import Complex, Modal, Real, RepeatedPoles, modal_sum
+
+MOST_CANCELLATION = 1e4
+"""A sum of modes whose terms exceed their sum by more than this, somewhere, loses four of sixteen digits: cascade."""
+
+Form = Literal["modal", "cascade"]
+
+
+class System(NamedTuple):
+    """x' = A x + b u, y = c·x + d u (or x⁺ for x'): `a` (n, n), `b` (n,), `c` (n,), `d`; one input, one output."""
+
+    a: Real
+    b: Real
+    c: Real
+    d: float
+
+    def response(self, at: npt.ArrayLike) -> Complex:
+        """d + c (xI − A)⁻¹ b at complex points `at` (k,), shape (k,)."""
+        return self.d + self.states(at) @ self.c
+
+    def states(self, at: npt.ArrayLike) -> Complex:
+        """(xI − A)⁻¹ b at complex points `at` (k,), shape (k, n)."""
+        points = np.atleast_1d(np.asarray(at, dtype=complex))
+        pencil = points[:, None, None] * np.eye(self.b.size) - self.a
+        inputs = np.broadcast_to(self.b[:, None].astype(complex), (points.size, self.b.size, 1))
+        return np.asarray(np.linalg.solve(pencil, inputs)[..., 0], dtype=complex)
+
+
+def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:
+    """A scaled real realisation and its form; `points` (k,) is where the response must keep its digits."""
+    modal = well_conditioned_sum(zeros, poles, gain, points)
+    if modal is None:
+        return scaled(cascade(zeros, poles, gain), points), "cascade"
+    return scaled(system_of(modal), points), "modal"
+
+
+def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Complex) -> Modal | None:
+    """The sum of modes, or None where it cancels too much to be used."""
+    try:
+        modal = modal_sum(zeros, poles, gain)
+    except RepeatedPoles:
+        return None
+    terms = np.abs(modal.residues / (points[:, None] - modal.poles)).sum(axis=1) + np.abs(modal.direct)
+    return modal if np.all(terms <= MOST_CANCELLATION * np.abs(modal.response(points)[0])) else None
+
+
+def system_of(modal: Modal) -> System:
+    """The block-diagonal realisation of a sum of modes with one output."""
+    a, b, c, d = modal.realise()
+    return System(a, b, c[0], float(d[0]))
+
+
+def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
+    """Sections in series, the first one last in the state, so that A is upper quasi-triangular.
+
+    The poles of largest real part come last in the series: integrators stand first in the state.
+    """
+    total = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
+    for group, above in _sections(zeros, poles):
+        section = _section(above, group)
+        a = np.block([[section.a, np.outer(section.b, total.c)], [np.zeros((total.b.size, group.size)), total.a]])
+        b = np.concatenate([section.b * total.d, total.b])
+        total = System(a, b, np.concatenate([section.c, section.d * total.c]), section.d * total.d)
+    return System(total.a, total.b, gain * total.c, gain * total.d)
+
+
+def _section(zeros: Complex, poles: Complex) -> System:
+    """One or two poles with as many zeros or fewer, gain 1. Numerators are expanded about the poles, not about 0."""
+    if poles.size == 1:
+        p = poles[0].real
+        rest, direct = (p - zeros[0].real, 1.0) if zeros.size else (1.0, 0.0)
+        return System(np.array([[p]]), np.ones(1), np.array([rest]), direct)
+    first, second = poles
+    centre, lag = second.real, first.imag**2
+    if first.imag:  # one state follows the other: b = (1, 0), 1/q is reached through `step`
+        step = max(abs(first.imag), 1e-4 * abs(first))  # an even rotation, unless the pair is almost a double pole
+        a = np.array([[centre, -lag / step], [step, centre]])
+    else:
+        step = 1.0
+        a = np.array([[centre, step], [0.0, first.real]])
+    value = np.prod(centre - zeros).real  # the numerator at the centre
+    if zeros.size == 2:
+        linear, constant, direct = first.real + centre - zeros.sum().real, value - lag, 1.0
+    else:
+        linear, constant, direct = float(zeros.size), value, 0.0
+    b = np.array([1.0, 0.0]) if first.imag else np.array([0.0, 1.0])
+    c = [linear, constant / step]
+    return System(a, b, np.array(c if first.imag else c[::-1]), direct)
+
+
+def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
+    """(poles, zeros) of each section: pairs of zeros go to the nearest pairs of poles, a single one to what is left."""
+    pole_groups, zero_groups = _twos(poles), _twos(zeros)
+    sections: list[tuple[Complex, Complex]] = []
+    for above in zero_groups:
+        fitting = [g for g in pole_groups if g.size == above.size] or pole_groups
+        nearest = min(fitting, key=lambda group, above=above: float(np.abs(group[:, None] - above).min()))
+        pole_groups = [g for g in pole_groups if g is not nearest]
+        sections.append((nearest, above))
+    sections += [(group, np.empty(0, dtype=complex)) for group in pole_groups]
+    return sorted(sections, key=lambda section: float(section[0].real.max()))
+
+
+def _twos(roots: Complex) -> list[Complex]:
+    """Sorted roots, as `conjugate_pairs` leaves them, in twos that have real coefficients; an odd real one last."""
+    reals, pairs = roots[roots.imag == 0], roots[roots.imag != 0]
+    groups = [pairs[i : i + 2] for i in range(0, pairs.size, 2)] + [reals[i : i + 2] for i in range(0, reals.size, 2)]
+    return sorted(groups, key=lambda group: -group.size)
+
+
+def scaled(system: System, points: Complex) -> System:
+    """The same system with each block's largest response over `points` brought near 1, for a unit input.
+
+    Factors are powers of two, so that scaling rounds nothing, and equal within a block, which keeps rotations.
+    """
+    size = np.ones(system.b.size)
+    responses = np.abs(system.states(points))
+    for block in blocks(system.a):
+        peak = float(responses[:, block].max(initial=0.0))
+        if peak > 0 and np.isfinite(peak):
+            size[block] = 2.0 ** np.round(np.log2(peak))
+    return System(system.a * size / size[:, None], system.b / size, system.c * size, system.d)
+
+
+def blocks(a: Real) -> list[slice]:
+    """The diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix."""
+    found: list[slice] = []
+    row = 0
+    while row < a.shape[0]:
+        width = 2 if row + 1 < a.shape[0] and a[row + 1, row] != 0 else 1
+        found.append(slice(row, row + width))
+        row += width
+    return found
+
+
+def row_bands(a: Real) -> npt.NDArray[np.int64]:
+    """First and past-the-last column that is not zero in each row, shape (n, 2); (0, 0) for a row of zeros."""
+    bands = np.zeros((a.shape[0], 2), dtype=np.int64)
+    for row, values in enumerate(a):
+        columns = np.flatnonzero(values)
+        if columns.size:
+            bands[row] = columns[0], columns[-1] + 1
+    return bands
+
+
+def beside_imaginary_axis(roots: Complex) -> Complex:
+    """Points from a tenth of the smallest to ten times the largest of `roots` (rad/s), a little right of s = jω.
+
+    On the axis itself a point could hit an undamped root.
+    """
+    sizes = np.abs(roots[roots != 0]) if np.any(roots != 0) else np.ones(1)
+    return (0.01 + 1j) * np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), 401)
+
+
+def around_unit_circle() -> Complex:
+    """Points just outside |z| = 1, up to nine tenths of half the sampling rate: zeros at z = −1 drown the rest."""
+    return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

@@ -1,0 +1,194 @@
+"""Transfer functions of one input and one output, kept as zeros, poles and gain.
+
+    G(s) = gain · Π(s − zᵢ) / Π(s − pᵢ),    s in rad/s
+
+Nothing here ever expands a product of factors: the eight poles of eq (5) of the paper, multiplied out, span 43 powers
+of ten. Whatever form a user writes is brought to factors once; everything after that works on the factors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.linear import Complex, conjugate_pairs
+from rtloop.design.realisation import System
+from rtloop.design.zeros import zeros_and_gain
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """A proper real transfer function: `zeros` (m,), `poles` (n,), m ≤ n, in rad/s, and `gain`.
+
+    Complex roots come as exact conjugates. ValueError for anything else, naming it.
+    """
+
+    zeros: Complex
+    poles: Complex
+    gain: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "zeros", _paired("zeros", self.zeros))
+        object.__setattr__(self, "poles", _paired("poles", self.poles))
+        object.__setattr__(self, "gain", float(_finite("gain", self.gain)))
+        if self.zeros.size > self.poles.size:
+            raise ValueError(
+                f"improper: {self.zeros.size} zeros but {self.poles.size} poles; "
+                "at most as many zeros as poles are allowed"
+            )
+
+    @classmethod
+    def from_zpk(cls, zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Transfer:
+        """From zeros and poles (rad/s) and the gain in front of their products."""
+        return cls(np.asarray(zeros, dtype=complex), np.asarray(poles, dtype=complex), gain)
+
+    @classmethod
+    def from_factors(
+        cls, gain: float, numerator: Sequence[npt.ArrayLike] = (), denominator: Sequence[npt.ArrayLike] = ()
+    ) -> Transfer:
+        """From real polynomials to be multiplied, each a list of coefficients in s, highest power first."""
+        zeros, above = _product("numerator", numerator)
+        poles, below = _product("denominator", denominator)
+        return cls(zeros, poles, float(_finite("gain", gain)) * above / below)
+
+    @classmethod
+    def from_transfer_function(cls, numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Transfer:
+        """From two real polynomials in s, highest power first. Fine for low orders; factors keep more digits."""
+        return cls.from_factors(1.0, [numerator], [denominator])
+
+    @classmethod
+    def from_state_space(cls, a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> Transfer:
+        """From x' = A x + B u, y = C x + D u: `a` (n, n), `b` n values, `c` n values, `d` one value."""
+        system = _system(a, b, c, d)
+        zeros, gain = zeros_and_gain(system)
+        return cls(zeros, _eigenvalues(system.a), gain) if gain else cls.from_zpk([], [], 0.0)
+
+    def __mul__(self, other: Transfer) -> Transfer:
+        """The two in series. Common factors are not cancelled."""
+        zeros, poles = np.concatenate([self.zeros, other.zeros]), np.concatenate([self.poles, other.poles])
+        return Transfer(zeros, poles, self.gain * other.gain)
+
+    def response(self, s: npt.ArrayLike) -> Complex:
+        """G at complex points `s` (any shape), rad/s."""
+        return factored_response(self.zeros, self.poles, self.gain, s)
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return self.poles.size
+
+    @property
+    def dc_gain(self) -> float:
+        """G(0); `inf` with an integrator."""
+        surplus = int(np.sum(self.poles == 0)) - int(np.sum(self.zeros == 0))
+        if surplus > 0:
+            return math.inf
+        if surplus < 0:
+            return 0.0
+        return float(factored_response(self.zeros[self.zeros != 0], self.poles[self.poles != 0], self.gain, 0.0).real)
+
+    @property
+    def high_frequency_gain(self) -> float:
+        """G(∞), which is the direct feedthrough."""
+        return 0.0 if self.is_strictly_proper else self.gain
+
+    @property
+    def is_stable(self) -> bool:
+        """Every pole to the left of the imaginary axis."""
+        return bool(np.all(self.poles.real < 0))
+
+    @property
+    def is_strictly_proper(self) -> bool:
+        """No direct feedthrough: fewer zeros than poles. (Proper it always is.)"""
+        return self.zeros.size < self.poles.size
+
+
+def factored_response(zeros: Complex, poles: Complex, gain: float, at: npt.ArrayLike) -> Complex:
+    """gain·Π(x − z)/Π(x − p) at complex points of any shape, a ratio at a time so that nothing overflows."""
+    points = np.asarray(at, dtype=complex)
+    value = np.full(points.shape, complex(gain))
+    for i, pole in enumerate(poles):
+        value *= (points - zeros[i] if i < zeros.size else 1.0) / (points - pole)
+    for zero in zeros[poles.size :]:
+        value *= points - zero
+    return value
+
+
+def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """`values` as floats. Raises ValueError for what is not a finite real number."""
+    try:
+        numbers = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: {values!r} is not made of real numbers; only finite real ones are allowed") from None
+    if not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{name}: {values!r} is not finite; only finite numbers are allowed")
+    return numbers
+
+
+def _paired(name: str, roots: Complex) -> Complex:
+    """`roots`, checked, with exact conjugates, and read-only."""
+    values = np.atleast_1d(np.asarray(roots, dtype=complex))
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: {values.tolist()} is not finite; only finite numbers are allowed")
+    try:
+        paired = conjugate_pairs(values)
+    except ValueError as fault:
+        raise ValueError(f"{name}: {fault}; complex {name} are allowed in conjugate pairs only") from None
+    paired.flags.writeable = False
+    return paired
+
+
+def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, float]:
+    """Roots and leading coefficient of a product of polynomials. Raises ValueError for a factor that is zero."""
+    roots: list[Complex] = [np.empty(0, dtype=complex)]
+    leading = 1.0
+    for factor in factors:
+        polynomial = np.trim_zeros(np.atleast_1d(_finite(name, factor)), "f")
+        if polynomial.ndim != 1:
+            raise ValueError(f"{name}: {factor!r} is not a list of coefficients, highest power of s first")
+        if not polynomial.size:
+            if name == "denominator":
+                raise ValueError(f"{name}: {factor!r} is zero; a coefficient other than zero is needed")
+            return np.empty(0, dtype=complex), 0.0
+        roots.append(_roots(polynomial))
+        leading *= float(polynomial[0])
+    return np.concatenate(roots), leading
+
+
+def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
+    """Roots of a polynomial; those of a quadratic in closed form, so that a double root stays exactly double."""
+    if polynomial.size != 3:
+        return np.roots(polynomial).astype(complex)
+    half, constant = polynomial[1] / (2 * polynomial[0]), polynomial[2] / polynomial[0]
+    discriminant = half * half - constant
+    if discriminant < 0:
+        return np.array([complex(-half, math.sqrt(-discriminant)), complex(-half, -math.sqrt(-discriminant))])
+    larger = -(half + math.copysign(math.sqrt(discriminant), half))
+    return np.array([larger, constant / larger if larger else 0.0], dtype=complex)
+
+
+def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> System:
+    """The four matrices as a System. Raises ValueError where their shapes do not fit together."""
+    matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))
+    column, row, direct = _finite("b", b).ravel(), _finite("c", c).ravel(), _finite("d", d).ravel()
+    order = matrix.shape[0]
+    for name, found, allowed in (
+        ("a", matrix.shape, (order, order)),
+        ("b", column.shape, (order,)),
+        ("c", row.shape, (order,)),
+        ("d", direct.shape, (1,)),
+    ):
+        if found != allowed:
+            raise ValueError(f"{name}: shape {found} does not fit; {allowed} is allowed (one input, one output)")
+    return System(matrix, column, row, float(direct[0]))
+
+
+def _eigenvalues(a: npt.NDArray[np.float64]) -> Complex:
+    """Eigenvalues; those that only rounding keeps from zero become zero, so that an integrator stays one."""
+    values = np.linalg.eigvals(a).astype(complex)
+    values[np.abs(values) <= a.shape[0] * np.finfo(float).eps * np.linalg.norm(a)] = 0.0
+    return values

@@ -1,0 +1,51 @@
+"""Zeros and gain of a state space of one input and one output."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hil.linear import Complex, Real
+from rtloop.design.realisation import System
+
+
+def zeros_and_gain(system: System) -> tuple[Complex, float]:
+    """Finite zeros and the gain of c(xI − A)⁻¹b + d; the gain is 0 for a system that is zero.
+
+    Zeros at infinity are taken off one at a time (Emami-Naeini & Van Dooren, Automatica 18, 1982, here for one input
+    and one output): a reflection turns b into (β, 0, …, 0); while d = 0, the first state is the input of what
+    remains, and β a factor of the gain. Once d ≠ 0, the zeros are the generalised eigenvalues of [A b; c d] and
+    [I 0; 0 0], which are the eigenvalues of A − b c/d.
+    """
+    a, b, c, d = _balanced(system)
+    gain = 1.0
+    noise = 1e-15 * float(np.linalg.norm(b) * np.linalg.norm(c) / max(np.linalg.norm(a), 1e-300))
+    while abs(d) <= noise and b.size:
+        mirror, beta = _reflection(b)
+        a, c = mirror @ a @ mirror, c @ mirror
+        noise = 1e-13 * float(np.linalg.norm(c))
+        gain *= beta
+        a, b, c, d = a[1:, 1:], a[1:, 0], c[1:], float(c[0])
+    if abs(d) <= noise or gain == 0:
+        return np.empty(0, dtype=complex), 0.0
+    return np.linalg.eigvals(a - np.outer(b, c) / d).astype(complex), gain * d
+
+
+def _reflection(vector: Real) -> tuple[Real, float]:
+    """The Householder reflection (symmetric) that turns `vector` into (β, 0, …, 0), and β."""
+    beta = -float(np.copysign(np.linalg.norm(vector), vector[0]))
+    normal = vector - beta * np.eye(vector.size)[0]
+    length = float(normal @ normal)
+    return np.eye(vector.size) - (2 / length if length else 0.0) * np.outer(normal, normal), beta
+
+
+def _balanced(system: System) -> System:
+    """The same system with the rows and columns of each state evened out by powers of two (Osborne 1960)."""
+    a, b, c = system.a.copy(), system.b.copy(), system.c.copy()
+    for _ in range(20):
+        for i in range(b.size):
+            column = np.abs(np.delete(a[:, i], i)).sum() + abs(c[i])
+            row = np.abs(np.delete(a[i], i)).sum() + abs(b[i])
+            factor = 2.0 ** np.round(0.5 * np.log2(row / column)) if row > 0 and column > 0 else 1.0
+            a[:, i], c[i] = a[:, i] * factor, c[i] * factor
+            a[i], b[i] = a[i] / factor, b[i] / factor
+    return System(a, b, c, system.d)

@@ -1,0 +1,104 @@
+"""A loop from a plan, a shared block, a driver's pointers and a clock."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drivers.base import Facts, Pointers, index_of
+from rtloop.engine.clock import Clock
+from rtloop.engine.context import LOOP
+from rtloop.engine.loop import Outcome, run_ticks
+from rtloop.engine.memory import SharedBlock
+from rtloop.engine.plan import Plan
+from rtloop.law.layout import Records, initial_state
+from rtloop.law.law import set_mode
+
+SNAPSHOT_SECONDS = 1.0
+UNLIMITED = np.iinfo(np.int64).max
+
+
+class LawArrays(NamedTuple):
+    """Coefficients and state, before or in the middle of a run."""
+
+    coefficients: Records
+    axes: Records
+    state: Records
+
+
+def law_at_rest(plan: Plan) -> LawArrays:
+    """The plan's law before its first tick."""
+    coefficients = plan.coefficients.view(np.recarray)
+    axes, state = initial_state(coefficients)
+    set_mode(axes, state[0], int(plan.mode), True)
+    return LawArrays(coefficients, axes, state)
+
+
+class Assembly:
+    """A loop's context (`loop`, one record) and the arrays that it points to, kept alive together."""
+
+    def __init__(
+        self, plan: Plan, block: SharedBlock, facts: Facts, pointers: Pointers, clock: Clock, law: LawArrays
+    ) -> None:
+        self._loops = np.zeros(1, LOOP).view(np.recarray)
+        self.loop = self._loops[0]
+        self._arrays: dict[str, np.ndarray[Any, Any]] = {}
+        self._point("coefficients", law.coefficients)
+        self._point("axes", law.axes)
+        self._point("law_state", law.state)
+        self._wire(plan, facts)
+        self._share(plan, block)
+        self._call(pointers, clock)
+        period_s = 1.0 / plan.pacing.rate_hz
+        self.loop.period_s, self.loop.period_us = period_s, period_s * 1e6
+        self.loop.heartbeat_timeout_ns = plan.pacing.heartbeat_timeout_s * 1e9
+        self.loop.snapshot_ticks = max(1, round(SNAPSHOT_SECONDS * plan.pacing.rate_hz))
+        self.loop.record_limit = UNLIMITED if plan.ticks is None else plan.ticks
+
+    def run(self, until_tick: int) -> Outcome:
+        """Run the compiled loop."""
+        return Outcome(run_ticks(self.loop, until_tick))
+
+    def _point(self, name: str, array: np.ndarray[Any, Any]) -> None:
+        self._arrays[name] = array
+        self._loops[name] = array.ctypes.data
+
+    def _wire(self, plan: Plan, facts: Facts) -> None:
+        """Buffers, and which channel belongs to which axis."""
+        axes, loop = plan.axes, self.loop
+        loop.axis_count, loop.input_count, loop.output_count = len(axes), len(facts.inputs), len(facts.outputs)
+        loop.observed_count = len(facts.observed)
+        self._point("inputs", np.zeros(len(facts.inputs) + 1 + len(facts.observed)))
+        self._point("outputs", np.array([channel.safe_v for channel in facts.outputs]))
+        self._point("timing", np.zeros(4))
+        self._point("adc_v", np.zeros(len(axes)))
+        self._point("references", np.zeros(len(axes)))
+        inputs = [index_of(facts.inputs, plan.wiring[axis].input) for axis in axes]
+        outputs = [index_of(facts.outputs, plan.wiring[axis].output) for axis in axes]
+        self._point("input_index", np.array(inputs, np.int64))
+        self._point("output_index", np.array(outputs, np.int64))
+
+    def _share(self, plan: Plan, block: SharedBlock) -> None:
+        """What lies in the shared block, the schedule and the generators."""
+        loop = self.loop
+        for name in ("words", "last_drive_v", "commands", "table"):
+            self._point(name, block[name])
+        for name in ("ticks", "events", "snapshots"):
+            for part in ("head", "marks", "slots"):
+                self._point(f"{name}_{part}", block[f"{name}_{part}"])
+            self._loops[f"{name}_capacity"] = block[f"{name}_marks"].size
+        block["table"][: plan.table.size] = plan.table
+        loop.table_count, loop.command_count = block["table"].size, block["commands"].size
+        loop.column_count, loop.snapshot_bytes = block["ticks_slots"].shape[1], block["snapshots_slots"].shape[1]
+        self._point("generators", plan.generators.copy())
+        self._point("schedule", plan.schedule)
+        loop.schedule_count = plan.schedule.size
+
+    def _call(self, pointers: Pointers, clock: Clock) -> None:
+        """The C functions of driver and clock; a driver that has a clock of its own waits by it."""
+        loop = self.loop
+        loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
+        loop.now, loop.clock_context = clock.now, clock.context
+        own = bool(pointers.wait)
+        loop.wait, loop.wait_context = (pointers.wait, pointers.context) if own else (clock.wait, clock.context)

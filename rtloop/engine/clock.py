@@ -1,0 +1,142 @@
+"""Clocks: what a tick waits for. Each is a pair of C functions, `wait` and `now`, with a context.
+
+`wait` fills timing[0] = deadline and timing[1] = wake, both in ns since the start, timing[2] = whole periods skipped,
+timing[3] = wake in ns of CLOCK_MONOTONIC; `now` fills timing[0] = ns since the start. A non-zero result ends the run.
+
+Paced: absolute deadlines on a fixed grid, sleep until `spin_ns` before the deadline, then spin. A tick that wakes
+late runs once; periods that have passed entirely are skipped and never caught up in a burst.
+Unpaced: virtual time. Nothing reads a clock, measured times are NaN; the wait is for the recorder alone.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import carray, types
+
+from hil.atomics import load_acquire
+from hil.compiled import cfunc
+from hil.pointers import SIGNATURE, address_pointer
+
+CLOCK_MONOTONIC = 1
+TIMER_ABSTIME = 1
+SECOND_NS = 1_000_000_000
+BACKPRESSURE_NS = 50_000
+
+# libc by name and not by a ctypes pointer: a pointer held as a global would defeat the compilation cache
+_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_clock_nanosleep = types.ExternalFunction(
+    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
+)
+
+CONTEXT = np.dtype(
+    [
+        ("timespec", np.int64, (2,)),
+        ("timespec_address", np.int64),
+        ("start_ns", np.int64),
+        ("period_ns", np.float64),
+        ("spin_ns", np.int64),
+        ("index", np.int64),
+        ("head_address", np.int64),
+        ("words_address", np.int64),
+        ("cursor_word", np.int64),
+        ("slack_ticks", np.int64),
+    ],
+    align=True,
+)
+
+
+class Clock(NamedTuple):
+    """Addresses of `wait`, `now` and their context. The context's array must outlive the clock."""
+
+    wait: int
+    now: int
+    context: int
+
+
+@cfunc(SIGNATURE)
+def paced_now(context, timing):
+    """ns since the start, by CLOCK_MONOTONIC."""
+    clock = carray(context, 1, CONTEXT)[0]
+    _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
+    carray(timing, 4)[0] = float(clock.timespec[0] * SECOND_NS + clock.timespec[1] - clock.start_ns)
+    return 0
+
+
+@cfunc(SIGNATURE)
+def paced_wait(context, timing):
+    """Sleep, then spin, until the next deadline of the grid."""
+    clock = carray(context, 1, CONTEXT)[0]
+    out = carray(timing, 4)
+    _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
+    now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    deadline_ns = clock.start_ns + np.int64(clock.index * clock.period_ns)
+    missed = 0
+    if now_ns > deadline_ns:
+        missed = np.int64((now_ns - deadline_ns) / clock.period_ns)
+        clock.index += missed
+        deadline_ns = clock.start_ns + np.int64(clock.index * clock.period_ns)
+    sleep_until_ns = deadline_ns - clock.spin_ns
+    while now_ns < sleep_until_ns:
+        clock.timespec[0] = sleep_until_ns // SECOND_NS
+        clock.timespec[1] = sleep_until_ns % SECOND_NS
+        _clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, clock.timespec_address, 0)
+        _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
+        now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    while now_ns < deadline_ns:
+        _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
+        now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    clock.index += 1
+    out[0] = float(deadline_ns - clock.start_ns)
+    out[1] = float(now_ns - clock.start_ns)
+    out[2] = float(missed)
+    out[3] = float(now_ns)
+    return 0
+
+
+@cfunc(SIGNATURE)
+def unpaced_now(context, timing):
+    """NaN: virtual time has no clock."""
+    carray(timing, 4)[0] = np.nan
+    return 0
+
+
+@cfunc(SIGNATURE)
+def unpaced_wait(context, timing):
+    """The next instant of virtual time, once the recorder is close enough behind."""
+    clock = carray(context, 1, CONTEXT)[0]
+    head = carray(address_pointer(clock.head_address), 1, np.uint64)
+    words = carray(address_pointer(clock.words_address), 64, np.uint64)
+    while np.int64(head[0] - load_acquire(words, clock.cursor_word)) > clock.slack_ticks:
+        clock.timespec[0] = 0
+        clock.timespec[1] = BACKPRESSURE_NS
+        _clock_nanosleep(CLOCK_MONOTONIC, 0, clock.timespec_address, 0)
+    out = carray(timing, 4)
+    out[0] = float(np.int64(clock.index * clock.period_ns))
+    out[1] = np.nan
+    out[2] = 0.0
+    out[3] = np.nan
+    clock.index += 1
+    return 0
+
+
+def clock_context(rate_hz: float) -> np.recarray:
+    """A context with the period set, one record."""
+    context = np.zeros(1, CONTEXT).view(np.recarray)
+    context.timespec_address = context.ctypes.data + CONTEXT.fields["timespec"][1]  # type: ignore[index]
+    context.period_ns = SECOND_NS / rate_hz
+    return context
+
+
+def paced_clock(context: np.recarray, spin_us: float) -> Clock:
+    """Real time; `context.start_ns` must be set to the CLOCK_MONOTONIC ns of the first deadline before use."""
+    context.spin_ns = round(spin_us * 1000)
+    return Clock(paced_wait.address, paced_now.address, context.ctypes.data)
+
+
+def unpaced_clock(context: np.recarray, head: np.ndarray, words: np.ndarray, cursor_word: int, slack: int) -> Clock:
+    """Virtual time that never gets more than `slack` ticks ahead of the reader at `words[cursor_word]`."""
+    context.head_address, context.words_address = head.ctypes.data, words.ctypes.data
+    context.cursor_word, context.slack_ticks = cursor_word, slack
+    return Clock(unpaced_wait.address, unpaced_now.address, context.ctypes.data)

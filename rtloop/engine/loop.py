@@ -1,0 +1,208 @@
+"""The compiled loop: one tick after the other, the same code for hardware, simulation and replay.
+
+    wait ─► read ─► interlocks, reference, law ─► write ─► memories ─► record
+
+Snapshots and commands come before the wait, in the slack of the period. Driver and clock are C function pointers;
+nothing here allocates, locks, prints or can raise.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from hil.atomics import load_acquire
+from hil.compiled import jit
+from hil.pointers import call
+from rtloop.engine.commands import apply_commands, publish_event
+from rtloop.engine.context import (
+    axes_of,
+    coefficients_of,
+    floats,
+    generators_of,
+    integers,
+    octets,
+    snapshot_ring,
+    state_of,
+    tick_ring,
+    words_of,
+)
+from rtloop.engine.memory import Word
+from rtloop.engine.messages import ALL_AXES, Kind, Origin
+from rtloop.engine.ring import claim, publish
+from rtloop.law.law import evaluate, set_mode, update
+from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.reference import reference_sample
+from rtloop.signals import COMMON_COUNT, PER_AXIS_COUNT, Flag, Mode
+
+
+class Outcome(IntEnum):
+    """Why `run_ticks` returned."""
+
+    DONE = 0
+    STOPPED = 1
+    DRIVER_FAILED = 2
+    HEARTBEAT_LOST = 3
+
+
+READ_FAILED, WRITE_FAILED = 1, 2
+STOP_WORD, HEARTBEAT_WORD = int(Word.STOP), int(Word.HEARTBEAT_NS)
+OFF = int(Mode.OFF)
+OVERRUN, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.TRIP_HEARTBEAT)
+LOOP_ORIGIN = int(Origin.LOOP)
+TRIPPED, DRIVER_FAILED, PERIODS_MISSED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED), int(Kind.PERIODS_MISSED)
+DONE, STOPPED, FAILURE, ORPHANED = (int(outcome) for outcome in Outcome)
+COEFFICIENT_BYTES, STATE_BYTES, LOOP_STATE_BYTES = COEFFICIENTS.itemsize, STATE.itemsize, LOOP_STATE.itemsize
+US_PER_NS = 1e-3
+
+
+@jit
+def run_ticks(loop, until_tick):
+    """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome."""
+    while loop.tick < until_tick:
+        _prepare(loop)
+        if call(loop.wait, loop.wait_context, loop.timing) != 0:
+            return FAILURE
+        _tick(loop)
+        loop.tick += 1
+        if loop.failed == WRITE_FAILED:
+            return FAILURE
+        state = state_of(loop)
+        if state.settled != 0:
+            if loop.failed == READ_FAILED:
+                return FAILURE
+            if state.trip & TRIP_HEARTBEAT != 0:
+                return ORPHANED
+            if loop.stopping != 0:
+                return STOPPED
+    return DONE
+
+
+@jit
+def _prepare(loop):
+    """What a tick does before its deadline: state snapshot, schedule and commands, stop request."""
+    if loop.tick >= loop.next_snapshot:
+        _publish_snapshot(loop)
+        loop.next_snapshot = loop.tick + loop.snapshot_ticks
+    apply_commands(loop)
+    if loop.stopping == 0 and load_acquire(words_of(loop), STOP_WORD) != 0:
+        loop.stopping = 1
+        set_mode(axes_of(loop), state_of(loop), OFF, False)
+
+
+@jit
+def _tick(loop):
+    timing = floats(loop.timing, 4)
+    deadline_ns, wake_ns, missed, now_ns = timing[0], timing[1], timing[2], timing[3]
+
+    status = call(loop.read, loop.driver_context, loop.inputs)
+    call(loop.now, loop.clock_context, loop.timing)
+    read_ns = timing[0]
+
+    _evaluate(loop, status, now_ns)
+    call(loop.now, loop.clock_context, loop.timing)
+    law_ns = timing[0]
+
+    written = call(loop.write, loop.driver_context, loop.outputs)
+    call(loop.now, loop.clock_context, loop.timing)
+    write_ns = timing[0]
+
+    state = state_of(loop)
+    update(coefficients_of(loop), axes_of(loop), state)
+    _report(loop, status, written, missed)
+    if loop.tick >= loop.record_limit:
+        return
+    ring, position = tick_ring(loop), np.uint64(loop.tick)
+    row = ring.slots[claim(ring, position)]
+    _fill_signals(loop, row)
+    row[0] = float(loop.tick)
+    row[1] = deadline_ns
+    row[2] = (wake_ns - deadline_ns) * US_PER_NS
+    row[3] = (read_ns - wake_ns) * US_PER_NS
+    row[4] = (law_ns - read_ns) * US_PER_NS
+    row[5] = (write_ns - law_ns) * US_PER_NS
+    row[7] = missed
+    row[9] = float(state.mode)
+    row[10] = float(status)
+    call(loop.now, loop.clock_context, loop.timing)
+    row[6] = (timing[0] - wake_ns) * US_PER_NS
+    overrun = row[2] + row[6] > loop.period_us
+    row[8] = float(state.flags | (OVERRUN if overrun else 0))
+    publish(ring, position)
+
+
+@jit
+def _evaluate(loop, status, now_ns):
+    """References, interlocks and law; the drives go to the driver's outputs and to the shared block."""
+    inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
+    outputs, last_drive_v = floats(loop.outputs, loop.output_count), floats(loop.last_drive_v, loop.axis_count)
+    adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
+    input_index, output_index = integers(loop.input_index, loop.axis_count), integers(loop.output_index, loop.axis_count)
+    generators, table = generators_of(loop), floats(loop.table, loop.table_count)
+    axes = axes_of(loop)
+    for a in range(loop.axis_count):
+        adc_v[a] = inputs[input_index[a]]
+        references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
+    heartbeat_ns = float(load_acquire(words_of(loop), HEARTBEAT_WORD))
+    heartbeat_lost = now_ns - heartbeat_ns > loop.heartbeat_timeout_ns
+    age_us = inputs[loop.input_count]
+    evaluate(coefficients_of(loop), axes, state_of(loop), adc_v, references, status, age_us, heartbeat_lost)
+    for a in range(loop.axis_count):
+        outputs[output_index[a]] = axes[a].drive_v
+        last_drive_v[a] = axes[a].drive_v
+
+
+@jit
+def _fill_signals(loop, row):
+    """Sample age, the signals of each axis, the observed signals."""
+    inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
+    adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
+    axes, column = axes_of(loop), COMMON_COUNT
+    row[11] = inputs[loop.input_count]
+    for a in range(loop.axis_count):
+        row[column] = adc_v[a]
+        row[column + 1] = axes[a].position_um
+        row[column + 2] = references[a]
+        row[column + 3] = axes[a].error_um
+        row[column + 4] = axes[a].command_um
+        row[column + 5] = axes[a].demand_v
+        row[column + 6] = axes[a].drive_v
+        column += PER_AXIS_COUNT
+    for i in range(loop.observed_count):
+        row[column + i] = inputs[loop.input_count + 1 + i]
+
+
+@jit
+def _report(loop, status, written, missed):
+    """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
+    new_trip = state_of(loop).new_trip
+    if new_trip != 0:
+        publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, float(new_trip), 0.0)
+    if loop.failed == 0 and (status < 0 or written < 0):
+        loop.failed = WRITE_FAILED if written < 0 else READ_FAILED
+        failing, verb = (written, 1.0) if written < 0 else (status, 0.0)
+        publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, float(failing), verb)
+    if missed > 0.0:
+        if loop.tick >= loop.next_late_event:
+            publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, missed, 0.0)
+        loop.next_late_event = loop.tick + np.int64(1.0 / loop.period_s)
+
+
+@jit
+def _publish_snapshot(loop):
+    """Tick, coefficients and state as bytes, as they are before the commands of this tick."""
+    ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)
+    row = ring.slots[claim(ring, position)]
+    for i in range(8):
+        row[i] = (loop.tick >> (8 * i)) & 0xFF
+    offset = 8
+    for address, count in (
+        (loop.coefficients, loop.axis_count * COEFFICIENT_BYTES),
+        (loop.axes, loop.axis_count * STATE_BYTES),
+        (loop.law_state, LOOP_STATE_BYTES),
+    ):
+        row[offset : offset + count] = octets(address, count)
+        offset += count
+    publish(ring, position)
+    loop.snapshots += 1

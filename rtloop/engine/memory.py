@@ -1,0 +1,147 @@
+"""The shared block: everything that the processes of one loop exchange, as named arrays over one mapped file.
+
+The block describes itself: its first page holds a JSON directory of the arrays, so that any process that gets the
+file (a memfd or a path in the runtime directory) can attach. A plain mapping is used because Python 3.11's
+`multiprocessing.shared_memory` would unlink the segment when the first attached process exits.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.engine.messages import MESSAGE
+from rtloop.engine.ring import Ring
+
+DIRECTORY_BYTES = 8192
+RING_SECONDS = 6.0
+# numbers of slots are powers of two: the rings rely on it
+MIN_RING_TICKS = 4096
+EVENT_SLOTS = 4096
+SNAPSHOT_SLOTS = 16
+COMMAND_SLOTS = 256
+
+
+class Word(IntEnum):
+    """Index into `words`, the block's uint64 control words."""
+
+    GO = 0
+    STOP = 1
+    HEARTBEAT_NS = 2
+    RECORDER_CURSOR = 3
+    LOOP_STATE = 4
+    RECORDER_STATE = 5
+    COMMANDS_HEAD = 6
+    COMMANDS_TAIL = 7
+    LOOP_PID = 8
+    RECORDER_PID = 9
+    START_UNIX_NS = 10
+    FINISHED_TICKS = 11
+
+
+class ProcessState(IntEnum):
+    """Value of LOOP_STATE and RECORDER_STATE."""
+
+    STARTING = 0
+    READY = 1
+    RUNNING = 2
+    FINISHED = 3
+    FAILED = 4
+
+
+class Sizes(NamedTuple):
+    """What the block's arrays are sized by; `snapshot_bytes` is the length of the law's binary snapshot."""
+
+    columns: int
+    axes: int
+    rate_hz: float
+    snapshot_bytes: int
+    table_samples: int
+
+
+class SharedBlock:
+    """Named numpy arrays over a mapped file; `fd` may be handed to child processes."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+        self._map = mmap.mmap(fd, 0)
+        directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
+        self._arrays: dict[str, np.ndarray[Any, Any]] = {
+            name: np.frombuffer(
+                self._map,
+                dtype=np.lib.format.descr_to_dtype(_tuples(descr)),
+                count=int(np.prod(shape)),
+                offset=offset,
+            ).reshape(shape)
+            for name, (offset, descr, shape) in directory.items()
+        }
+
+    @classmethod
+    def create(cls, sizes: Sizes, path: str | None = None) -> SharedBlock:
+        """A new zeroed block, anonymous or at `path` (replaced if present, mode 0600)."""
+        specification = _specification(sizes)
+        offset, directory = DIRECTORY_BYTES, {}
+        for name, (dtype, shape) in specification.items():
+            directory[name] = (offset, np.lib.format.dtype_to_descr(dtype), shape)
+            offset += -(-int(dtype.itemsize * np.prod(shape)) // 64) * 64
+        header = json.dumps(directory).encode()
+        if len(header) > DIRECTORY_BYTES:
+            raise ValueError(f"directory of the shared block: {len(header)} bytes, at most {DIRECTORY_BYTES}")
+        if path is None:
+            fd = os.memfd_create("rtloop")
+        else:
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        os.ftruncate(fd, offset)
+        os.pwrite(fd, header, 0)
+        return cls(fd)
+
+    def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
+        return self._arrays[name]
+
+    @property
+    def words(self) -> np.ndarray[Any, Any]:
+        """The control words, indexed by Word."""
+        return self._arrays["words"]
+
+    def ring(self, name: str) -> Ring:
+        """The ring `ticks`, `events` or `snapshots`."""
+        return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
+
+
+def ring_ticks(rate_hz: float) -> int:
+    """Slots of the tick ring: a power of two that holds at least RING_SECONDS."""
+    return 1 << int(np.ceil(np.log2(max(MIN_RING_TICKS, RING_SECONDS * rate_hz))))
+
+
+def _specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
+    word, real = np.dtype(np.uint64), np.dtype(np.float64)
+    ticks = ring_ticks(sizes.rate_hz)
+    arrays: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+        "words": (word, (64,)),
+        "last_drive_v": (real, (sizes.axes,)),
+        "table": (real, (max(sizes.table_samples, 1),)),
+        "commands": (MESSAGE, (COMMAND_SLOTS,)),
+    }
+    slots: Sequence[tuple[str, np.dtype[Any], tuple[int, ...]]] = (
+        ("ticks", real, (ticks, sizes.columns)),
+        ("events", MESSAGE, (EVENT_SLOTS,)),
+        ("snapshots", np.dtype(np.uint8), (SNAPSHOT_SLOTS, sizes.snapshot_bytes)),
+    )
+    for name, dtype, shape in slots:
+        arrays[f"{name}_head"] = (word, (1,))
+        arrays[f"{name}_marks"] = (word, (shape[0],))
+        arrays[f"{name}_slots"] = (dtype, shape)
+    return arrays
+
+
+def _tuples(descr: Any) -> Any:
+    """numpy's dtype description as it was before JSON turned its tuples into lists."""
+    if isinstance(descr, str):
+        return descr
+    return [tuple(tuple(part) if isinstance(part, list) else part for part in field) for field in descr]

@@ -1,0 +1,74 @@
+"""What the loop's process needs to know: settled beforehand, passed as one pickled value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.base import Driver, Facts, Wiring
+from drivers.registry import driver_class
+from rtloop.engine.memory import Sizes
+from rtloop.law.layout import snapshot_bytes
+from rtloop.signals import Mode, columns
+
+
+@dataclass(frozen=True)
+class Pacing:
+    """How ticks follow each other. `paced` False is virtual time: no clock, no real-time scheduling."""
+
+    rate_hz: float
+    paced: bool = True
+    spin_us: float = 0.0
+    priority: int = 80
+    cpu: int | None = None
+    require_realtime: bool = False
+    heartbeat_timeout_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One run: law, driver, references, schedule. `ticks` None runs until told to stop."""
+
+    name: str
+    axes: tuple[str, ...]
+    pacing: Pacing
+    ticks: int | None
+    driver_kind: str
+    driver_options: Mapping[str, Any]
+    wiring: Mapping[str, Wiring]
+    coefficients: npt.NDArray[Any]
+    mode: Mode
+    generators: npt.NDArray[Any]
+    table: npt.NDArray[np.float64]
+    schedule: npt.NDArray[Any]
+    observed: tuple[str, ...]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of a record."""
+        return columns(self.axes, self.observed)
+
+    @property
+    def sizes(self) -> Sizes:
+        """Sizes of the shared block."""
+        axes = len(self.axes)
+        return Sizes(len(self.columns), axes, self.pacing.rate_hz, snapshot_bytes(axes), self.table.size)
+
+    def driver(self) -> Driver:
+        """The driver, not open. Raises ValueError or DriverError."""
+        kind = driver_class(self.driver_kind)
+        return kind(kind.options_model(**self.driver_options), self.wiring, self.pacing.rate_hz)
+
+
+def require_facts(driver: Driver, rate_hz: float, paced: bool) -> Facts:
+    """The driver's facts. Raises ValueError where rate or virtual time do not suit them."""
+    facts = driver.facts
+    if rate_hz > facts.max_rate_hz:
+        raise ValueError(f"loop.rate_hz: {rate_hz:g} is above the {facts.max_rate_hz:g} Hz of driver {driver.kind!r}")
+    if facts.real and not paced:
+        raise ValueError(f"driver {driver.kind!r} moves real hardware: it cannot run unpaced, in virtual time")
+    return facts

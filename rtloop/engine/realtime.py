@@ -1,0 +1,83 @@
+"""What the host grants a real-time process, asked for one by one and each reported as granted or refused."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import platform
+from typing import Any
+
+from rtloop.engine.plan import Pacing
+
+PR_SET_PDEATHSIG, PR_SET_TIMERSLACK = 1, 29
+MCL_CURRENT, MCL_FUTURE = 1, 2
+PM_QOS_DEVICE = "/dev/cpu_dma_latency"
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
+    """Ask for everything that keeps ticks on time, for the calling thread. What was granted, by name."""
+    report: dict[str, Any] = {
+        "scheduler": "SCHED_OTHER",
+        "priority": 0,
+        "mlock": False,
+        "affinity": sorted(os.sched_getaffinity(0)),
+        "kernel": f"{platform.release()} {platform.version()}",
+        "timer_slack_ns": None,
+        "pm_qos": False,
+        "refused": [],
+    }
+    if not pacing.paced:
+        return report
+    _try(report, "affinity", lambda: _affinity(pacing.cpu))
+    _try(report, "mlock", lambda: _checked(_libc.mlockall(MCL_CURRENT | MCL_FUTURE)) or True)
+    _try(report, "timer_slack_ns", lambda: _checked(_libc.prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)) or 1)
+    _try(report, "pm_qos", _hold_pm_qos)
+    _try(report, "priority", lambda: _fifo(pacing.priority))
+    if report["priority"]:
+        report["scheduler"] = "SCHED_FIFO"
+    return report
+
+
+def freeze_garbage_collection() -> None:
+    """No collection may start while the loop runs."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def die_with_parent() -> None:
+    """End with the supervisor. For virtual time alone: a real output must be ramped down first."""
+    _libc.prctl(PR_SET_PDEATHSIG, 9, 0, 0, 0)
+
+
+def _try(report: dict[str, Any], name: str, request: Any) -> None:
+    try:
+        report[name] = request()
+    except OSError as error:
+        report["refused"].append(f"{name}: {os.strerror(error.errno or 0)}")
+
+
+def _checked(result: int) -> int:
+    if result != 0:
+        raise OSError(ctypes.get_errno(), "refused")
+    return result
+
+
+def _affinity(cpu: int | None) -> list[int]:
+    if cpu is not None:
+        os.sched_setaffinity(0, {cpu})
+    return sorted(os.sched_getaffinity(0))
+
+
+def _fifo(priority: int) -> int:
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    return priority
+
+
+def _hold_pm_qos() -> bool:
+    """Keep the processors out of deep idle states while this process lives: the open file is the request."""
+    fd = os.open(PM_QOS_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
+    os.write(fd, (0).to_bytes(4, "little"))
+    return True

@@ -1,0 +1,56 @@
+"""Errors that a user meets, each with the exit code of the command line.
+
+    RtloopError
+    ├── ConfigError      78  the configuration, with every fault in it
+    ├── UnavailableError 69  hardware or service not available
+    ├── OutputError      73  the output cannot be written
+    ├── RefusedError     77  refused by the host
+    └── LoopFault         1  the loop tripped, lost data or failed
+
+Recordings add theirs in `rtloop.recording.errors`, drivers in `drivers.errors` (also 69).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class RtloopError(Exception):
+    """Base: the message names the thing, the value and what is allowed."""
+
+    exit_code = 1
+
+
+class ConfigError(RtloopError):
+    """A configuration that cannot run; `faults` lists all that is wrong with it."""
+
+    exit_code = 78
+
+    def __init__(self, source: str, faults: Sequence[str]) -> None:
+        self.faults = list(faults)
+        count = "1 fault" if len(self.faults) == 1 else f"{len(self.faults)} faults"
+        super().__init__("\n  ".join([f"{source}: {count}", *self.faults]))
+
+
+class UnavailableError(RtloopError):
+    """Hardware or a service is not there."""
+
+    exit_code = 69
+
+
+class OutputError(RtloopError):
+    """A file or folder cannot be written."""
+
+    exit_code = 73
+
+
+class RefusedError(RtloopError):
+    """The host does not allow what the configuration requires."""
+
+    exit_code = 77
+
+
+class LoopFault(RtloopError):
+    """The loop did not do what it was asked."""
+
+    exit_code = 1

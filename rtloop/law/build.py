@@ -1,0 +1,126 @@
+"""Coefficients of the law from its options: everything that can fail, fails here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from drivers.base import Channel
+from rtloop.design.discretise import DiscreteController
+from rtloop.design.realisation import row_bands
+from rtloop.law.hysteresis import LANES
+from rtloop.law.layout import COEFFICIENTS, MAX_ORDER, Records, records
+from rtloop.law.options import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
+
+
+def axis_coefficients(
+    axis: AxisOptions,
+    controller: DiscreteController | None,
+    um_per_v: float,
+    offset_v: float,
+    output: Channel,
+    period_s: float,
+) -> Records:
+    """Coefficients (1,) of one axis.
+
+    Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
+    """
+    coefficients = records(COEFFICIENTS, 1)
+    fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v}
+    fields |= _feedforward(axis.feedforward)
+    fields |= _controller(controller)
+    fields |= _prefilter(axis.prefilter)
+    fields |= limit_fields(axis.limits, output, period_s)
+    fields |= interlock_fields(axis.interlocks)
+    for name, value in fields.items():
+        _assign(coefficients, name, value)
+    return coefficients
+
+
+def _assign(coefficients: Records, name: str, value: object) -> None:
+    """Set a scalar, or the leading part of an array."""
+    numbers = np.asarray(value)
+    target = coefficients[name][0]
+    if numbers.ndim == 0:
+        coefficients[name][0] = numbers
+    else:
+        target[tuple(slice(0, length) for length in numbers.shape)] = numbers
+
+
+def _feedforward(options: FeedforwardOptions) -> Mapping[str, object]:
+    forward, inverse = options.models()
+    return {
+        "play_count": -(-forward.weights.size // LANES) * LANES,
+        "model_thresholds_v": forward.thresholds,
+        "model_weights_um_per_v": forward.weights,
+        "inverse_thresholds_um": inverse.thresholds,
+        "inverse_weights_v_per_um": inverse.weights,
+        "dead_band_v": forward.thresholds[0] if options.dead_band == "exact" else 0.0,
+        "dead_band_threshold_v": options.dead_band_threshold_v,
+    }
+
+
+def _controller(controller: DiscreteController | None) -> Mapping[str, object]:
+    if controller is None:
+        return {}
+    order = controller.b.size
+    if order > MAX_ORDER:
+        raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
+    bands = row_bands(controller.a)
+    return {
+        "order": order,
+        "a": controller.a,
+        "b": controller.b,
+        "c": controller.c,
+        "d": controller.d,
+        "row_start": bands[:, 0],
+        "row_stop": bands[:, 1],
+        "tracking": controller.antiwindup,
+        "steady_state": controller.steady_state_gain,
+    }
+
+
+def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
+    fields: dict[str, object] = {"tap_count": len(options.taps), "section_count": len(options.sections)}
+    if options.taps:
+        fields["taps"] = options.taps
+    if options.sections:
+        fields["sections"] = options.sections
+    return fields
+
+
+def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Mapping[str, float]:
+    """Limits per tick. Raises ValueError for a drive beyond the channel's range."""
+    if -options.drive_v < output.minimum_v or options.drive_v > output.maximum_v:
+        largest = min(-output.minimum_v, output.maximum_v)
+        raise ValueError(f"limits.drive_v: {options.drive_v} is outside the driver's ±{largest} V")
+    slew = float("inf") if options.slew_v_per_s is None else options.slew_v_per_s * period_s
+    return {
+        "drive_min_v": -options.drive_v,
+        "drive_max_v": options.drive_v,
+        "safe_v": output.safe_v,
+        "command_limit_um": options.command_um,
+        "slew_v_per_tick": slew,
+        "trip_slew_v_per_tick": options.trip_slew_v_per_s * period_s,
+        "bump_decay": float(np.exp(-period_s / options.bump_s)),
+    }
+
+
+def interlock_fields(options: InterlockOptions) -> Mapping[str, float]:
+    """Thresholds as the law compares them."""
+    if options.sensor_min_v >= options.sensor_max_v:
+        raise ValueError(
+            f"interlocks.sensor_min_v: {options.sensor_min_v} must be below sensor_max_v, {options.sensor_max_v}"
+        )
+    return {
+        "sensor_min_v": options.sensor_min_v,
+        "sensor_max_v": options.sensor_max_v,
+        "position_limit_um": options.position_um,
+        "sample_age_limit_us": options.sample_age_us,
+    }
+
+
+def joined(parts: Sequence[Records]) -> Records:
+    """Coefficients of all axes."""
+    return np.concatenate(parts).view(np.recarray)

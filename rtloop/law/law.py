@@ -1,0 +1,121 @@
+"""The law of one tick for all axes: `evaluate` before the drive is written, `update` after.
+
+    x_d ─► pre-filter ─(+)─ e ─► C(z) ─► v ─► limit ─► P̂⁻¹ ─► demand ─► limit, slew ─► u
+                        −▲ x
+
+Modes replace the left part: FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip
+ramp u to its safe value. Every change of mode continues from the drive in force.
+"""
+
+from __future__ import annotations
+
+from hil.compiled import jit
+from rtloop.law.filters import controller_enter, controller_output, controller_update, prefilter
+from rtloop.law.hysteresis import follow_drive, inverse_drive
+from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
+from rtloop.signals import Flag, Mode
+
+OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
+COMMAND_LIMITED = int(Flag.COMMAND_LIMITED)
+DRIVE_LIMITED = int(Flag.DRIVE_LIMITED)
+SLEW_LIMITED = int(Flag.SLEW_LIMITED)
+RAMPING = int(Flag.RAMPING)
+HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
+NEGLIGIBLE_BUMP = 1e-9
+
+
+@jit
+def set_mode(axes, loop, mode, at_rest):
+    """Change the mode; bumplessly, but from zero state `at_rest`, before anything was driven."""
+    loop.mode = mode
+    for a in range(axes.shape[0]):
+        axes[a].entering = 0 if at_rest else 1
+
+
+@jit
+def reset_trip(loop):
+    """Forget the causes of a trip; the mode stays OFF until it is set."""
+    loop.trip = 0
+    loop.mode = OFF
+
+
+@jit
+def evaluate(coefficients, axes, loop, adc_v, references, driver_status, sample_age_us, heartbeat_lost):
+    """Drives of this tick, in `axes[a].drive_v`, from the inputs in V and the references (µm; V in RAW mode)."""
+    causes = loop_causes(driver_status, heartbeat_lost)
+    for a in range(axes.shape[0]):
+        state = axes[a]
+        state.position_um = (adc_v[a] - coefficients[a].offset_v) * coefficients[a].um_per_v
+        state.usable = 1 if usable(adc_v[a]) and usable(references[a]) else 0
+        causes |= axis_causes(coefficients[a], state, adc_v[a], sample_age_us)
+    loop.new_trip = causes & ~loop.trip
+    loop.trip |= causes
+    if loop.trip != 0:
+        loop.mode = OFF
+    loop.flags = loop.trip | (HEARTBEAT_LOST if heartbeat_lost else 0)
+    loop.settled = 1
+    for a in range(axes.shape[0]):
+        loop.flags |= _drive(coefficients[a], axes[a], loop, references[a])
+        if axes[a].drive_v != coefficients[a].safe_v:
+            loop.settled = 0
+
+
+@jit
+def _drive(coefficients, state, loop, reference):
+    """Set the signals and the drive of one axis; returns its flags."""
+    last_v = state.drive_v
+    if state.usable != 0:
+        state.error_um = prefilter(coefficients, state, reference) - state.position_um
+    else:
+        state.error_um = reference - state.position_um
+        if loop.new_trip != 0:  # hold for the tick that trips; the ramp below needs no input
+            state.demand_v = last_v
+            return RAMPING
+    if loop.mode == OFF:
+        state.drive_v = toward(last_v, coefficients.safe_v, coefficients.trip_slew_v_per_tick)
+        state.demand_v = coefficients.safe_v
+        state.command_um = state.applied_command_um
+        return 0 if state.drive_v == coefficients.safe_v else RAMPING
+    flags = 0
+    if loop.mode == RAW:
+        state.command_um = state.applied_command_um
+        state.demand_v = reference + _bump(coefficients, state, last_v - reference)
+    else:
+        if loop.mode == FEEDFORWARD:
+            state.command_um = reference + _bump(coefficients, state, state.applied_command_um - reference)
+        else:
+            if state.entering != 0:
+                controller_enter(coefficients, state, state.error_um, state.applied_command_um)
+            state.command_um = controller_output(coefficients, state, state.error_um)
+        limited = clip(state.command_um, -coefficients.command_limit_um, coefficients.command_limit_um)
+        if limited != state.command_um:
+            flags |= COMMAND_LIMITED
+        state.demand_v = inverse_drive(coefficients, state, limited)
+    state.entering = 0
+    allowed = clip(state.demand_v, coefficients.drive_min_v, coefficients.drive_max_v)
+    if allowed != state.demand_v:
+        flags |= DRIVE_LIMITED
+    state.drive_v = toward(last_v, allowed, coefficients.slew_v_per_tick)
+    if state.drive_v != allowed:
+        flags |= SLEW_LIMITED
+    return flags
+
+
+@jit
+def _bump(coefficients, state, gap):
+    """The decaying offset that makes a new mode continue from where the old one was."""
+    state.bump = gap if state.entering != 0 else state.bump * coefficients.bump_decay
+    if -NEGLIGIBLE_BUMP < state.bump < NEGLIGIBLE_BUMP:
+        state.bump = 0.0
+    return state.bump
+
+
+@jit
+def update(coefficients, axes, loop):
+    """Advance every memory by the drives really applied."""
+    for a in range(axes.shape[0]):
+        state = axes[a]
+        state.applied_command_um = follow_drive(coefficients[a], state, state.drive_v)
+        if loop.mode == CLOSED_LOOP:
+            shortfall_um = state.applied_command_um - state.command_um
+            controller_update(coefficients[a], state, state.error_um, shortfall_um)

@@ -1,0 +1,134 @@
+"""Coefficients and state of the law as fixed-size records: their bytes are what a recording keeps and a replay uses.
+
+One record per axis, so that one compiled kernel serves every configuration. Sizes are upper bounds; `*_count` says
+how much of an array is in use.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+MAX_PLAYS = 64
+MAX_ORDER = 24
+MAX_TAPS = 128
+MAX_SECTIONS = 12
+
+Records = np.recarray[Any, Any]
+
+COEFFICIENTS = np.dtype(
+    [
+        # sensor scale
+        ("um_per_v", np.float64),
+        ("offset_v", np.float64),
+        # inverse Prandtl-Ishlinskii and the forward model that it inverts
+        ("play_count", np.int64),
+        ("inverse_thresholds_um", np.float64, (MAX_PLAYS,)),
+        ("inverse_weights_v_per_um", np.float64, (MAX_PLAYS,)),
+        ("model_thresholds_v", np.float64, (MAX_PLAYS,)),
+        ("model_weights_um_per_v", np.float64, (MAX_PLAYS,)),
+        ("dead_band_v", np.float64),
+        ("dead_band_threshold_v", np.float64),
+        # controller C(z): x⁺ = A x + b e, v = c x + d e; only columns start ≤ j < stop of a row of A are non-zero
+        ("order", np.int64),
+        ("row_start", np.int64, (MAX_ORDER,)),
+        ("row_stop", np.int64, (MAX_ORDER,)),
+        ("a", np.float64, (MAX_ORDER, MAX_ORDER)),
+        ("b", np.float64, (MAX_ORDER,)),
+        ("c", np.float64, (MAX_ORDER,)),
+        ("d", np.float64),
+        ("tracking", np.float64, (MAX_ORDER,)),
+        ("steady_state", np.float64, (MAX_ORDER,)),
+        # reference pre-filter: FIR taps, then second-order sections b0 b1 b2 a1 a2
+        ("tap_count", np.int64),
+        ("taps", np.float64, (MAX_TAPS,)),
+        ("section_count", np.int64),
+        ("sections", np.float64, (MAX_SECTIONS, 5)),
+        # limits; rates are per tick
+        ("command_limit_um", np.float64),
+        ("drive_min_v", np.float64),
+        ("drive_max_v", np.float64),
+        ("safe_v", np.float64),
+        ("slew_v_per_tick", np.float64),
+        ("trip_slew_v_per_tick", np.float64),
+        ("bump_decay", np.float64),
+        # interlocks
+        ("sensor_min_v", np.float64),
+        ("sensor_max_v", np.float64),
+        ("position_limit_um", np.float64),
+        ("sample_age_limit_us", np.float64),
+    ],
+    align=True,
+)
+STATE = np.dtype(
+    [
+        ("inverse_plays_um", np.float64, (MAX_PLAYS,)),
+        ("model_plays_v", np.float64, (MAX_PLAYS,)),
+        ("moved_um", np.float64, (MAX_PLAYS,)),
+        ("dead_band_direction", np.float64),
+        ("controller", np.float64, (MAX_ORDER,)),
+        ("scratch", np.float64, (MAX_ORDER,)),
+        ("tap_index", np.int64),
+        ("tap_history", np.float64, (MAX_TAPS,)),
+        ("section_history", np.float64, (MAX_SECTIONS, 2)),
+        ("bump", np.float64),
+        ("entering", np.int64),
+        ("usable", np.int64),
+        # signals of the current tick
+        ("position_um", np.float64),
+        ("error_um", np.float64),
+        ("command_um", np.float64),
+        ("applied_command_um", np.float64),
+        ("demand_v", np.float64),
+        ("drive_v", np.float64),
+    ],
+    align=True,
+)
+LOOP_STATE = np.dtype(
+    [("mode", np.int64), ("trip", np.int64), ("new_trip", np.int64), ("flags", np.int64), ("settled", np.int64)],
+    align=True,
+)
+"""State common to all axes: Mode; latched causes and those of this tick, as Flag bits; flags of this tick; 1 when
+every output is at its safe value."""
+
+
+def records(dtype: np.dtype[Any], count: int) -> Records:
+    """Zeroed records, with attribute access also where the kernels run uncompiled."""
+    return np.zeros(count, dtype).view(np.recarray)
+
+
+def initial_state(coefficients: Records) -> tuple[Records, Records]:
+    """State of (axes, loop) at rest: outputs at their safe values, an unloaded actuator that never moved."""
+    axes = records(STATE, coefficients.size)
+    axes["drive_v"] = coefficients["safe_v"]
+    return axes, records(LOOP_STATE, 1)
+
+
+def snapshot_bytes(axes: int) -> int:
+    """Length of a snapshot: tick, coefficients and state."""
+    return 8 + axes * (COEFFICIENTS.itemsize + STATE.itemsize) + LOOP_STATE.itemsize
+
+
+def split_snapshot(snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[int, Records, Records, Records]:
+    """Tick, coefficients, axes' state and loop state of a snapshot, as copies.
+
+    Raises ValueError where the length does not fit `axes`.
+    """
+    data = bytes(snapshot)
+    if len(data) != snapshot_bytes(axes):
+        raise ValueError(f"law snapshot: {len(data)} bytes, but {axes} axes take {snapshot_bytes(axes)}")
+    offset, parts = 8, []
+    for dtype, count in ((COEFFICIENTS, axes), (STATE, axes), (LOOP_STATE, 1)):
+        parts.append(np.frombuffer(data, dtype, count, offset).copy().view(np.recarray))
+        offset += count * dtype.itemsize
+    return int.from_bytes(data[:8], "little"), parts[0], parts[1], parts[2]
+
+
+def layout_description() -> dict[str, Any]:
+    """What a recording says of the snapshot's layout: the fields with their offsets, and a digest of them."""
+    tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
+    described = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
+    return {**described, "sha256": hashlib.sha256(repr(described).encode()).hexdigest()}

@@ -1,0 +1,235 @@
+"""From a configuration to a plan: all that can be judged before anything runs is judged here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drivers.base import Channel, Facts, index_of
+from drivers.errors import DriverError
+from drivers.registry import driver_class
+from rtloop.config import Configuration, ScheduleOptions
+from rtloop.design.compare import Comparison, compare
+from rtloop.design.discretise import DiscreteController, discretise
+from rtloop.design.loop import LoopAnalysis, analyse_continuous, analyse_discrete
+from rtloop.design.transfer import Transfer
+from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
+from rtloop.engine.plan import Pacing, Plan, require_facts
+from rtloop.errors import ConfigError
+from rtloop.law.build import axis_coefficients, joined
+from rtloop.law.layout import Records
+from rtloop.law.options import AxisOptions
+from rtloop.law.reference import GENERATOR
+from rtloop.references import TableOfSamples, generator_values
+from rtloop.signals import Mode
+
+
+@dataclass(frozen=True)
+class AxisCheck:
+    """What is known of an axis before it runs; None where there is no controller or no model."""
+
+    name: str
+    controller: Transfer | None = None
+    discrete: DiscreteController | None = None
+    comparison: Comparison | None = None
+    continuous: LoopAnalysis | None = None
+    running: LoopAnalysis | None = None
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A plan with the facts and findings behind it."""
+
+    configuration: Configuration
+    plan: Plan
+    facts: Facts
+    checks: tuple[AxisCheck, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass
+class _Findings:
+    faults: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def attempt(self, where: str, build: Callable[[], Any]) -> Any:
+        """The result of `build`, or None with its ValueError as a fault at `where`."""
+        try:
+            return build()
+        except ValueError as error:
+            self.faults.append(f"{where}{error}")
+            return None
+
+
+def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
+    """Build law, references and schedule. Raises ConfigError with all faults, DriverError for a missing library."""
+    findings, rate_hz = _Findings(), configuration.loop.rate_hz
+    facts = findings.attempt("driver.", lambda: _facts(configuration, paced))
+    if facts is None:
+        raise ConfigError(configuration.name, findings.faults)
+    checks, coefficients = [], []
+    for axis in configuration.axes:
+        check = _check(axis, 1.0 / rate_hz, findings)
+        checks.append(check)
+        coefficients.append(_coefficients(configuration, axis, check.discrete, facts, findings))
+        if axis.controller is None and _uses_closed_loop(configuration):
+            findings.faults.append(f"axis.{axis.name}.controller: missing; mode closed_loop needs it")
+    table = TableOfSamples()
+    generators = _generators(configuration, facts, table, findings)
+    schedule = _schedule(configuration, facts, table, findings)
+    ticks = _ticks(duration_s, rate_hz, findings)
+    if findings.faults:
+        raise ConfigError(configuration.name, findings.faults)
+    plan = Plan(
+        name=configuration.name,
+        axes=tuple(axis.name for axis in configuration.axes),
+        pacing=_pacing(configuration, paced),
+        ticks=ticks,
+        driver_kind=configuration.driver_kind,
+        driver_options=configuration.driver_options.model_dump(exclude_unset=True),
+        wiring=configuration.wiring,
+        coefficients=joined(coefficients),
+        mode=Mode[configuration.loop.mode.upper()],
+        generators=generators,
+        table=table.samples,
+        schedule=schedule,
+        observed=facts.observed,
+    )
+    return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
+
+
+def _facts(configuration: Configuration, paced: bool) -> Facts:
+    kind = driver_class(configuration.driver_kind)
+    try:
+        driver = kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
+        return require_facts(driver, configuration.loop.rate_hz, paced)
+    except DriverError as error:
+        raise ConfigError(configuration.name, [f"driver: {error}"]) from None
+
+
+def _pacing(configuration: Configuration, paced: bool) -> Pacing:
+    loop = configuration.loop
+    return Pacing(
+        loop.rate_hz, paced, loop.spin_us, loop.priority, loop.cpu, loop.require_realtime, loop.heartbeat_timeout_s
+    )
+
+
+def _ticks(duration_s: float | None, rate_hz: float, findings: _Findings) -> int | None:
+    if duration_s is None:
+        return None
+    ticks = round(duration_s * rate_hz) if np.isfinite(duration_s) else 0
+    if ticks < 1:
+        findings.faults.append(f"--duration: {duration_s} s is no tick at {rate_hz:g} Hz; at least one period is needed")
+    return ticks
+
+
+def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck:
+    """C(z), its agreement with C(s), and the loop on the axis's model."""
+    if axis.controller is None:
+        return AxisCheck(axis.name)
+    where, options = f"axis.{axis.name}.controller", axis.controller
+    transfer = options.transfer()
+    discrete = findings.attempt(
+        f"{where}: ", lambda: discretise(transfer, period_s, options.method, options.prewarp_hz)
+    )
+    if discrete is None:
+        return AxisCheck(axis.name, transfer)
+    comparison = compare(transfer, discrete)
+    findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
+    if axis.model is None:
+        findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
+        return AxisCheck(axis.name, transfer, discrete, comparison)
+    plant = axis.model.transfer()
+    continuous = findings.attempt(f"axis.{axis.name}.model: ", lambda: analyse_continuous(transfer, plant))
+    running = findings.attempt(
+        f"axis.{axis.name}.model: ", lambda: analyse_discrete(discrete, plant, axis.model.delay_ticks if axis.model else 0)
+    )
+    if running is not None and not running.stable:
+        message_ = (
+            f"{where}: the loop is unstable on axis.{axis.name}.model at {1 / period_s:g} Hz "
+            f"(largest |pole| {running.max_abs_pole:.6f}, must be below 1)"
+        )
+        if options.allow_unstable:
+            findings.warnings.append(message_)
+        else:
+            findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
+    return AxisCheck(axis.name, transfer, discrete, comparison, continuous, running)
+
+
+def _coefficients(
+    configuration: Configuration,
+    axis: AxisOptions,
+    discrete: DiscreteController | None,
+    facts: Facts,
+    findings: _Findings,
+) -> Records | None:
+    channel, where = configuration.channels[axis.name], f"driver.channels.{axis.name}."
+    source = findings.attempt(where + "input: ", lambda: index_of(facts.inputs, channel.input))
+    sink = findings.attempt(where + "output: ", lambda: index_of(facts.outputs, channel.output))
+    if source is None or sink is None:
+        return None
+    output: Channel = facts.outputs[sink]
+    return findings.attempt(
+        f"axis.{axis.name}.",
+        lambda: axis_coefficients(
+            axis, discrete, channel.um_per_v, channel.offset, output, 1.0 / configuration.loop.rate_hz
+        ),
+    )
+
+
+def _uses_closed_loop(configuration: Configuration) -> bool:
+    modes = [configuration.loop.mode, *(entry.mode for entry in configuration.schedule)]
+    return "closed_loop" in modes
+
+
+def _generators(
+    configuration: Configuration, facts: Facts, table: TableOfSamples, findings: _Findings
+) -> np.ndarray[Any, Any]:
+    generators = np.zeros(len(configuration.axes), GENERATOR)
+    for i, axis in enumerate(configuration.axes):
+        values = findings.attempt(
+            f"axis.{axis.name}.reference.",
+            lambda axis=axis: generator_values(
+                axis.reference, configuration.loop.rate_hz, facts.inputs, configuration.folder, table
+            ),
+        )
+        if values is not None:
+            generators["kind"][i] = values[0]
+            generators["parameters"][i, : len(values) - 1] = values[1:]
+    return generators
+
+
+def _schedule(
+    configuration: Configuration, facts: Facts, table: TableOfSamples, findings: _Findings
+) -> np.ndarray[Any, Any]:
+    """Commands in the order of their ticks; entries of one tick keep the file's order."""
+    names = [axis.name for axis in configuration.axes]
+    entries = sorted(configuration.schedule, key=lambda entry: entry.at_tick)
+    commands = [np.zeros(0, MESSAGE)]
+    for entry in entries:
+        built = findings.attempt(
+            f"schedule, at_tick {entry.at_tick}: ",
+            lambda entry=entry: _command(entry, names, configuration, facts, table),
+        )
+        if built is not None:
+            commands.append(built)
+    return np.concatenate(commands)
+
+
+def _command(
+    entry: ScheduleOptions, names: list[str], configuration: Configuration, facts: Facts, table: TableOfSamples
+) -> np.ndarray[Any, Any]:
+    if entry.mode is not None:
+        kind, values = Kind.SET_MODE, (float(Mode[entry.mode.upper()]),)
+    elif entry.reference is not None:
+        kind = Kind.SET_REFERENCE
+        values = generator_values(
+            entry.reference, configuration.loop.rate_hz, facts.inputs, configuration.folder, table
+        )
+    else:
+        kind, values = Kind.RESET_TRIP, ()
+    axis = ALL_AXES if entry.axis is None else names.index(entry.axis)
+    return message(kind, tick=entry.at_tick, axis=axis, origin=Origin.SCHEDULE, values=values)

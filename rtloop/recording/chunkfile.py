@@ -1,0 +1,164 @@
+"""An MCAP file that grows chunk by chunk, each written whole or not at all.
+
+`PATH.part` while it grows, `PATH` once it has its index. Cut off at any moment, the file holds everything up to its
+last chunk; a full disk leaves room for the index by giving up the last chunks.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import zstandard
+from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
+
+from rtloop.recording.container import (
+    CHUNK_HEAD,
+    MAGIC,
+    pack_chunk,
+    pack_end,
+    pack_records,
+)
+from rtloop.recording.errors import OutputError
+
+LEVEL = 3
+"""zstd: at 10 kHz and one axis 0.70 µs and 73 bytes a tick; level 1: 0.52 µs, 85 bytes; level 5: 1.7 µs, 71 bytes."""
+
+
+class Content(NamedTuple):
+    """What a chunk holds: its records, the span of their log times, messages and index record by channel."""
+
+    records: bytes
+    start: int
+    end: int
+    counts: dict[int, int]
+    indexes: dict[int, bytes]
+
+
+class _Written(NamedTuple):
+    entry: ChunkIndex
+    counts: dict[int, int]
+    crc_before: int
+
+
+class ChunkFile:
+    """`repeated`: the schemas and channels that the summary repeats. All methods raise OutputError."""
+
+    def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord]) -> None:
+        self.path, self.part = path, path.with_name(path.name + ".part")
+        self.size = 0
+        self._repeated = repeated
+        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._chunks: list[_Written] = []
+        self._crc = 0
+        self._fd = self._open()
+        self._append(MAGIC + pack_records([header]))
+
+    def __len__(self) -> int:
+        return len(self._chunks)
+
+    def append(self, content: Content) -> None:
+        """Compress and write one chunk and its index records, if it has any."""
+        chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
+        after = self.size + len(chunk)
+        position, places = after, {}
+        for channel, record in content.indexes.items():
+            places[channel] = position
+            position += len(record)
+        entry = ChunkIndex(
+            chunk_length=len(chunk),
+            chunk_start_offset=self.size,
+            compression="zstd",
+            compressed_size=len(chunk) - CHUNK_HEAD.size,
+            message_end_time=content.end,
+            message_index_length=position - after,
+            message_index_offsets=places,
+            message_start_time=content.start,
+            uncompressed_size=len(content.records),
+        )
+        written = _Written(entry, content.counts, self._crc)
+        self._append(chunk + b"".join(content.indexes.values()))
+        self._chunks.append(written)
+
+    def drop_last(self) -> dict[int, int]:
+        """Take the last chunk off the file; returns its messages by channel."""
+        chunk = self._chunks.pop()
+        self.size, self._crc = chunk.entry.chunk_start_offset, chunk.crc_before
+        os.ftruncate(self._fd, self.size)
+        return chunk.counts
+
+    def write_end(self) -> None:
+        """The index and the footer."""
+        self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), self._index()))
+
+    def publish(self) -> None:
+        """Make the file durable and give it its final name; never replaces a file."""
+        try:
+            os.fsync(self._fd)
+            if self.path.exists():
+                raise OutputError(f"{self.path} appeared while it was written; the recording stays in {self.part}")
+            os.rename(self.part, self.path)
+            folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            os.fsync(folder)
+            os.close(folder)
+        except OSError as error:
+            raise self._refused(error) from None
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Give up the file as it is; idempotent."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _open(self) -> int:
+        if self.path.exists():
+            raise OutputError(f"{self.path} exists already; a recording is never overwritten")
+        try:
+            fd = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
+            return fd
+        except FileExistsError:
+            raise OutputError(f"{self.part} is left from an unfinished run; `rtloop recover` completes it") from None
+        except OSError as error:
+            raise self._refused(error) from None
+
+    def _append(self, data: bytes) -> None:
+        """All of `data` at the end of the file, or nothing of it."""
+        try:
+            done = 0
+            while done < len(data):
+                done += os.pwrite(self._fd, data[done:], self.size + done)
+        except OSError as error:
+            os.ftruncate(self._fd, self.size)
+            raise self._refused(error) from None
+        self.size += len(data)
+        self._crc = zlib.crc32(data, self._crc)
+
+    def _index(self) -> list[ChunkIndex]:
+        return [chunk.entry for chunk in self._chunks]
+
+    def _statistics(self) -> Statistics:
+        counts: dict[int, int] = {}
+        for chunk in self._chunks:
+            for channel, count in chunk.counts.items():
+                counts[channel] = counts.get(channel, 0) + count
+        return Statistics(
+            attachment_count=0,
+            channel_count=sum(isinstance(record, Channel) for record in self._repeated),
+            channel_message_counts=counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(counts.values()),
+            message_end_time=max(entry.message_end_time for entry in self._index()),
+            message_start_time=min(entry.message_start_time for entry in self._index()),
+            metadata_count=0,
+            schema_count=sum(isinstance(record, Schema) for record in self._repeated),
+        )
+
+    def _refused(self, error: OSError) -> OutputError:
+        return OutputError(f"{self.part}: {error.strerror}")

@@ -1,0 +1,142 @@
+"""Finding the chunks of an MCAP file: by its index, or by going through it where there is none to trust."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+
+from rtloop.recording.container import (
+    CHUNK_HEAD,
+    CHUNK_MARK,
+    CHUNK_MARK_OFFSET,
+    FOOTER_BYTES,
+    FOOTER_HEAD,
+    MAGIC,
+    PREFIX,
+    DamagedChunk,
+    parse_chunk_head,
+    parse_summary,
+)
+from rtloop.recording.errors import RecordingError
+
+SEARCH_BYTES = 1 << 20
+INDEX_HEAD_BYTES = PREFIX.size + 6
+
+
+class Entry(NamedTuple):
+    """Where a chunk record is, in bytes, and what the index says about it, if there is one."""
+
+    offset: int
+    length: int
+    index: ChunkIndex | None  # pyright: ignore[reportIncompatibleMethodOverride]
+
+
+class Source:
+    """A file opened for reading at any place from any thread. Raises RecordingError when it cannot be an MCAP file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self.size = os.fstat(self._fd).st_size
+            magic = os.pread(self._fd, len(MAGIC), 0)
+        except FileNotFoundError:
+            raise RecordingError(f"{path}: no such file{_hint(path)}") from None
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror}") from None
+        if magic != MAGIC:
+            os.close(self._fd)
+            what = "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
+            raise RecordingError(f"{path}: not a recording: {what or 'not an MCAP file'}")
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Up to `length` bytes; fewer at the end of the file."""
+        try:
+            return os.pread(self._fd, length, offset)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: {error.strerror}") from None
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+def _hint(path: Path) -> str:
+    part = path.with_name(path.name + ".part")
+    return f", but there is {part.name}, left from an unfinished run" if part.exists() else ""
+
+
+def indexed_chunks(source: Source) -> list[Entry]:
+    """The chunks by the index of a finished file. Raises DamagedChunk where there is none or it is damaged."""
+    tail = source.read(max(source.size - FOOTER_BYTES - len(MAGIC), 0), FOOTER_BYTES + len(MAGIC))
+    if len(tail) < FOOTER_BYTES + len(MAGIC) or not tail.endswith(MAGIC):
+        raise DamagedChunk("the file was not finished")
+    opcode, length, start, _ = FOOTER_HEAD.unpack_from(tail)
+    if opcode != Opcode.FOOTER or length != FOOTER_BYTES - PREFIX.size or not len(MAGIC) < start < source.size:
+        raise DamagedChunk("its end is damaged")
+    summary = source.read(start, source.size - len(MAGIC) - start)
+    return [Entry(index.chunk_start_offset, index.chunk_length, index) for index in parse_summary(summary)]
+
+
+def scanned_chunks(source: Source) -> tuple[list[Entry], list[str]]:
+    """The chunks found by going through the file, and what is wrong with it."""
+    entries: list[Entry] = []
+    problems: list[str] = []
+    position = len(MAGIC)
+    while position < source.size:
+        entry, length = _record_at(source, position)
+        if entry:
+            entries.append(entry)
+        if length:
+            position += length
+            continue
+        if source.read(position, 1) == bytes([Opcode.DATA_END]):
+            break
+        found = _next_chunk(source, position + 1)
+        if found is None:
+            problems.append(f"it ends in the middle of a chunk: {source.size - position} bytes are left out")
+            break
+        problems.append(f"bytes {position} to {found} are damaged")
+        position = found
+    return entries, problems
+
+
+def _record_at(source: Source, position: int) -> tuple[Entry | None, int]:
+    """The chunk at `position`, and the length of the record there: 0 if it is none that a recording has."""
+    head = source.read(position, CHUNK_HEAD.size)
+    if len(head) < INDEX_HEAD_BYTES:
+        return None, 0
+    opcode, length = PREFIX.unpack_from(head)
+    whole = PREFIX.size + length
+    if position + whole > source.size:
+        return None, 0
+    if opcode == Opcode.CHUNK:
+        try:
+            parse_chunk_head(head)
+        except DamagedChunk:
+            return None, 0
+        return Entry(position, whole, None), whole
+    entries_length = int.from_bytes(head[PREFIX.size + 2 : INDEX_HEAD_BYTES], "little")
+    is_index = opcode == Opcode.MESSAGE_INDEX and length == 6 + entries_length
+    is_header = opcode == Opcode.HEADER and position == len(MAGIC)
+    return None, whole if is_index or is_header else 0
+
+
+def _next_chunk(source: Source, position: int) -> int | None:
+    """Offset of the next whole chunk record that begins at or behind `position`."""
+    search = position + CHUNK_MARK_OFFSET
+    while search < source.size:
+        block = source.read(search, SEARCH_BYTES)
+        place = block.find(CHUNK_MARK)
+        while place >= 0:
+            candidate = search + place - CHUNK_MARK_OFFSET
+            if _record_at(source, candidate)[0]:
+                return candidate
+            place = block.find(CHUNK_MARK, place + 1)
+        if len(block) < SEARCH_BYTES:
+            return None
+        search += len(block) - len(CHUNK_MARK) + 1
+    return None

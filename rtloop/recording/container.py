@@ -1,0 +1,153 @@
+"""The MCAP container, as bytes: chunk records, the summary section, and the reverse. It knows nothing of ticks.
+
+Layout of a file (https://mcap.dev/spec): magic, header, chunks, data end, summary, footer, magic. Only three things
+are under a checksum: the content of a chunk, the summary section, and (in a finished file) the data section whole.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    Statistics,
+    SummaryOffset,
+)
+
+MAGIC = b"\x89MCAP0\r\n"
+PREFIX = struct.Struct("<BQ")
+CHUNK_HEAD = struct.Struct("<BQQQQII4sQ")
+CHUNK_MARK = struct.pack("<I4s", 4, b"zstd")
+"""Compression's name inside every chunk record: what a search for chunks looks for."""
+CHUNK_MARK_OFFSET = 37
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+FOOTER_HEAD = struct.Struct("<BQQQ")
+FOOTER_BYTES = FOOTER_HEAD.size + 4
+DATA_END_BYTES = PREFIX.size + 4
+LARGEST_CHUNK_BYTES = 64 << 20
+"""Uncompressed; beyond that a chunk is taken as damaged rather than allocated."""
+
+
+class DamagedChunk(Exception):
+    """The bytes of a chunk are not what was written."""
+
+
+class ChunkHead(NamedTuple):
+    """A chunk's fixed fields; times in ns since the UNIX epoch, sizes in bytes."""
+
+    start: int
+    end: int
+    uncompressed: int
+    crc: int
+    compressed: int
+
+
+def pack_message(channel: int, log_time: int, payload: bytes) -> bytes:
+    """One message record."""
+    length = MESSAGE_HEAD.size - PREFIX.size + len(payload)
+    return MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel, 0, log_time, log_time) + payload
+
+
+def pack_records(records: Iterable[McapRecord]) -> bytes:
+    """Any records, one after the other."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return builder.end()
+
+
+def pack_chunk(records: bytes, start: int, end: int, compressor: zstandard.ZstdCompressor) -> bytes:
+    """A chunk record over `records`."""
+    data = compressor.compress(records)
+    length = CHUNK_HEAD.size - PREFIX.size + len(data)
+    crc = zlib.crc32(records)
+    return CHUNK_HEAD.pack(Opcode.CHUNK, length, start, end, len(records), crc, 4, b"zstd", len(data)) + data
+
+
+def parse_chunk_head(data: bytes) -> ChunkHead:
+    """The fields of a chunk record's beginning. Raises DamagedChunk unless they agree with each other."""
+    if len(data) < CHUNK_HEAD.size:
+        raise DamagedChunk("cut off")
+    opcode, length, start, end, uncompressed, crc, name_length, name, compressed = CHUNK_HEAD.unpack_from(data)
+    good = opcode == Opcode.CHUNK and name_length == 4 and name == b"zstd"
+    if not good or length != CHUNK_HEAD.size - PREFIX.size + compressed or uncompressed > LARGEST_CHUNK_BYTES:
+        raise DamagedChunk("its header contradicts itself")
+    return ChunkHead(start, end, uncompressed, crc, compressed)
+
+
+def unpack_chunk(record: bytes) -> bytes:
+    """The uncompressed content of a whole chunk record. Raises DamagedChunk unless its checksum agrees."""
+    head = parse_chunk_head(record)
+    data = memoryview(record)[CHUNK_HEAD.size :]
+    if len(data) != head.compressed:
+        raise DamagedChunk("cut off")
+    try:
+        # The frame's own idea of its size is checked first, so that a damaged one cannot ask for all the memory.
+        if zstandard.get_frame_parameters(data).content_size != head.uncompressed:
+            raise DamagedChunk("its size is not what it says")
+        content = zstandard.ZstdDecompressor().decompress(data)
+    except zstandard.ZstdError:
+        raise DamagedChunk("it cannot be decompressed") from None
+    if zlib.crc32(content) != head.crc:
+        raise DamagedChunk("its checksum differs")
+    return content
+
+
+def split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of each record in `data`. Raises DamagedChunk where lengths do not add up."""
+    position = 0
+    while position < len(data):
+        if position + PREFIX.size > len(data):
+            raise DamagedChunk("a record is cut off")
+        opcode, length = PREFIX.unpack_from(data, position)
+        position += PREFIX.size
+        if position + length > len(data):
+            raise DamagedChunk("a record is cut off")
+        yield opcode, data[position : position + length]
+        position += length
+
+
+def pack_end(
+    data_crc: int, data_end: int, repeated: Sequence[McapRecord], statistics: Statistics, index: Sequence[ChunkIndex]
+) -> bytes:
+    """Everything after the last chunk: data end, summary, footer, magic. `data_end`: bytes in front of it."""
+    start = data_end + DATA_END_BYTES
+    summary, offsets = b"", []
+    groups: dict[type[McapRecord], list[McapRecord]] = {}
+    for record in (*repeated, statistics, *index):
+        groups.setdefault(type(record), []).append(record)
+    for group in groups.values():
+        packed = pack_records(group)
+        offsets.append(SummaryOffset(packed[0], start + len(summary), len(packed)))
+        summary += packed
+    offsets_start = start + len(summary)
+    summary += pack_records(offsets)
+    head = FOOTER_HEAD.pack(Opcode.FOOTER, 20, start, offsets_start)
+    footer = Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))
+    return pack_records([DataEnd(data_crc)]) + summary + pack_records([footer]) + MAGIC
+
+
+def parse_summary(data: bytes) -> list[ChunkIndex]:
+    """Chunk indexes from `data`: the summary section and the footer without magic. Raises DamagedChunk."""
+    (crc,) = struct.unpack_from("<I", data, len(data) - 4)
+    if zlib.crc32(data[:-4]) != crc:
+        raise DamagedChunk("the checksum of the summary differs")
+    try:
+        return [
+            ChunkIndex.read(ReadDataStream(io.BytesIO(content)))
+            for opcode, content in split_records(data[:-FOOTER_BYTES])
+            if opcode == Opcode.CHUNK_INDEX
+        ]
+    except (struct.error, ValueError, McapError) as error:
+        raise DamagedChunk(f"the chunk index cannot be read ({type(error).__name__})") from None

@@ -1,0 +1,68 @@
+"""What a chunk of a recording holds: either ticks alone, or messages of the slow topics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from rtloop.recording import format
+from rtloop.recording.chunks import Entry, Source
+from rtloop.recording.container import MESSAGE_HEAD, PREFIX, DamagedChunk, parse_chunk_head, split_records
+
+
+class Message(NamedTuple):
+    """A message for one of the slow topics; `log_time` in ns since the UNIX epoch."""
+
+    channel: int
+    log_time: int
+    payload: bytes
+
+
+def may_hold(entry: Entry, channel: int) -> bool:
+    """Whether a chunk may hold messages of a channel: every chunk but those of ticks is indexed by channel."""
+    if entry.index is None:
+        return True
+    return channel in (entry.index.message_index_offsets or {format.TICKS})
+
+
+def read_chunk(source: Source, entry: Entry) -> bytes:
+    """The chunk record. Raises DamagedChunk where it contradicts the index, which has a checksum."""
+    record = source.read(entry.offset, entry.length)
+    if entry.index:
+        head = parse_chunk_head(record)
+        said = entry.index.message_start_time, entry.index.message_end_time, entry.index.uncompressed_size
+        if (head.start, head.end, head.uncompressed) != said:
+            raise DamagedChunk("it contradicts the index")
+    return record
+
+
+def is_ticks(content: bytes) -> bool:
+    """Whether a chunk holds ticks."""
+    return content[:1] == bytes([Opcode.MESSAGE]) and _channel(content[PREFIX.size :]) == format.TICKS
+
+
+def tick_rows(content: bytes, dtype: np.dtype[Any], names: Sequence[str]) -> np.ndarray[Any, Any]:
+    """The columns `names` of a chunk of ticks, shape (n, names). Raises DamagedChunk."""
+    if len(content) % dtype.itemsize:
+        raise DamagedChunk("its length is not that of whole ticks")
+    records = np.frombuffer(content, dtype)
+    if np.any(records["_length"] != dtype.itemsize - PREFIX.size):
+        raise DamagedChunk("it holds more than ticks")
+    return format.tick_rows(records, names)
+
+
+def split_messages(content: bytes) -> list[Message]:
+    """The messages of a chunk of the slow topics. Raises DamagedChunk."""
+    head = MESSAGE_HEAD.size - PREFIX.size
+    return [
+        Message(_channel(record), int.from_bytes(record[6:14], "little"), record[head:])
+        for opcode, record in split_records(content)
+        if opcode == Opcode.MESSAGE
+    ]
+
+
+def _channel(record: bytes) -> int:
+    return int.from_bytes(record[:2], "little")

@@ -1,0 +1,75 @@
+"""Events as they are recorded: the loop's fixed-size message as a JSON object, and back without loss.
+
+`what` holds the message's `values` and `identity` as they were, so that a replay can execute the same commands, and
+beside them what they mean in words.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
+from rtloop.signals import Mode, trip_causes
+
+Event = dict[str, Any]
+GAP, FINISHED, ROTATED, RECOVERED = "gap", "finished", "rotated", "recovered"
+"""Kinds that the recorder itself writes; `who` is "recorder"."""
+FINAL = (FINISHED, ROTATED, RECOVERED)
+"""One of these ends a file; its `what` holds the totals."""
+
+
+def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
+    """The event of one record of MESSAGE; `time_ns` since the start of the run."""
+    values = [float(value) for value in message["values"]]
+    kind, axis = int(message["kind"]), int(message["axis"])
+    meaning: dict[str, Any] = {}
+    if kind == Kind.SET_MODE:
+        meaning = {"mode": _name(Mode, values[0])}
+    elif kind == Kind.TRIPPED:
+        meaning = {"causes": trip_causes(values[0])}
+    return {
+        "tick": int(message["tick"]),
+        "time_ns": time_ns,
+        "kind": _name(Kind, kind),
+        "who": _name(Origin, int(message["origin"])),
+        "axis": axes[axis] if 0 <= axis < len(axes) else None,
+        "what": {**meaning, "values": [_json(value) for value in values], "identity": int(message["identity"])},
+    }
+
+
+def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
+    """The record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder's own."""
+    if event["kind"] in (GAP, *FINAL):
+        return None
+    record = np.zeros(1, MESSAGE)
+    record["tick"], record["identity"] = event["tick"], event["what"]["identity"]
+    record["kind"], record["origin"] = _number(Kind, event["kind"]), _number(Origin, event["who"])
+    record["axis"] = ALL_AXES if event["axis"] is None else list(axes).index(event["axis"])
+    record["values"][0] = [float(value) for value in event["what"]["values"]]
+    return record
+
+
+def recorder_event(kind: str, tick: int, time_ns: int, what: dict[str, Any]) -> Event:
+    """An event of the recorder's own."""
+    return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": "recorder", "axis": None, "what": what}
+
+
+def _name(kinds: Any, value: float) -> str:
+    """The member's name in lower case, or the number where this version knows none."""
+    try:
+        return str(kinds(int(value)).name).lower()
+    except (ValueError, OverflowError):
+        return str(value)
+
+
+def _number(kinds: Any, name: str) -> int:
+    return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
+
+
+def _json(value: float) -> float | str:
+    """JSON has no words for NaN and infinity: they are written as strings that float() understands."""
+    return value if math.isfinite(value) else repr(value)

@@ -1,0 +1,146 @@
+"""What a recording holds: topics, schemas and the exact layout of a tick's message.
+
+A tick is one MCAP message record of fixed length, so a chunk of ticks is an array of `tick_dtype`: it is encoded and
+decoded a whole chunk at a time. Its payload is protobuf (https://protobuf.dev/programming-guides/encoding): per
+column one tag and eight bytes, with explicit presence, so that zeros are written too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from rtloop.signals import DEADLINE
+
+FORMAT = 1
+PROFILE = "rtloop"
+LIBRARY = "rtloop"
+TICKS, EVENTS, LAW, CONFIGURATION = 1, 2, 3, 4
+"""Channel ids."""
+TICK_SCHEMA, EVENT_SCHEMA, CONFIGURATION_SCHEMA = 1, 2, 3
+LAW_ENCODING = "rtloop-law"
+"""Message encoding of `/law`: SHA-256 of what follows (32 bytes), tick (uint64, little-endian), the law's own bytes."""
+MAX_CHUNK_BYTES = 1 << 20
+PREFIX_BYTES = 9
+"""Opcode and length in front of every MCAP record."""
+MAX_COLUMNS = 2047
+"""Field numbers up to this need at most two bytes of tag."""
+
+Records = np.ndarray[Any, Any]
+_DOUBLE = 1
+_WIRE_64BIT = 1
+_WIRE_BYTES = 2
+_EVENT = {
+    "title": "rtloop.Event",
+    "type": "object",
+    "properties": {
+        "tick": {"type": "integer"},
+        "time_ns": {"type": "integer", "description": "since the start of the run"},
+        "kind": {"type": "string"},
+        "who": {"type": "string"},
+        "axis": {"type": ["string", "null"]},
+        "what": {"type": "object"},
+    },
+}
+_CONFIGURATION = {"title": "rtloop.Configuration", "type": "object"}
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def _number(field: int, value: int) -> bytes:
+    return _varint(field << 3) + _varint(value)
+
+
+def _text(field: int, value: bytes | str) -> bytes:
+    data = value.encode() if isinstance(value, str) else value
+    return _varint(field << 3 | _WIRE_BYTES) + _varint(len(data)) + data
+
+
+def tick_schema(columns: Sequence[str]) -> bytes:
+    """Serialised FileDescriptorSet of `rtloop.Tick` (proto2): column i is `optional double NAME = i + 1`."""
+    fields = b"".join(
+        _text(2, _text(1, name) + _number(3, number) + _number(4, 1) + _number(5, _DOUBLE))
+        for number, name in enumerate(columns, start=1)
+    )
+    file = _text(1, "rtloop/tick.proto") + _text(2, "rtloop") + _text(4, _text(1, "Tick") + fields)
+    return _text(1, file + _text(12, "proto2"))
+
+
+def schemas(columns: Sequence[str]) -> list[Schema]:
+    """The schema records of a recording with these columns."""
+    return [
+        Schema(id=TICK_SCHEMA, name="rtloop.Tick", encoding="protobuf", data=tick_schema(columns)),
+        Schema(id=EVENT_SCHEMA, name="rtloop.Event", encoding="jsonschema", data=json.dumps(_EVENT).encode()),
+        Schema(
+            id=CONFIGURATION_SCHEMA,
+            name="rtloop.Configuration",
+            encoding="jsonschema",
+            data=json.dumps(_CONFIGURATION).encode(),
+        ),
+    ]
+
+
+def channels() -> list[Channel]:
+    """The channel records of every recording."""
+    rows = (
+        (TICKS, "/ticks", "protobuf", TICK_SCHEMA),
+        (EVENTS, "/events", "json", EVENT_SCHEMA),
+        (LAW, "/law", LAW_ENCODING, 0),
+        (CONFIGURATION, "/configuration", "json", CONFIGURATION_SCHEMA),
+    )
+    return [
+        Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema)
+        for number, topic, encoding, schema in rows
+    ]
+
+
+def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
+    """A tick's whole MCAP message record, prefix included, without padding; columns by name."""
+    fields = [("_opcode", "u1"), ("_length", "<u8"), ("_channel", "<u2"), ("_sequence", "<u4")]
+    fields += [("_log_time", "<u8"), ("_publish_time", "<u8")]
+    for number, name in enumerate(columns, start=1):
+        fields += [(f"_tag_{number}", "u1" if number < 16 else "<u2"), (name, "<f8")]
+    return np.dtype(fields)
+
+
+def blank_ticks(columns: Sequence[str], count: int) -> Records:
+    """`count` records of `tick_dtype` with everything filled in that does not change from tick to tick."""
+    records = np.zeros(count, tick_dtype(columns))
+    records["_opcode"] = Opcode.MESSAGE
+    records["_length"] = records.dtype.itemsize - PREFIX_BYTES
+    records["_channel"] = TICKS
+    for number in range(1, len(columns) + 1):
+        records[f"_tag_{number}"] = int.from_bytes(_varint(number << 3 | _WIRE_64BIT), "little")
+    return records
+
+
+def fill_ticks(records: Records, columns: Sequence[str], rows: np.ndarray[Any, Any], start_unix_ns: int) -> None:
+    """Put `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`; log time is start + deadline, in ns."""
+    for index, name in enumerate(columns):
+        records[name] = rows[:, index]
+    records["_log_time"] = rows[:, DEADLINE].astype(np.int64) + start_unix_ns
+    records["_publish_time"] = records["_log_time"]
+
+
+def tick_rows(records: Records, columns: Sequence[str]) -> np.ndarray[Any, Any]:
+    """The (n, columns) float64 values of records of `tick_dtype`, bit for bit; each column is contiguous."""
+    rows = np.empty((len(columns), len(records))).T
+    for index, name in enumerate(columns):
+        rows[:, index] = records[name]
+    return rows
+
+
+def chunk_rows(columns: Sequence[str]) -> int:
+    """Ticks in a full chunk."""
+    return MAX_CHUNK_BYTES // tick_dtype(columns).itemsize

@@ -1,0 +1,136 @@
+"""The recorder: a process beside the loop that copies the rings into a file and computes nothing.
+
+    python -m rtloop.recording.recorder --fd N
+
+N is the shared block. One JSON line on stdin starts it: {"path": ".../NAME.mcap", "header": {...}} and optionally
+"options": the fields of `session.Options`. It ends when the loop has and the rings are empty, and prints one JSON
+line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. SIGINT and SIGTERM are
+ignored, for the loop's last ticks are to be recorded too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.atomics import load_acquire, store_release
+from hil.compiled import jit
+from rtloop.engine.memory import ProcessState, SharedBlock, Word
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.rings import RingReader
+from rtloop.recording.session import Options, Session
+
+POLL_S = 0.03
+UNPACED_POLL_S = 0.0002
+ABANDONED_S = 5.0
+"""With the supervisor gone and no new tick for this long, the loop is taken as gone too."""
+
+
+@jit
+def load_word(words, index):
+    """One control word."""
+    return load_acquire(words, index)
+
+
+@jit
+def store_word(words, index, value):
+    """Set one control word."""
+    store_release(words, index, value)
+
+
+class Recorder:
+    """Polls the rings of `block` into a Session until the loop has ended. Ready once constructed."""
+
+    def __init__(self, block: SharedBlock) -> None:
+        self._words = block.words
+        self.set_word(Word.RECORDER_PID, os.getpid())
+        for name in ("ticks", "snapshots", "events"):
+            RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
+
+    def word(self, index: Word) -> int:
+        return int(load_word(self._words, int(index)))
+
+    def set_word(self, index: Word, value: int) -> None:
+        store_word(self._words, int(index), np.uint64(value))
+
+    def record(self, session: Session, pause_s: float) -> str:
+        """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned"."""
+        last_tick_s = time.monotonic()
+        while True:
+            state = self.word(Word.LOOP_STATE)
+            drained = session.drain()
+            self.set_word(Word.RECORDER_CURSOR, session.cursor)
+            session.write_due()
+            if session.error:
+                self.set_word(Word.RECORDER_STATE, ProcessState.FAILED)
+            if drained:
+                last_tick_s = time.monotonic()
+            elif state in (ProcessState.FINISHED, ProcessState.FAILED):
+                return ProcessState(state).name.lower()
+            elif time.monotonic() - last_tick_s > ABANDONED_S and _stdin_closed():
+                return "abandoned"
+            if drained < session.room:
+                time.sleep(pause_s)
+
+
+def _stdin_closed() -> bool:
+    readable, _, _ = select.select([0], [], [], 0)
+    return bool(readable) and os.read(0, 4096) == b""
+
+
+def _read_command() -> dict[str, Any]:
+    """The line that starts a recording; read unbuffered, so that a later end of stdin can be seen."""
+    line = b""
+    while not line.endswith(b"\n"):
+        part = os.read(0, 1 << 16)
+        if not part:
+            raise RecordingError("the recorder was given no file to write")
+        line += part
+    return json.loads(line)
+
+
+def run(fd: int) -> int:
+    """Record one run from the shared block at `fd`; returns the exit code."""
+    block = SharedBlock(fd)
+    recorder = Recorder(block)
+    recorder.set_word(Word.RECORDER_STATE, ProcessState.READY)
+    totals: dict[str, Any]
+    try:
+        command = _read_command()
+        header = command["header"]
+        session = Session(block, Path(command["path"]), header, Options(**command.get("options", {})))
+        recorder.set_word(Word.RECORDER_STATE, ProcessState.RUNNING)
+        result = recorder.record(session, POLL_S if header["paced"] else UNPACED_POLL_S)
+        totals = session.finish(result)
+    except RecordingError as error:
+        totals = {"complete": False, "error": str(error)}
+    totals["cpu_s"] = round(time.process_time(), 3)
+    good = totals["error"] is None
+    recorder.set_word(Word.RECORDER_STATE, ProcessState.FINISHED if good else ProcessState.FAILED)
+    with contextlib.suppress(BrokenPipeError):
+        print(json.dumps(totals), flush=True)
+    return 0 if good else 1
+
+
+def main() -> int:
+    """Command line entry."""
+    parser = argparse.ArgumentParser(prog="rtloop.recording.recorder", description="record the loop's rings")
+    parser.add_argument("--fd", type=int, required=True, help="file descriptor of the shared block")
+    arguments = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    return run(arguments.fd)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""Completes a recording that was killed, cut off or damaged: a new file with everything that is provably right.
+
+The original is never changed. A chunk is taken whole or not at all, by its checksum; what is left out is said.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.recording import format
+from rtloop.recording.contents import Message
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.events import FINAL, FINISHED, RECOVERED, recorder_event
+from rtloop.recording.reader import Reader, Rows
+from rtloop.recording.writer import Writer
+from rtloop.signals import DEADLINE, TICK
+
+Progress = Callable[[int], None]
+
+
+def output_of(path: Path) -> Path:
+    """The recovered file's name: NAME.mcap for NAME.mcap.part, NAME-recovered.mcap for a damaged NAME.mcap."""
+    return path.with_suffix("") if path.suffix == ".part" else path.with_name(f"{path.stem}-recovered.mcap")
+
+
+class Recovery:
+    """Copies what `reader` still finds into `writer`, and keeps account."""
+
+    def __init__(self, reader: Reader, writer: Writer) -> None:
+        self._reader, self._writer = reader, writer
+        self.next_tick: int = reader.header.get("first_tick", 0)
+        self.gaps: list[tuple[int, int]] = []
+        self._end_ns = 0.0
+        self._final: Message | None = None
+
+    def copy(self, progress: Progress | None = None) -> None:
+        """All chunks, in order."""
+        messages: list[Message]
+        for rows, messages in self._reader.chunks():
+            if rows is not None:
+                self._note_gaps(rows)
+                self._writer.write_ticks(rows)
+            else:
+                self._writer.write_messages([message for message in messages if self._is_content(message)])
+            if progress:
+                progress(self._writer.ticks)
+
+    def final(self, logged: int) -> Message:
+        """The event that ends the recovered file: the original one if nothing is missing, else what is."""
+        if self._final and not self._reader.problems and not self.gaps:
+            return self._final
+        what = {
+            "ticks_executed": self.next_tick,
+            "ticks_logged": logged,
+            "ticks_lost": sum(count for _, count in self.gaps),
+            "events_lost": 0,
+            "result": RECOVERED,
+            "complete": False,
+            "gaps": self.gaps,
+            "problems": self._reader.problems,
+        }
+        event = recorder_event(RECOVERED, self.next_tick, round(self._end_ns), what)
+        return Message(format.EVENTS, self._writer.start_unix_ns + round(self._end_ns), json.dumps(event).encode())
+
+    def _is_content(self, message: Message) -> bool:
+        """Whether to copy a message: the header is written already, and the end will be."""
+        if message.channel == format.EVENTS and json.loads(message.payload)["kind"] in FINAL:
+            self._final = message
+            return False
+        return message.channel != format.CONFIGURATION
+
+    def _note_gaps(self, rows: Rows) -> None:
+        ticks = np.concatenate([[self.next_tick - 1], rows[:, TICK]]).astype(np.int64)
+        for index in np.flatnonzero(np.diff(ticks) != 1):
+            self.gaps.append((int(ticks[index]) + 1, int(ticks[index + 1] - ticks[index]) - 1))
+        self.next_tick = int(ticks[-1]) + 1
+        self._end_ns = float(rows[-1, DEADLINE]) + 1e9 / self._reader.header["rate_hz"]
+
+
+def recover(path: Path | str, output: Path | str | None = None, progress: Progress | None = None) -> dict[str, Any]:
+    """Write a complete file from `path`; `progress` is told the ticks so far.
+
+    Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError.
+    """
+    path = Path(path)
+    output = output_of(path) if output is None else Path(output)
+    _refuse_growing(path)
+    with Reader(path, tolerant=True) as reader:
+        header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
+        writer = Writer(output, header, header["created_unix_ns"])
+        try:
+            writer.start_unix_ns = reader.start_unix_ns
+            recovery = Recovery(reader, writer)
+            recovery.copy(progress)
+            final = recovery.final(writer.ticks)
+            writer.finish(recovery.final)
+        except BaseException:
+            writer.close()
+            writer.part.unlink(missing_ok=True)
+            raise
+        what = json.loads(final.payload)
+        return {
+            "recording": str(path),
+            "output": str(output),
+            "ticks": writer.ticks,
+            "gaps": recovery.gaps,
+            "problems": reader.problems,
+            "complete": what["kind"] == FINISHED and what["what"]["complete"],
+        }
+
+
+def _refuse_growing(path: Path) -> None:
+    """The recorder holds a lock on the file that it writes."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return  # the reader says it better
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RecordingError(f"{path}: is being written by a recorder right now") from None
+    finally:
+        os.close(fd)

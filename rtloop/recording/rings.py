@@ -1,0 +1,32 @@
+"""Reading the loop's rings from Python: each reader has its cursor and counts what it lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rtloop.engine.memory import SharedBlock
+from rtloop.engine.ring import drain
+
+
+class RingReader:
+    """Reads the ring `name` of `block` from its beginning."""
+
+    def __init__(self, block: SharedBlock, name: str) -> None:
+        self._ring = block.ring(name)
+        self.position, self.lost = 0, 0
+
+    def take_into(self, out: np.ndarray[Any, Any]) -> tuple[int, int]:
+        """Copy whole slots into `out` as far as it reaches; returns (slots copied, slots lost in front of them)."""
+        copied, first, lost = drain(self._ring, np.uint64(self.position), out)
+        self.position = int(first) + copied
+        self.lost += int(lost)
+        return copied, int(lost)
+
+    def take(self) -> np.ndarray[Any, Any]:
+        """What is there, at most one ring full, as an array of its own."""
+        slots = self._ring.slots
+        out = np.empty(slots.shape, slots.dtype)
+        copied, _ = self.take_into(out)
+        return out[:copied]

@@ -1,0 +1,148 @@
+"""Writes one recording: the header first, then chunks of ticks and chunks of everything else."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Header, McapRecord
+
+from rtloop.recording import format
+from rtloop.recording.chunkfile import ChunkFile, Content
+from rtloop.recording.container import PREFIX, pack_message, pack_records
+from rtloop.recording.contents import Message
+from rtloop.recording.errors import OutputError
+
+
+class Writer:
+    """`path` is the finished file's name; `header` is kept as the `/configuration` message at `log_time` (UNIX ns).
+
+    Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds an index entry of 16 bytes to every tick: some viewers need it. Below `min_free_bytes` of
+    free space nothing more is written. Raises OutputError, here and from the methods; what was written stays good.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: dict[str, Any],
+        log_time: int,
+        *,
+        message_index: bool = False,
+        min_free_bytes: int = 0,
+    ) -> None:
+        self.path = path
+        self.start_unix_ns = log_time
+        self.ticks = 0
+        self._columns: list[str] = header["columns"]
+        self._message_index, self._min_free_bytes = message_index, min_free_bytes
+        self._blank = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
+        self._check_space()
+        repeated = [*format.schemas(self._columns), *format.channels()]
+        self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated)
+        self._write_header(header, log_time, repeated)
+
+    @property
+    def part(self) -> Path:
+        """The file's name while it is not finished."""
+        return self._file.part
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file so far."""
+        return self._file.size
+
+    def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
+        """Rows (n, columns) float64 of consecutive ticks, n at most `format.chunk_rows`, as one chunk."""
+        count = len(rows)
+        if count == 0:
+            return
+        self._check_space()
+        records = self._blank[:count]
+        format.fill_ticks(records, self._columns, rows, self.start_unix_ns)
+        times, index = records["_log_time"], {}
+        if self._message_index:
+            offsets = np.arange(count) * records.dtype.itemsize
+            index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
+        self._file.append(Content(records.tobytes(), int(times[0]), int(times[-1]), {format.TICKS: count}, index))
+        self.ticks += count
+
+    def write_messages(self, messages: Sequence[Message]) -> None:
+        """Messages of the slow topics as one chunk, with an index by topic."""
+        if messages:
+            self._check_space()
+            self._file.append(_content(messages))
+
+    def finish(self, final: Callable[[int], Message]) -> None:
+        """Add the message `final(ticks written)`, the index and the end; then give the file its name.
+
+        Where that does not fit on the disk, the last chunks make room for it.
+        """
+        kept = len(self._file)
+        while not self._end_fits(final):
+            while len(self._file) >= kept:
+                self.ticks -= self._file.drop_last().get(format.TICKS, 0)
+            kept -= 1
+        self._file.publish()
+
+    def close(self) -> None:
+        """Give up the file as it is; idempotent."""
+        self._file.close()
+
+    def _end_fits(self, final: Callable[[int], Message]) -> bool:
+        try:
+            self._file.append(_content([final(self.ticks)]))
+            self._file.write_end()
+        except OutputError:
+            if len(self._file) <= 1:
+                raise
+            return False
+        return True
+
+    def _write_header(self, header: dict[str, Any], log_time: int, repeated: Sequence[McapRecord]) -> None:
+        digest = hashlib.sha256(header.get("configuration", "").encode()).hexdigest()
+        payload = json.dumps({**header, "configuration_sha256": digest}).encode()
+        message = Message(format.CONFIGURATION, log_time, payload)
+        self._file.append(_content([message], pack_records(repeated)))
+
+    def _check_space(self) -> None:
+        if self._min_free_bytes == 0:
+            return
+        try:
+            status = os.statvfs(self.path.parent)
+        except OSError as error:
+            raise OutputError(f"{self.path}: {error.strerror}") from None
+        free = status.f_bavail * status.f_frsize
+        if free < self._min_free_bytes:
+            raise OutputError(
+                f"{self.path}: {free >> 20} MiB are free, at least {self._min_free_bytes >> 20} MiB are to stay free"
+            )
+
+
+def _content(messages: Sequence[Message], before: bytes = b"") -> Content:
+    """A chunk of `before` (records) and the messages, each in the index of its channel."""
+    records, places = bytearray(before), {}
+    for message in messages:
+        times, offsets = places.setdefault(message.channel, ([], []))
+        times.append(message.log_time)
+        offsets.append(len(records))
+        records += pack_message(*message)
+    return Content(
+        bytes(records),
+        min(message.log_time for message in messages),
+        max(message.log_time for message in messages),
+        {channel: len(place[0]) for channel, place in places.items()},
+        {channel: _index_record(channel, *place) for channel, place in places.items()},
+    )
+
+
+def _index_record(channel: int, times: Any, offsets: Any) -> bytes:
+    """A message index record; `times` in ns, `offsets` in bytes into the chunk's content."""
+    pairs = np.column_stack([np.asarray(times, np.uint64), np.asarray(offsets, np.uint64)]).tobytes()
+    head = PREFIX.pack(Opcode.MESSAGE_INDEX, 6 + len(pairs)) + channel.to_bytes(2, "little")
+    return head + len(pairs).to_bytes(4, "little") + pairs

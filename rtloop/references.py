@@ -1,0 +1,80 @@
+"""Reference options to generators: parameters of the compiled kinds, and one table that holds all samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.base import Channel, index_of
+from rtloop.law.options import (
+    ChirpOptions,
+    HoldOptions,
+    InputOptions,
+    ReferenceOptions,
+    StepsOptions,
+    TableOptions,
+)
+from rtloop.law.reference import Generator
+from rtloop.law.safety import USABLE_MAGNITUDE
+
+
+class TableOfSamples:
+    """Grows while references are built; `samples` is what the loop reads."""
+
+    def __init__(self) -> None:
+        self._parts: list[npt.NDArray[np.float64]] = []
+        self._size = 0
+
+    def add(self, samples: npt.NDArray[np.float64]) -> int:
+        """Index of the first of `samples` (n,)."""
+        first = self._size
+        self._parts.append(samples)
+        self._size += samples.size
+        return first
+
+    @property
+    def samples(self) -> npt.NDArray[np.float64]:
+        """All samples, one after the other."""
+        return np.concatenate(self._parts) if self._parts else np.zeros(0)
+
+
+def generator_values(
+    options: ReferenceOptions, rate_hz: float, inputs: tuple[Channel, ...], folder: Path, table: TableOfSamples
+) -> tuple[float, ...]:
+    """Generator kind, then its parameters. Raises ValueError for what cannot be a reference."""
+    if isinstance(options, HoldOptions):
+        return Generator.HOLD, options.value
+    if isinstance(options, StepsOptions):
+        hold_ticks = round(options.dwell_s * rate_hz)
+        if hold_ticks < 1:
+            raise ValueError(f"dwell_s: {options.dwell_s} is less than a period of {1 / rate_hz:g} s")
+        first = table.add(np.array(options.levels))
+        return Generator.TABLE, first, len(options.levels), hold_ticks, float(options.repeat)
+    if isinstance(options, TableOptions):
+        samples = _read_samples(folder / options.file)
+        return Generator.TABLE, table.add(samples), samples.size, options.hold_ticks, float(options.repeat)
+    if isinstance(options, ChirpOptions):
+        sweep = (options.amplitude, options.start_hz, options.end_hz, options.duration_s, options.offset)
+        return Generator.CHIRP, *sweep, float(options.logarithmic)
+    if isinstance(options, InputOptions):
+        return Generator.INPUT, index_of(inputs, options.channel), options.per_v, options.offset
+    kind = Generator.SINE if options.kind == "sine" else Generator.TRIANGLE
+    return kind, options.amplitude, options.frequency_hz, options.offset, options.phase_deg / 360
+
+
+def _read_samples(path: Path) -> npt.NDArray[np.float64]:
+    """A column of numbers. Raises ValueError."""
+    try:
+        loaded = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=1)
+    except OSError as error:
+        raise ValueError(f"file: {path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise ValueError(f"file: {path}: not a column of numbers ({error})") from None
+    samples = np.asarray(loaded, dtype=float)
+    if samples.ndim != 1 or samples.size == 0:
+        raise ValueError(f"file: {path}: shape {samples.shape}; one column of at least one number is needed")
+    if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
+        raise ValueError(f"file: {path}: holds numbers that are not finite or beyond {USABLE_MAGNITUDE:g}")
+    return samples

@@ -1,0 +1,108 @@
+"""The record of a tick: the one definition that ring, recording, replay and export share.
+
+A record is a row of float64. Its columns are the common signals, then the signals of each axis, then what the driver
+declares as observed (a rig's truth; recorded, never passed to the law).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+
+class Signal(NamedTuple):
+    name: str
+    unit: str
+    meaning: str
+
+
+COMMON = (
+    Signal("tick", "1", "index of the executed tick, from 0"),
+    Signal("deadline_ns", "ns", "when the tick was due, since the start of the run"),
+    Signal("lateness_us", "µs", "wake after the deadline; NaN in virtual time"),
+    Signal("read_us", "µs", "duration of the driver's read; NaN in virtual time"),
+    Signal("law_us", "µs", "from the end of the read to the start of the write; NaN in virtual time"),
+    Signal("write_us", "µs", "duration of the driver's write; NaN in virtual time"),
+    Signal("exec_us", "µs", "from wake to the end of the tick before this record is published; NaN in virtual time"),
+    Signal("periods_missed", "1", "whole periods that passed unused before this tick"),
+    Signal("flags", "1", "bits of Flag"),
+    Signal("mode", "1", "Mode in force during the tick"),
+    Signal("driver_status", "1", "what the driver's read returned: 0 good, > 0 degraded, < 0 failed"),
+    Signal("sample_age_us", "µs", "age of the sample as the driver knows it; 0 where it was taken by the read"),
+)
+PER_AXIS = (
+    Signal("adc_v", "V", "raw input"),
+    Signal("position_um", "µm", "measured position x"),
+    Signal("reference_um", "µm", "reference sample x_d as generated; volts in raw mode"),
+    Signal("error_um", "µm", "pre-filtered reference minus position, e"),
+    Signal("command_um", "µm", "command v to the inverse hysteresis, before its limit"),
+    Signal("demand_v", "V", "drive that the law asks for, before limit and slew"),
+    Signal("drive_v", "V", "drive u written to the driver"),
+)
+(
+    TICK,
+    DEADLINE,
+    LATENESS,
+    READ,
+    LAW,
+    WRITE,
+    EXEC,
+    PERIODS_MISSED,
+    FLAGS,
+    MODE,
+    DRIVER_STATUS,
+    SAMPLE_AGE,
+) = range(len(COMMON))
+ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE = range(len(PER_AXIS))
+COMMON_COUNT = len(COMMON)
+PER_AXIS_COUNT = len(PER_AXIS)
+
+
+class Mode(IntEnum):
+    """What drives the outputs. `reference` is in volts for RAW, in µm for FEEDFORWARD and CLOSED_LOOP."""
+
+    OFF = 0
+    RAW = 1
+    FEEDFORWARD = 2
+    CLOSED_LOOP = 3
+
+
+class Flag(IntFlag):
+    """Bits of the `flags` signal; the upper ones are the latched causes of a trip."""
+
+    OVERRUN = 1 << 0
+    COMMAND_LIMITED = 1 << 1
+    DRIVE_LIMITED = 1 << 2
+    SLEW_LIMITED = 1 << 3
+    RAMPING = 1 << 4
+    HEARTBEAT_LOST = 1 << 5
+    TRIP_NON_FINITE = 1 << 8
+    TRIP_SENSOR_RANGE = 1 << 9
+    TRIP_POSITION = 1 << 10
+    TRIP_DRIVER = 1 << 11
+    TRIP_HEARTBEAT = 1 << 12
+    TRIP_STALE = 1 << 13
+
+
+TRIP_MASK = ~0xFF & 0xFFFFFFFF
+
+
+def columns(axes: Sequence[str], observed: Sequence[str]) -> tuple[str, ...]:
+    """Names of a record's columns, in order: `tick`, …, `x_adc_v`, …, then the observed ones as given."""
+    return (
+        *(signal.name for signal in COMMON),
+        *(f"{axis}_{signal.name}" for axis in axes for signal in PER_AXIS),
+        *observed,
+    )
+
+
+def axis_column(axis: int, signal: int) -> int:
+    """Column of a per-axis signal (ADC … DRIVE) of axis number `axis`."""
+    return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
+
+
+def trip_causes(flags: float) -> list[str]:
+    """Names of the trip causes in a flags value, without their prefix, in lower case."""
+    bits = int(flags) & TRIP_MASK
+    return [flag.name.removeprefix("TRIP_").lower() for flag in Flag if flag & bits and flag.name]

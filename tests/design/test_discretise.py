@@ -1,0 +1,207 @@
+"""C(z) against exact arithmetic: the state space that runs, compared at 120 digits and more."""
+
+import cmath
+import math
+from itertools import chain
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import signal
+
+from rtloop.design.discretise import discretise
+from rtloop.design.paper import PAPER_C
+from rtloop.design.transfer import Transfer
+
+T = 1e-4
+HZ = np.array([0.1, 3.0, 107.9, 350.0, 595.5, 640.0, 2000.0, 4400.0])
+METHODS = [("matched", None), ("tustin", None), ("tustin", 595.5), ("foh", None), ("zoh", None)]
+
+
+def exact(zeros, poles, gain, method, prewarp_hz, hz):
+    """C(z) from the definitions, at hundreds of digits: repeated poles are set 1e-30 apart, and that cancels again."""
+    with mp.workdps(120 + 35 * len(poles)):
+        period = mp.mpf(T)
+        z = mp.exp(2j * mp.pi * mp.mpf(hz) * period)
+        zs, ps = [mp.mpmathify(complex(x)) for x in zeros], [mp.mpmathify(complex(x)) for x in poles]
+        if method == "tustin":
+            w0 = 2 * mp.pi * mp.mpf(prewarp_hz) if prewarp_hz else None
+            s = (z - 1) / (z + 1) * (w0 / mp.tan(w0 * period / 2) if w0 else 2 / period)
+            return complex(gain * mp.fprod(s - x for x in zs) / mp.fprod(s - x for x in ps))
+        if method == "matched":
+            zd, pd = [mp.exp(x * period) for x in zs], [mp.exp(x * period) for x in ps]
+            zd += [mp.mpf(-1)] * (len(pd) - len(zd))
+            near = mp.mpf("1e-40")  # both gains a little beside 0 Hz, where an integrator has one too
+            continuous = gain * mp.fprod(near - x for x in zs) / mp.fprod(near - x for x in ps)
+            at = mp.exp(near * period)
+            discrete = mp.fprod(at - x for x in zd) / mp.fprod(at - x for x in pd)
+            return complex(continuous / discrete * mp.fprod(z - x for x in zd) / mp.fprod(z - x for x in pd))
+        ps = [p + (abs(p) + 1) * (i + 1) * mp.mpf("1e-30") for i, p in enumerate(ps)]
+        total = mp.mpf(gain if len(zs) == len(ps) else 0)
+        for i, p in enumerate(ps):
+            residue = gain * mp.fprod(p - x for x in zs) / mp.fprod(p - q for j, q in enumerate(ps) if j != i)
+            grown = mp.exp(p * period)
+            if method == "zoh":
+                total += residue * (grown - 1) / p / (z - grown)
+            else:  # (z − 1)²/(Tz) times the z transform of the sampled ramp response
+                total += residue * ((z - 1) ** 2 / (z - grown) - (z - 1) - p * period) / (period * p**2)
+        return complex(total)
+
+
+def worst_error(transfer: Transfer, method, prewarp_hz, hz=HZ) -> float:
+    """Largest relative error, |C(z)| counting as no less than 1e-5 of the terms that c·x + d e adds up there.
+
+    Ten zeros in one place leave a sum of doubles nothing but its rounding, in any realisation; and what lies nine
+    powers of ten below the largest |C(z)| passes through unseen.
+    """
+    controller = discretise(transfer, T, method, prewarp_hz)
+    wanted = np.array([exact(transfer.zeros, transfer.poles, transfer.gain, method, prewarp_hz, f) for f in hz])
+    states = controller.system.states(np.exp(2j * np.pi * np.asarray(hz) * T))
+    terms = np.abs(states) @ np.abs(controller.c) + abs(controller.d)
+    size = np.maximum(np.maximum(np.abs(wanted), 1e-5 * terms), 1e-9 * np.abs(wanted).max())
+    return float(np.max(np.abs(controller.response(hz) - wanted) / size))
+
+
+@pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)
+def test_paper_controller_to_1e9(method, prewarp_hz) -> None:
+    """Eq (20) at 10 kHz."""
+    assert worst_error(PAPER_C, method, prewarp_hz) < 1e-9
+
+
+REPEATED = {
+    "double real": Transfer.from_factors(2e3, [[1, 30]], [[1, 200, 1e4]]),
+    "triple and a pair": Transfer.from_zpk([-50, -3000], [-900, -900, -900, -20 + 3700j, -20 - 3700j], 1e9),
+    "double pair": Transfer.from_zpk([-3, -4], [-50 + 3000j, -50 - 3000j] * 2, 1e8),
+    "cluster": Transfer.from_zpk([-10], [-100, -100.0001, -100.00015], 1e3),
+    "almost a double real": Transfer.from_zpk([], [-500 + 1e-4j, -500 - 1e-4j], 1e5),
+    "two integrators": Transfer.from_factors(40, [[1, 20], [1, 300]], [[1, 0], [1, 0], [1, 9000]]),
+    "order 10 in cascade": Transfer.from_factors(1e40, [], [[1, 2e4, 1e8]] * 5),
+    "order 9, biproper": Transfer.from_zpk([-70.0] * 9, [-700.0] * 9, 3.0),
+    "zero on a pole": Transfer.from_zpk([-700.0], [-700.0, -700.0], 3.0),
+}
+DISTINCT = {
+    "integrator": Transfer.from_factors(5, [[1, 40]], [[1, 0], [1, 6000]]),
+    "fast beside slow": Transfer.from_zpk([], [-1, -9e6], 1e7),
+    "odd": Transfer.from_zpk([-2, -3 + 40j, -3 - 40j], [-1, -300, -8 + 700j, -8 - 700j, -5000], 7.0),
+    "unstable zero": Transfer.from_factors(-20.7, [[1, -1.22e5]], [[1, 925, 4.59e5]]),
+}
+
+
+@pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)
+@pytest.mark.parametrize("name", [*REPEATED, *DISTINCT])
+def test_every_shape_to_1e9(name, method, prewarp_hz) -> None:
+    transfer = (REPEATED | DISTINCT)[name]
+    assert worst_error(transfer, method, prewarp_hz) < 1e-9
+    form = discretise(transfer, T, method, prewarp_hz).form
+    assert form == "cascade" if name in REPEATED else form == "modal"
+
+
+rates = st.floats(0, 4.6).map(lambda power: -(10**power))
+pairs = st.tuples(st.floats(1.5, 4.3), st.floats(0.005, 0.95)).map(
+    lambda p: [10 ** p[0] * cmath.exp(1j * sign * (math.pi - math.acos(p[1]))) for sign in (1, -1)]
+)
+roots = st.tuples(st.lists(rates, max_size=3), st.lists(pairs, max_size=3)).map(lambda r: [*r[0], *chain(*r[1])])
+
+
+@settings(max_examples=100, deadline=None)
+@given(poles=roots, zeros=roots, repeat=st.booleans(), integrator=st.booleans(), how=st.sampled_from(METHODS))
+def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
+    """State space = C(z), anti-windup stable and exact, steady state right; whatever the poles.
+
+    To 1e-8 here: six zeros near 3 Hz among poles far away cancel inside the cascade as well, and cost another digit.
+    """
+    poles = (poles + poles if repeat and len(poles) <= 5 else poles) + ([0.0] if integrator else [])
+    zeros = zeros[: len(poles)] if len(zeros) <= len(poles) else []
+    transfer = Transfer.from_zpk(zeros, poles, float(np.prod([abs(p) or 1 for p in poles])))
+    controller = discretise(transfer, T, *how)
+    assert worst_error(transfer, *how, hz=HZ[1::3]) < 1e-8
+    a, b, c, m = controller.a, controller.b, controller.c, controller.antiwindup
+    if np.abs(c).max(initial=0) > 1e-6:  # otherwise every pole has its zero
+        assert c @ m == pytest.approx(1.0, rel=1e-9)
+        assert np.abs(np.linalg.eigvals(a - np.outer(a @ m, c))).max() < 1
+    if not integrator:
+        x = controller.steady_state_gain
+        assert a @ x + b == pytest.approx(x, rel=1e-9, abs=1e-12)
+    for row, (first, end) in zip(a, controller.row_bands, strict=True):
+        assert np.all(row[:first] == 0) and np.all(row[end:] == 0)
+
+
+@pytest.mark.parametrize(("method", "theirs"), [("tustin", "bilinear"), ("zoh", "zoh"), ("foh", "foh")])
+def test_against_scipy(method, theirs) -> None:
+    """scipy.signal.cont2discrete on a well-conditioned system."""
+    numerator, denominator = [2.0, 300.0, 5e4], np.polymul([1, 100], [1, 150, 9e4])
+    num, den, _ = signal.cont2discrete((numerator, denominator), 1e-3, theirs)
+    controller = discretise(Transfer.from_transfer_function(numerator, denominator), 1e-3, method)
+    _, wanted = signal.freqz(np.ravel(num), den, np.pi * np.array([0.01, 0.1, 0.5, 0.9]))
+    assert controller.response([5, 50, 250, 450]) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_modal_blocks_and_bands_of_the_paper() -> None:
+    """Three real poles and a pair: rows touch 1, 1, 1, 2, 2 columns; rotations are scaled rotations."""
+    controller = discretise(PAPER_C, T, "matched")
+    assert controller.form == "modal"
+    assert controller.row_bands.tolist() == [[0, 1], [1, 2], [2, 3], [3, 5], [3, 5]]
+    assert controller.a[3, 3] == controller.a[4, 4] and controller.a[3, 4] == -controller.a[4, 3]
+
+
+def test_states_are_of_comparable_size() -> None:
+    """Each state's largest response to a unit sine lies near 1, though the modes' gains span 0.1 to 500."""
+    controller = discretise(PAPER_C, T, "matched")
+    z = np.exp(2j * np.pi * np.geomspace(0.001, 4999, 2000) * T)
+    peaks = np.abs(controller.system.states(z)).max(axis=0)
+    assert np.all((peaks > 0.5) & (peaks < 2))
+
+
+def test_static_controller_has_no_states() -> None:
+    for transfer in (Transfer.from_zpk([], [], 2.5), Transfer.from_zpk([], [-1], 0.0)):
+        controller = discretise(transfer, T, "matched")
+        assert controller.order == 0 and controller.a.shape == (0, 0) and controller.row_bands.shape == (0, 2)
+        assert controller.antiwindup.size == 0 and controller.steady_state_gain.size == 0
+        assert controller.d == controller.dc_gain == transfer.gain * (not transfer.order)
+        assert np.all(controller.response([1, 10]) == controller.d)
+
+
+def test_integrating_state_takes_the_correction_and_has_no_steady_state() -> None:
+    controller = discretise(DISTINCT["integrator"], T, "tustin")
+    integrating = np.flatnonzero(np.diag(controller.a) == 1)
+    assert integrating.size == 1 and math.isinf(controller.dc_gain)
+    assert np.all(controller.steady_state_gain[integrating] == 0)
+    assert (controller.c * controller.antiwindup)[integrating] == pytest.approx(1, abs=1e-6)
+
+
+def test_dc_gain_is_kept() -> None:
+    for method, prewarp_hz in METHODS:
+        assert discretise(PAPER_C, T, method, prewarp_hz).dc_gain == pytest.approx(593.569162, abs=1e-5)
+
+
+def test_unstable_controller_is_limited_stably_or_refused() -> None:
+    controller = discretise(Transfer.from_factors(10, [[1, 50]], [[1, -30], [1, 700]]), T, "matched")
+    error = controller.a - np.outer(controller.a @ controller.antiwindup, controller.c)
+    assert np.abs(np.linalg.eigvals(error)).max() < 1
+    hidden = Transfer.from_zpk([30.0], [30.0, -5.0], 1.0)  # the output does not see the unstable mode
+    with pytest.raises(ValueError, match="controller: "):
+        discretise(hidden, T, "matched")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0,), "period_s: 0.0; a positive"),
+        ((math.nan,), "period_s: nan"),
+        ((T, "euler"), "method: 'euler'; allowed are matched, tustin, foh, zoh"),
+        ((T, "matched", 595.5), "prewarp_hz: 595.5 with method 'matched'"),
+        ((T, "tustin", 5000.0), "prewarp_hz: 5000.0; between 0 and half the sampling rate, 5000 Hz"),
+    ],
+)
+def test_refusals(arguments, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        discretise(PAPER_C, *arguments)
+
+
+def test_roots_that_a_rule_cannot_map_are_refused() -> None:
+    with pytest.raises(ValueError, match="overflows"):
+        discretise(Transfer.from_zpk([8e6], [-1], 1), T, "matched")
+    with pytest.raises(ValueError, match="at infinity"):
+        discretise(Transfer.from_zpk([2 / T], [-1], 1), T, "tustin")

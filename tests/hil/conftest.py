@@ -1,0 +1,61 @@
+"""What the rig's tests share: a compiled run over a drive, and options with everything but one part made ideal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from hil.compiled import jit
+from hil.options import ConverterOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
+from hil.rig import advance, build_rig, sample
+
+IDEAL: dict[str, Any] = {
+    "hysteresis": HysteresisOptions(truth="custom", thresholds_v=(0.0,), weights_um_per_v=(1.0,)),
+    "sensor": SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0),
+    "adc": ConverterOptions(range_v=1e9, bits=0),
+    "dac": ConverterOptions(range_v=1e9, bits=0),
+}
+
+
+class Run(NamedTuple):
+    """Signals of a run, each of shape (ticks,): at tick k, before the drive of tick k."""
+
+    adc_v: np.ndarray
+    true_um: np.ndarray
+    hysteresis_um: np.ndarray
+
+
+@jit
+def _run(coefficients, state, drive_v, adc_v, true_um, hysteresis_um):
+    for k in range(drive_v.size):
+        adc_v[k] = sample(coefficients, state)
+        true_um[k] = state.true_position_um
+        hysteresis_um[k] = state.hysteresis_um
+        advance(coefficients, state, drive_v[k])
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., Run]:
+    """Drive one axis, `x`, of a rig from rest."""
+
+    def run_rig(drive_v: Any, options: RigOptions | None = None, period_s: float = 1e-4) -> Run:
+        drive = np.asarray(drive_v, dtype=float)
+        coefficients, state = build_rig(options or RigOptions(), ["x"], period_s)
+        signals = Run(*(np.empty(drive.size) for _ in Run._fields))
+        _run(coefficients[0], state[0], drive, *signals)
+        return signals
+
+    return run_rig
+
+
+@pytest.fixture(scope="session")
+def ideal() -> Callable[..., RigOptions]:
+    """Options of a rig that is linear, exact and free of noise, except for the parts given."""
+
+    def make(latency_ticks: int = 0, **parts: Any) -> RigOptions:
+        return RigOptions(plant=PlantOptions(**{**IDEAL, **parts}), latency_ticks=latency_ticks)
+
+    return make

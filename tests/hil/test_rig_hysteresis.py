@@ -1,0 +1,149 @@
+"""Hysteresis against max/min written out here, and against the paper's eq (4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.hysteresis import play
+from hil.options import DynamicsOptions, HysteresisOptions
+
+# Eq (4): thresholds r_i [V] and weights p_i [µm/V].
+R = np.array([0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9])
+P = np.array([2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09])
+RIGID = DynamicsOptions(form="zpk", gain=1.0)
+
+volts = st.floats(-20, 20)
+thresholds = st.floats(0, 10)
+
+
+def forward(drive: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Σ p_i F_{r_i}[u] from rest, F as in the text under eq (1): max(u − r, min(u + r, F₋))."""
+    held, out = np.zeros(R.size), []
+    for u in drive:
+        held = np.maximum(u - R, np.minimum(u + R, held))
+        out.append(weights @ held)
+    return np.array(out)
+
+
+def inverse_of_eq_4(command: np.ndarray) -> np.ndarray:
+    """Kuhnen's exact inverse (2003) of eq (4), r_0 taken as 0: z_j = Σ_{i<=j} p_i (r_j − r_i), g from partial sums."""
+    sums = np.cumsum(P)
+    z = np.array([P[: j + 1] @ (R[j] - R[: j + 1]) for j in range(R.size)])
+    g = np.array([1 / P[0], *(-P[1:] / (sums[1:] * sums[:-1]))])
+    held, out = np.zeros(R.size), []
+    for v in command:
+        held = np.maximum(v - z, np.minimum(v + z, held))
+        out.append(g @ held)
+    return np.array(out)
+
+
+def height_ratio(x: np.ndarray, y: np.ndarray) -> float:
+    """h/H of one closed loop, x a full period of a sine from its minimum: largest opening over total height."""
+    half = x.size // 2
+    up, down = y[: half + 1], y[half:][::-1]
+    opening = np.abs(np.interp(x[: half + 1], x[half:][::-1], down) - up).max()
+    return float(opening / (y.max() - y.min()))
+
+
+def periods(amplitude: float) -> np.ndarray:
+    """Three periods of a sine, from 0, 4000 points each."""
+    return amplitude * np.sin(2 * np.pi * np.arange(12001) / 4000)
+
+
+def displacement(run, ideal, truth: str, drive: np.ndarray) -> np.ndarray:
+    """y of the rig for each drive, without the period that it takes to be seen."""
+    options = ideal(hysteresis=HysteresisOptions(truth=truth), dynamics=RIGID)  # type: ignore[arg-type]
+    return run(np.append(drive, 0.0), options).hysteresis_um[1:]
+
+
+def test_initial_curve_at_10_v(run, ideal):
+    """Σ p_i max(10 − r_i, 0) with eq (4) = 43.01835 µm."""
+    assert displacement(run, ideal, "nominal", np.array([10.0]))[0] == pytest.approx(43.01835, abs=1e-5)
+
+
+def test_loop_of_eq_4_at_10_v(run, ideal):
+    """h/H = 14.659 % at ±10 V (the paper measured 16.3 % on the actuator itself)."""
+    drive = periods(10.0)
+    y = displacement(run, ideal, "nominal", drive)
+    one = slice(3000, 7001)
+    assert 100 * height_ratio(drive[one], y[one]) == pytest.approx(14.659, abs=0.01)
+
+
+def test_residual_truth_leaves_what_the_paper_shows(run, ideal):
+    """An inverse of eq (4) on p_0 = 2.3834, p_6 = 0.25452 leaves h/H = 3.75 % at 40 µm."""
+    command = periods(40.0)
+    y = displacement(run, ideal, "residual", inverse_of_eq_4(command))
+    one = slice(3000, 7001)
+    assert 100 * height_ratio(command[one], y[one]) == pytest.approx(3.75, abs=0.02)
+
+
+def test_nominal_truth_leaves_the_dead_band_only(run, ideal):
+    """The exact formula with r_0 taken as 0 leaves 0.7471 µm at 40 µm from rest: r_0 = 0.095 V lost in each turn."""
+    command = 40 * np.sin(2 * np.pi * np.arange(20001) / 10000)
+    y = displacement(run, ideal, "nominal", inverse_of_eq_4(command))
+    assert np.abs(y - command).max() == pytest.approx(0.7471, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("truth", "weights"),
+    [("nominal", P), ("residual", np.array([2.3834, *P[1:6], 0.25452, *P[7:]]))],
+)
+def test_both_truths_are_the_operator_written_out(run, ideal, truth, weights):
+    drive = np.cumsum(np.random.default_rng(1).normal(0, 2, 3000))
+    drive = np.abs((drive + 10) % 40 - 20) - 10
+    np.testing.assert_allclose(displacement(run, ideal, truth, drive), forward(drive, weights), rtol=0, atol=1e-12)
+
+
+def test_custom_model(run, ideal):
+    """Two plays by hand: u = 3, 1, −3 V with r = 0, 1 and p = 2, 10 gives 6 + 20, 2 + 20, −6 − 20 µm."""
+    options = ideal(
+        hysteresis=HysteresisOptions(truth="custom", thresholds_v=(0.0, 1.0), weights_um_per_v=(2.0, 10.0)),
+        dynamics=RIGID,
+    )
+    assert list(run([3.0, 1.0, -3.0, 0.0], options).hysteresis_um) == [0.0, 26.0, 22.0, -26.0]
+
+
+def test_history_is_remembered(run, ideal):
+    """A drive to 10 V and back leaves y = Σ p_i max(F, −r_i) there, at rest, and seen by the sensor at once."""
+    options = ideal(hysteresis=HysteresisOptions(truth="nominal", history_v=(10.0,)))
+    remanent = forward(np.array([10.0, 0.0]), P)[1]
+    seen = run(np.zeros(500), options)
+    np.testing.assert_allclose(seen.hysteresis_um, remanent, rtol=1e-13)
+    # D(0) of eq (5) is 1.01086419: at rest from the first tick on.
+    np.testing.assert_allclose(seen.true_um, 1.01086419 * remanent, rtol=1e-8)
+    assert remanent > 1
+
+
+@given(volts, thresholds, volts)
+def test_play_is_the_definition(drive, threshold, held):
+    """Krasnosel'skii & Pokrovskii 1989: max(u − r, min(u + r, y₋))."""
+    assert play(drive, threshold, held) == max(drive - threshold, min(drive + threshold, held))
+
+
+@given(volts, thresholds, volts)
+def test_play_stays_within_its_threshold(drive, threshold, held):
+    assert abs(play(drive, threshold, held) - drive) <= threshold + 1e-14
+
+
+@given(volts, volts, thresholds, volts)
+def test_play_is_monotone(one, other, threshold, held):
+    low, high = sorted((one, other))
+    assert play(low, threshold, held) <= play(high, threshold, held)
+
+
+@given(volts, volts, thresholds, st.lists(st.floats(0, 1), max_size=8))
+def test_play_does_not_see_the_rate(start, end, threshold, stops):
+    """On the way from one drive to another, any monotone stops in between change nothing."""
+    held = play(start, threshold, 0.0)
+    walked = held
+    for share in (*sorted(stops), 1.0):
+        walked = play(end if share == 1.0 else start + share * (end - start), threshold, walked)
+    assert walked == pytest.approx(play(end, threshold, held), abs=1e-13)
+
+
+@given(thresholds, volts)
+def test_play_holds_on_nan(threshold, held):
+    assert play(float("nan"), threshold, held) == held

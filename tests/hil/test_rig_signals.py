@@ -1,0 +1,159 @@
+"""Noise, sensor, converters and latency against arithmetic written out here."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.compiled import jit
+from hil.converters import convert, span
+from hil.noise import draw, seed_word
+from hil.options import ConverterOptions, DynamicsOptions, PlantOptions, RigOptions, SensorOptions
+from hil.rig import build_rig
+
+RIGID = DynamicsOptions(form="zpk", gain=1.0)
+WORDS = 2**64
+
+
+@jit
+def _draws(word, out):
+    for i in range(out.size):
+        out[i], word = draw(word)
+
+
+def draws(seed: int, stream: str, count: int) -> np.ndarray:
+    """`count` numbers of a stream."""
+    out = np.empty(count)
+    _draws(np.uint64(seed_word(seed, stream)), out)
+    return out
+
+
+def written_out(word: int, count: int) -> list[float]:
+    """xorshift64 (Marsaglia 2003: 13, 7, 17) in Python integers, twelve 16-bit fields summed, then standardised."""
+    out = []
+    for _ in range(count):
+        total = 0
+        for _ in range(3):
+            word ^= (word << 13) % WORDS
+            word ^= word >> 7
+            word ^= (word << 17) % WORDS
+            total += sum(word >> shift & 0xFFFF for shift in (0, 16, 32, 48))
+        out.append((total - 393210) / float(np.sqrt(2.0**32 - 1)))
+    return out
+
+
+def test_noise_is_the_documented_generator():
+    assert list(draws(7, "x", 200)) == written_out(seed_word(7, "x"), 200)
+
+
+def test_noise_moments():
+    """Irwin-Hall of 12: mean 0, variance 1, skewness 0, excess kurtosis −6/(5·12) = −0.1; bounds are 5 deviations."""
+    values = draws(0, "x", 1_000_000)
+    assert abs(values.mean()) < 5e-3
+    assert abs(values.var() - 1) < 7e-3
+    assert abs((values**3).mean()) < 1.2e-2
+    assert abs((values**4).mean() / values.var() ** 2 - 2.9) < 5e-2
+    assert np.abs(values).max() <= 6
+    # P(|z| > 2) of the Irwin-Hall sum differs from the Gaussian's 0.0455 by less than 0.002.
+    assert (np.abs(values) > 2).mean() == pytest.approx(0.0455, abs=2e-3)
+
+
+def test_noise_is_white():
+    values = draws(0, "x", 1_000_000)
+    for lag in (1, 2, 3, 7, 64):
+        assert abs((values[lag:] * values[:-lag]).mean()) < 5e-3
+
+
+def test_streams_do_not_depend_on_each_other():
+    names = ["x", "y"]
+    x, y = (draws(0, name, 200_000) for name in names)
+    assert abs(np.corrcoef(x, y)[0, 1]) < 0.012
+    assert len({seed_word(seed, name) for seed in range(50) for name in names}) == 100
+
+
+def test_seed_changes_samples_and_nothing_else_does(run):
+    one, again, other = (run(np.zeros(100), RigOptions(seed=seed)).adc_v for seed in (1, 1, 2))
+    assert one.tobytes() == again.tobytes()
+    assert one.tobytes() != other.tobytes()
+
+
+def test_an_axis_keeps_its_noise_beside_others():
+    alone, both = (build_rig(RigOptions(), axes, 1e-4)[1] for axes in (["y"], ["x", "y"]))
+    assert alone[0].noise_word == both[1].noise_word != both[0].noise_word
+
+
+def test_sensor_noise_has_the_rms_asked_for(run, ideal):
+    sensor = SensorOptions(um_per_v=10.0, noise_um=0.5, resolution_um=0.0, offset_um=3.0)
+    reading_um = 10 * run(np.zeros(100_000), ideal(sensor=sensor)).adc_v
+    assert reading_um.std() == pytest.approx(0.5, rel=0.02)
+    assert reading_um.mean() == pytest.approx(3.0, abs=0.01)
+
+
+def test_sensor_resolution_and_scale(run, ideal):
+    """1.26 µm + 0.5 µm at a resolution of 0.25 µm and 10 µm/V: 1.75 µm, 0.175 V."""
+    sensor = SensorOptions(um_per_v=10.0, noise_um=0.0, resolution_um=0.25, offset_um=0.5)
+    seen = run([1.26, 1.26], ideal(sensor=sensor, dynamics=RIGID))
+    assert seen.true_um[1] == 1.26
+    assert seen.adc_v[1] == 0.175
+
+
+@pytest.mark.parametrize(
+    ("value", "code"),
+    [(0.0, 0), (2.5, 2), (1.25 * 0.5, 0), (1.25 * 1.5, 2), (-1.25 * 2.5, -2), (10.0, 7), (99, 7), (-10, -8), (-99, -8)],
+)
+def test_converter_codes(value, code):
+    """4 bits over ±10 V: an LSB of 1.25 V, codes −8 … 7, halves to the even code."""
+    assert convert(*span(10.0, 4), float(value)) == 1.25 * code
+    if 2.5 > abs(value) > 0:
+        assert convert(*span(10.0, 4), float(value)) == 1.25 * round(Fraction(value) / Fraction(1.25))
+
+
+@given(st.floats(-9.9, 9.9), st.integers(8, 32))
+def test_converter_error_is_half_an_lsb_at_most(value, bits):
+    lsb = 20 / 2**bits
+    out = convert(*span(10.0, bits), value)
+    assert abs(out - value) <= lsb / 2 * (1 + 1e-6)
+    assert float(out / lsb).is_integer()
+
+
+@given(st.floats(-1e308, 1e308) | st.just(float("inf")) | st.just(float("-inf")))
+def test_ideal_converter_clips_only(value):
+    assert convert(*span(10.0, 0), value) == min(max(value, -10.0), 10.0)
+
+
+@pytest.mark.parametrize("bits", [0, 16])
+def test_nan_stays_visible_in_the_adc(bits):
+    assert np.isnan(convert(*span(10.0, bits), float("nan")))
+
+
+@pytest.mark.parametrize("latency", [0, 1, 3, 16])
+def test_latency(run, ideal, latency):
+    """Written in tick k, seen in tick k + 1 + latency; 0 V before."""
+    drive = np.arange(1.0, 61.0)
+    seen = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
+    np.testing.assert_array_equal(seen, np.concatenate([np.zeros(1 + latency), drive])[: drive.size])
+
+
+@pytest.mark.parametrize("latency", [0, 2])
+def test_nan_at_the_dac_holds_the_last_value(run, ideal, latency):
+    drive = [1.0, np.nan, np.nan, 4.0, 5.0, 0.0, 0.0, 0.0]
+    seen = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
+    assert list(seen[latency + 1 : latency + 6]) == [1.0, 1.0, 1.0, 4.0, 5.0]
+
+
+def test_dac_and_adc_both_convert(run):
+    """4 bits in the DAC: 3 V leaves as 2.5 V. 3 bits in the ADC at ±8 V: 2.5 V arrives as 2 V."""
+    plant = PlantOptions(
+        hysteresis={"truth": "custom", "thresholds_v": (0.0,), "weights_um_per_v": (1.0,)},  # type: ignore[arg-type]
+        dynamics=RIGID,
+        sensor=SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0),
+        adc=ConverterOptions(range_v=8.0, bits=3),
+        dac=ConverterOptions(bits=4),
+    )
+    seen = run([3.0, 3.0], RigOptions(plant=plant))
+    assert seen.true_um[1] == 2.5
+    assert seen.adc_v[1] == 2.0

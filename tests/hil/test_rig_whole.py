@@ -1,0 +1,160 @@
+"""The rig as a whole: what it does at its limits, and that it does the same in bytes, compiled or not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+
+from hil.options import (
+    CreepOptions,
+    DisturbanceOptions,
+    DynamicsOptions,
+    HysteresisOptions,
+    PlantOptions,
+    RigOptions,
+    SensorOptions,
+)
+from hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
+
+EXERCISE = """
+import hashlib
+import numpy as np
+from hil.options import CreepOptions, PlantOptions, RigOptions, SensorOptions
+from hil.rig import advance, build_rig, sample
+
+plant = PlantOptions(
+    creep=CreepOptions(gains=(0.1,), time_constants_s=(0.05,)),
+    sensor=SensorOptions(bandwidth_hz=1500.0, offset_um=0.3),
+)
+coefficients, state = build_rig(RigOptions(plant=plant, latency_ticks=2, seed=5), ["x", "y"], 1e-4)
+out = []
+for k in range(400):
+    for i in range(2):
+        out.append(float(sample(coefficients[i], state[i])))
+        advance(coefficients[i], state[i], float("nan") if k == 77 else (k * 37 % 500) / 25.0 - 10.0)
+print(hasattr(sample, "py_func"), hashlib.sha256(np.array(out).tobytes() + state.tobytes()).hexdigest())
+"""
+
+
+def exercise(disable_jit: bool) -> list[str]:
+    """Whether the kernels were compiled, and a digest of all samples and the last state, in a process of its own."""
+    environment = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path), NUMBA_DISABLE_JIT=str(int(disable_jit)))
+    command = [sys.executable, "-W", "error", "-c", EXERCISE]
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
+
+
+def test_uncompiled_kernels_give_the_same_bytes():
+    compiled, uncompiled = exercise(disable_jit=False), exercise(disable_jit=True)
+    assert (compiled[0], uncompiled[0]) == ("True", "False")
+    assert compiled[1] == uncompiled[1]
+
+
+def test_the_comparison_in_bytes_can_fail(run):
+    """One LSB of the DAC in one tick of 200 shows."""
+    drive = 9 * np.sin(np.arange(200) / 20)
+    other = drive.copy()
+    other[20] += 20 / 2**16
+    quiet = RigOptions(plant=PlantOptions(sensor=SensorOptions(noise_um=0.0, resolution_um=0.0)))
+    assert run(drive, quiet).adc_v.tobytes() == run(drive, quiet).adc_v.tobytes()
+    assert run(drive, quiet).true_um.tobytes() != run(other, quiet).true_um.tobytes()
+
+
+def test_full_square_wave_at_the_resonance(run):
+    """±10 V at 595.5 Hz drives the tip to about 376 µm, against 43 µm at rest: the drive limit protects no actuator."""
+    period = 1e-5
+    t = period * np.arange(100_000)
+    drive = np.where(t * 595.5 % 1 < 0.5, 10.0, -10.0)
+    options = RigOptions(plant=PlantOptions(hysteresis=HysteresisOptions(truth="nominal")))
+    peak = np.abs(run(drive, options, period).true_um).max()
+    assert peak == pytest.approx(376, abs=4)
+
+
+def test_a_rig_at_rest_reads_its_noise_only(run):
+    seen = run(np.zeros(10_000))
+    assert not seen.true_um.any()
+    assert not seen.hysteresis_um.any()
+    # 10 nm of noise rounded to 10 nm: √(10² + 10²/12) nm = 10.4 nm, at 10 µm/V.
+    assert 1e4 * seen.adc_v.std() == pytest.approx(10.4, rel=0.05)
+
+
+def test_disturbance_is_added_after_the_hysteresis(ideal):
+    coefficients, state = build_rig(ideal(), ["x"], 1e-4)
+    state[0].disturbance_um = 2.0
+    for _ in range(10_000):
+        advance(coefficients[0], state[0], 3.0)
+    sample(coefficients[0], state[0])
+    assert state[0].hysteresis_um == 3.0
+    # D(0) of eq (5).
+    assert state[0].true_position_um == pytest.approx(1.01086419 * 5.0, abs=1e-7)
+
+
+def test_disturbance_of_the_options(run, ideal):
+    """0.5 + 2 sin(2π·50·(t − 0.01 s)) µm from tick 100 on, through a rigid plant, seen one period later."""
+    options = ideal(
+        dynamics=DynamicsOptions(form="zpk", gain=1.0),
+        disturbance=DisturbanceOptions(step_um=0.5, sine_um=2.0, sine_hz=50.0, start_s=0.01),
+    )
+    seen = run(np.zeros(5001), options).true_um[1:]
+    t = 1e-4 * np.arange(5000)
+    expected = np.where(np.arange(5000) >= 100, 0.5 + 2 * np.sin(2 * np.pi * 50 * (t - 0.01)), 0.0)
+    np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-11)
+
+
+def test_disturbance_faster_than_half_the_rate_is_refused(ideal):
+    with pytest.raises(ValueError, match="axis x: disturbance: sine_hz 6000: allowed is less than 5000, half the rate"):
+        build_rig(ideal(disturbance=DisturbanceOptions(sine_um=1.0, sine_hz=6000.0)), ["x"], 1e-4)
+
+
+def test_nan_leaves_the_rig_as_holding_does():
+    rigs = [build_rig(RigOptions(), ["x"], 1e-4) for _ in range(2)]
+    for (coefficients, state), value in zip(rigs, (float("nan"), 5.0), strict=True):
+        for drive in (5.0, value, value, 1.0):
+            advance(coefficients[0], state[0], drive)
+    assert rigs[0][1].tobytes() == rigs[1][1].tobytes()
+
+
+def test_infinite_drive_is_clipped(run):
+    assert np.isfinite(run(np.array([np.inf, -np.inf, np.inf, 0.0])).true_um).all()
+
+
+def test_memory_of_creep_and_hysteresis_is_at_rest(run):
+    """With creep too, an aged actuator neither moves nor creeps at 0 V."""
+    plant = PlantOptions(
+        hysteresis=HysteresisOptions(history_v=(10.0, -4.0)), creep=CreepOptions(gains=(0.2,), time_constants_s=(0.01,))
+    )
+    seen = run(np.zeros(300), RigOptions(plant=plant))
+    np.testing.assert_allclose(seen.true_um, seen.true_um[0], rtol=1e-9)
+    assert seen.true_um[0] != 0
+
+
+def test_axes_are_independent():
+    """Two axes, one driven: the other stays; replacements apply to their own axis."""
+    options = RigOptions(plants={"y": PlantOptions(hysteresis=HysteresisOptions(truth="nominal"))})
+    coefficients, state = build_rig(options, ["x", "y"], 1e-4)
+    assert coefficients[0].weights_um_per_v[0] == 2.3834
+    assert coefficients[1].weights_um_per_v[0] == 2.55
+    before = state[1].tobytes()
+    advance(coefficients[0], state[0], 10.0)
+    assert state[1].tobytes() == before
+    assert state[0].tobytes() != before
+
+
+def test_kernels_leave_the_coefficients_alone():
+    coefficients, state = build_rig(RigOptions(latency_ticks=1), ["x"], 1e-4)
+    before = coefficients.tobytes()
+    for k in range(100):
+        sample(coefficients[0], state[0])
+        advance(coefficients[0], state[0], k / 10)
+    assert coefficients.tobytes() == before
+
+
+def test_records_are_what_compiled_code_makes_of_the_dtypes():
+    """So that a kernel may be compiled against the dtypes and called on a rig's records."""
+    coefficients, state = build_rig(RigOptions(), ["x"], 1e-4)
+    assert numba.typeof(coefficients[0]) == numba.from_dtype(COEFFICIENTS)
+    assert numba.typeof(state[0]) == numba.from_dtype(STATE)

@@ -1,0 +1,166 @@
+"""A loop made by hand: a shared block that tests fill through `claim` and `publish`, and the recorder's process."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
+from rtloop.engine.messages import Kind, Origin, message
+from rtloop.engine.ring import claim, publish
+from rtloop.recording.recorder import load_word
+from rtloop.signals import (
+    DRIVE,
+    ERROR,
+    POSITION,
+    REFERENCE,
+    Flag,
+    Mode,
+    axis_column,
+    columns,
+)
+
+RATE_HZ = 10_000.0
+AXES = ["x"]
+OBSERVED = ["x_true_position_um", "x_hysteresis_um"]
+COLUMNS = columns(AXES, OBSERVED)
+SNAPSHOT_BYTES = 200
+START_UNIX_NS = 1_763_680_000_000_000_000
+TIMEOUT_S = 60.0
+
+
+def make_rows(count: int, *, first: int = 0, paced: bool = True, seed: int = 1) -> np.ndarray[Any, Any]:
+    """Rows (count, columns) that look like a closed loop on a noisy stage."""
+    random = np.random.default_rng(seed)
+    rows = np.zeros((count, len(COLUMNS)))
+    tick = np.arange(first, first + count)
+    rows[:, 0] = tick
+    rows[:, 1] = tick * 1e5
+    rows[:, 2:7] = random.integers(20, 400, (count, 5)) / 1000.0 if paced else np.nan
+    rows[:, 9] = Mode.CLOSED_LOOP
+    reference = 25.0 * np.sin(2 * np.pi * 10.0 * tick / RATE_HZ)
+    volts = np.round((reference / 10.0 + random.normal(0, 4e-4, count)) * 3276.8) / 3276.8
+    rows[:, axis_column(0, 0)] = volts
+    rows[:, axis_column(0, POSITION)] = volts * 10.0
+    rows[:, axis_column(0, REFERENCE)] = reference
+    rows[:, axis_column(0, ERROR)] = reference - volts * 10.0
+    for column in (axis_column(0, DRIVE - 2), axis_column(0, DRIVE - 1), axis_column(0, DRIVE)):
+        rows[:, column] = (reference + 0.3 * rows[:, axis_column(0, ERROR)]) / 12.3
+    rows[:, -2] = reference + random.normal(0, 0.005, count)
+    rows[:, -1] = 1.1 * rows[:, -2]
+    return rows
+
+
+def make_header(**changes: Any) -> dict[str, Any]:
+    """A recording's header as the supervisor gives it."""
+    return {
+        "format": 1,
+        "name": "test",
+        "created_unix_ns": START_UNIX_NS - 1_000_000,
+        "axes": AXES,
+        "observed": OBSERVED,
+        "columns": list(COLUMNS),
+        "rate_hz": RATE_HZ,
+        "paced": True,
+        "ticks_expected": None,
+        "configuration": "[loop]\nrate_hz = 10000.0\n# µ\n",
+        "law": {},
+        "driver": {"kind": "sim"},
+        "realtime": {"scheduler": "other", "priority": 0, "mlock": False, "affinity": [0], "kernel": "test"},
+        "versions": {},
+        "host": {},
+        **changes,
+    }
+
+
+def snapshot(tick: int) -> np.ndarray[Any, Any]:
+    """A snapshot of a law: the tick, then bytes that depend on it."""
+    data = np.random.default_rng(tick).integers(0, 256, SNAPSHOT_BYTES, dtype=np.uint8)
+    data[:8] = np.frombuffer(tick.to_bytes(8, "little"), np.uint8)
+    return data
+
+
+class HandMadeLoop:
+    """The writer's end of a shared block."""
+
+    def __init__(self, rate_hz: float = RATE_HZ) -> None:
+        self.block = SharedBlock.create(Sizes(len(COLUMNS), len(AXES), rate_hz, SNAPSHOT_BYTES, 1))
+        os.set_inheritable(self.block.fd, True)
+        self.block.words[Word.START_UNIX_NS] = START_UNIX_NS
+        self.block.words[Word.LOOP_STATE] = ProcessState.RUNNING
+
+    def put(self, ring_name: str, payload: Any) -> None:
+        """Publish one slot."""
+        ring = self.block.ring(ring_name)
+        position = np.uint64(ring.head[0])
+        ring.slots[claim(ring, position)] = payload
+        publish(ring, position)
+
+    def run(self, rows: np.ndarray[Any, Any], *, snapshot_every: int = 10_000, slack: int | None = None) -> None:
+        """Publish rows as ticks, with a snapshot in front of each multiple; `slack`: never lap the recorder by more."""
+        for row in rows:
+            tick = int(row[0])
+            if tick % snapshot_every == 0:
+                self.put("snapshots", snapshot(tick))
+            while slack is not None and tick - self.cursor > slack:
+                time.sleep(0.001)
+            self.put("ticks", row)
+
+    @property
+    def cursor(self) -> int:
+        """What the recorder has taken."""
+        return int(load_word(self.block.words, int(Word.RECORDER_CURSOR)))
+
+    def command(self, tick: int, mode: Mode) -> None:
+        """The event of a change of mode."""
+        self.put("events", message(Kind.SET_MODE, tick=tick, origin=Origin.SCHEDULE, values=[mode])[0])
+
+    def trip(self, tick: int) -> None:
+        """The event of a trip."""
+        causes = Flag.TRIP_POSITION | Flag.TRIP_STALE
+        self.put("events", message(Kind.TRIPPED, tick=tick, axis=0, origin=Origin.LOOP, values=[causes, 1.5])[0])
+
+    def end(self, state: ProcessState = ProcessState.FINISHED) -> None:
+        """Say that the loop is over."""
+        self.block.words[Word.LOOP_STATE] = state
+
+
+class RecorderProcess:
+    """The real recorder on a hand-made loop."""
+
+    def __init__(self, loop: HandMadeLoop, *, prefix: tuple[str, ...] = ()) -> None:
+        self.loop = loop
+        command = [*prefix, sys.executable, "-m", "rtloop.recording.recorder", "--fd", str(loop.block.fd)]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[loop.block.fd]
+        )
+        self.wait_until(lambda: loop.block.words[Word.RECORDER_STATE] == ProcessState.READY)
+
+    def start(self, path: Path, header: dict[str, Any] | None = None, **options: Any) -> None:
+        """Give the recorder its file."""
+        order = {"path": str(path), "header": header or make_header(), "options": {"min_free_bytes": 0, **options}}
+        assert self.process.stdin
+        self.process.stdin.write(json.dumps(order).encode() + b"\n")
+        self.process.stdin.flush()
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        """Until `condition`, or the recorder's end."""
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while not condition():
+            assert self.process.poll() is None, self.process.communicate()
+            assert time.monotonic() < deadline_s, "the recorder does not answer"
+            time.sleep(0.005)
+
+    def result(self) -> tuple[int, dict[str, Any]]:
+        """(exit code, totals); nothing may have been said on stderr."""
+        out, err = self.process.communicate(timeout=TIMEOUT_S)
+        assert err == b""
+        return self.process.returncode, json.loads(out)
