@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-from pydantic import BaseModel, ConfigDict
+from hil.options import Options
 
 ABI_VERSION = 1
 
@@ -59,12 +59,6 @@ class Pointers(NamedTuple):
     write: int
     wait: int = 0
     abi_version: int = ABI_VERSION
-
-
-class Options(BaseModel):
-    """Base of a driver's options: unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Driver(ABC):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import carray
 
 from drivers.base import Pointers
 from hil.compiled import cfunc
-from hil.pointers import SIGNATURE, address_pointer
+from hil.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype([("rows", np.int64), ("columns", np.int64), ("row", np.int64), ("address", np.int64)])
 EXHAUSTED = -100

@@ -8,20 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numba import carray
 
 from drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from hil.compiled import cfunc
 from hil.options import RigOptions
-from hil.pointers import SIGNATURE, address_pointer
+from hil.pointers import SIGNATURE, address_pointer, carray
 from hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
 CONTEXT = np.dtype([("count", np.int64), ("coefficients", np.int64), ("state", np.int64)])
 OBSERVED_PER_AXIS = 2
-
-
-class SimOptions(RigOptions):
-    """The rig's own options."""
 
 
 @cfunc(SIGNATURE)
@@ -56,10 +51,10 @@ class SimDriver(Driver):
     """The simulated rig as a driver, for any number of axes and any rate."""
 
     kind = "sim"
-    options_model = SimOptions  # type: ignore[assignment]
+    options_model = RigOptions
 
     def __init__(self, options: RigOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
-        super().__init__(options, wiring, rate_hz)  # type: ignore[arg-type]
+        super().__init__(options, wiring, rate_hz)
         self._rig = build_rig(options, self._axes_by_plant(), 1.0 / rate_hz)
         self._context = np.zeros(1, CONTEXT)
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+
+from hil.compiled import intrinsic
 
 WORD = types.uint64
 ALIGNMENT = 8
@@ -72,5 +73,3 @@ def fence_release(typingctx: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(), codegen
-
-

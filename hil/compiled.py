@@ -21,6 +21,7 @@ from typing import Any
 import llvmlite
 import llvmlite.binding
 import numba
+import numba.extending
 from numba import config as numba_config
 
 SOURCE_ROOT = Path(__file__).resolve().parent.parent
@@ -73,6 +74,11 @@ numba_config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAcc
 def jit(function: Callable[..., Any]) -> Any:
     """Compile a kernel on first use; `.py_func` is the same kernel uncompiled."""
     return numba.njit(cache=True, error_model="numpy")(function)
+
+
+def intrinsic(function: Callable[..., Any]) -> Any:
+    """A function that writes its own LLVM code; typed as Any because its callers leave out the typing context."""
+    return numba.extending.intrinsic(function)
 
 
 def cfunc(signature: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -9,9 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
+from numba import carray as _carray  # pyright: ignore[reportPrivateImportUsage]
 from numba import types
-from numba.extending import intrinsic
 
+from hil.compiled import intrinsic
+
+carray: Any = _carray
+"""numba's array view of a pointer."""
 SIGNATURE = types.int32(types.voidptr, types.CPointer(types.float64))
 """numba's signature of `int32 function(void *context, double *values)`."""
 
@@ -40,4 +44,3 @@ def address_pointer(typingctx: Any, address: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), codegen
-

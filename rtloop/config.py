@@ -1,6 +1,6 @@
 """The configuration file: TOML, checked as a whole, every fault reported at once with its key and what is allowed.
 
-    [loop]  [driver]  [driver.channels.AXIS]  [[axis]]  [[schedule]]  [recording]
+[loop]  [driver]  [driver.channels.AXIS]  [[axis]]  [[schedule]]  [recording]
 """
 
 from __future__ import annotations
@@ -108,7 +108,9 @@ class Configuration:
     @property
     def wiring(self) -> dict[str, Wiring]:
         """Channels of each axis, in the order of the axes."""
-        return {axis.name: Wiring(self.channels[axis.name].input, self.channels[axis.name].output) for axis in self.axes}
+        return {
+            axis.name: Wiring(self.channels[axis.name].input, self.channels[axis.name].output) for axis in self.axes
+        }
 
 
 class InputFileError(RtloopError):
@@ -203,7 +205,11 @@ def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -
     """What concerns names in more than one section."""
     names = [axis.name for axis in sections.axis]
     faults = [f"axis.{name}: named twice" for name in sorted(set(names)) if names.count(name) > 1]
-    faults += [f"driver.channels.{name}: missing; the axis needs input, output, um_per_v" for name in names if name not in channels]
+    faults += [
+        f"driver.channels.{name}: missing; the axis needs input, output, um_per_v"
+        for name in names
+        if name not in channels
+    ]
     faults += [f"driver.channels.{name}: there is no axis of this name" for name in channels if name not in names]
     for entry in sections.schedule:
         if entry.axis is not None and entry.axis not in names:

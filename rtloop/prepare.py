@@ -27,6 +27,10 @@ from rtloop.references import TableOfSamples, generator_values
 from rtloop.signals import Mode
 
 
+COMPARED_PART = 0.2
+"""C(z) is compared with C(s) up to this part of the rate; toward half of it every method must differ."""
+
+
 @dataclass(frozen=True)
 class AxisCheck:
     """What is known of an axis before it runs; None where there is no controller or no model."""
@@ -122,7 +126,9 @@ def _ticks(duration_s: float | None, rate_hz: float, findings: _Findings) -> int
         return None
     ticks = round(duration_s * rate_hz) if np.isfinite(duration_s) else 0
     if ticks < 1:
-        findings.faults.append(f"--duration: {duration_s} s is no tick at {rate_hz:g} Hz; at least one period is needed")
+        findings.faults.append(
+            f"--duration: {duration_s} s is no tick at {rate_hz:g} Hz; at least one period is needed"
+        )
     return ticks
 
 
@@ -137,7 +143,7 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
     )
     if discrete is None:
         return AxisCheck(axis.name, transfer)
-    comparison = compare(transfer, discrete)
+    comparison = compare(transfer, discrete, up_to_hz=COMPARED_PART / period_s)
     findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
     if axis.model is None:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
@@ -145,7 +151,8 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
     plant = axis.model.transfer()
     continuous = findings.attempt(f"axis.{axis.name}.model: ", lambda: analyse_continuous(transfer, plant))
     running = findings.attempt(
-        f"axis.{axis.name}.model: ", lambda: analyse_discrete(discrete, plant, axis.model.delay_ticks if axis.model else 0)
+        f"axis.{axis.name}.model: ",
+        lambda: analyse_discrete(discrete, plant, axis.model.delay_ticks if axis.model else 0),
     )
     if running is not None and not running.stable:
         message_ = (

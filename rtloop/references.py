@@ -67,7 +67,9 @@ def generator_values(
 def _read_samples(path: Path) -> npt.NDArray[np.float64]:
     """A column of numbers. Raises ValueError."""
     try:
-        loaded = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=1)
+        loaded = (
+            np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=1)
+        )
     except OSError as error:
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
     except ValueError as error:

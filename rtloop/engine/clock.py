@@ -13,11 +13,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import carray, types
+from numba import types
 
 from hil.atomics import load_acquire
 from hil.compiled import cfunc
-from hil.pointers import SIGNATURE, address_pointer
+from hil.pointers import SIGNATURE, address_pointer, carray
 
 CLOCK_MONOTONIC = 1
 TIMER_ABSTIME = 1

@@ -23,6 +23,7 @@ SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, REFUSED = (
     int(kind) for kind in (Kind.SET_MODE, Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.STOP, Kind.REFUSED)
 )
 
+
 class QueueFull(RuntimeError):
     """The loop has not taken the commands before this one."""
 

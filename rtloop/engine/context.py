@@ -7,10 +7,9 @@ lowered, atomically, at every call: measured at 2 µs a tick.
 from __future__ import annotations
 
 import numpy as np
-from numba import carray
 
 from hil.compiled import jit
-from hil.pointers import address_pointer
+from hil.pointers import address_pointer, carray
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE

@@ -138,7 +138,10 @@ def _evaluate(loop, status, now_ns):
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs, last_drive_v = floats(loop.outputs, loop.output_count), floats(loop.last_drive_v, loop.axis_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
-    input_index, output_index = integers(loop.input_index, loop.axis_count), integers(loop.output_index, loop.axis_count)
+    input_index, output_index = (
+        integers(loop.input_index, loop.axis_count),
+        integers(loop.output_index, loop.axis_count),
+    )
     generators, table = generators_of(loop), floats(loop.table, loop.table_count)
     axes = axes_of(loop)
     for a in range(loop.axis_count):

@@ -43,11 +43,13 @@ def main() -> int:
     block = SharedBlock(parser.parse_args().fd)
     plan: Plan = pickle.load(sys.stdin.buffer)
     driver: Driver | None = None
+    state = ProcessState.FAILED
     try:
         driver = plan.driver()
         facts = require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
         outcome = _run(plan, block, driver, facts)
         report("finished", outcome=outcome.name.lower(), driver_error=_driver_error(driver))
+        state = ProcessState.FINISHED
         code = 0 if outcome in (Outcome.DONE, Outcome.STOPPED) else UnavailableError.exit_code
     except DriverError as error:
         report("failed", message=str(error), exit_code=UnavailableError.exit_code)
@@ -58,8 +60,7 @@ def main() -> int:
     finally:
         if driver is not None:
             driver.close()
-        finished = block.words[Word.LOOP_STATE] == ProcessState.RUNNING
-        block.words[Word.LOOP_STATE] = ProcessState.FINISHED if finished else ProcessState.FAILED
+        block.words[Word.LOOP_STATE] = state
     return code
 
 
@@ -75,7 +76,8 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
     freeze_garbage_collection()
     realtime = prepare_realtime(plan.pacing)
-    if plan.pacing.require_realtime and plan.pacing.paced and (realtime["scheduler"] != "SCHED_FIFO" or not realtime["mlock"]):
+    granted = realtime["scheduler"] == "SCHED_FIFO" and realtime["mlock"]
+    if plan.pacing.require_realtime and plan.pacing.paced and not granted:
         raise RefusedError(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
     block.words[Word.LOOP_STATE] = ProcessState.READY
     report("ready", realtime=realtime)

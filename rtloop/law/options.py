@@ -87,8 +87,8 @@ class TransferOptions(Options):
     def transfer(self) -> Transfer:
         """The transfer function. Raises ValueError for an improper or malformed one."""
         if self.form == "zpk":
-            roots = [[complex(*root) for root in group] for group in (self.zeros, self.poles)]
-            return Transfer.from_zpk(*roots, self._gain())
+            zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
+            return Transfer.from_zpk(zeros, poles, self._gain())
         if self.form == "state_space":
             if self.d is None:
                 raise ValueError("d: needed in a state space; 0.0 for no direct part")

@@ -1,7 +1,7 @@
 """An MCAP file that grows chunk by chunk, each written whole or not at all.
 
-`PATH.part` while it grows, `PATH` once it has its index. Cut off at any moment, the file holds everything up to its
-last chunk; a full disk leaves room for the index by giving up the last chunks.
+`PATH.part` (or another suffix) while it grows, `PATH` once it has its index. Cut off at any moment, the file holds
+everything up to its last chunk; a full disk leaves room for the index by giving up the last chunks.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class _Written(NamedTuple):
 class ChunkFile:
     """`repeated`: the schemas and channels that the summary repeats. All methods raise OutputError."""
 
-    def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord]) -> None:
-        self.path, self.part = path, path.with_name(path.name + ".part")
+    def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord], suffix: str = ".part") -> None:
+        self.path, self.part = path, path.with_name(path.name + suffix)
         self.size = 0
         self._repeated = repeated
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)

@@ -61,6 +61,7 @@ class Source:
             raise RecordingError(f"{self.path}: {error.strerror}") from None
 
     def close(self) -> None:
+        """Close the file."""
         os.close(self._fd)
 
 

@@ -10,12 +10,8 @@ from typing import Any
 
 from rtloop.recording import format
 from rtloop.recording.chunks import Entry, Source
-from rtloop.recording.container import (
-    MAGIC,
-    DamagedChunk,
-    pack_records,
-    unpack_chunk,
-)
+from rtloop.recording.container import MAGIC, DamagedChunk, pack_records, unpack_chunk
+from rtloop.recording.contents import read_chunk, split_messages
 from rtloop.recording.errors import RecordingError
 
 REQUIRED = {"columns": list, "axes": list, "rate_hz": (int, float), "created_unix_ns": int, "paced": bool}

@@ -20,10 +20,8 @@ import numpy as np
 
 from rtloop.recording import format
 from rtloop.recording.chunks import Entry, Source, indexed_chunks, scanned_chunks
-from rtloop.recording.container import (
-    DamagedChunk,
-    unpack_chunk,
-)
+from rtloop.recording.container import DamagedChunk, unpack_chunk
+from rtloop.recording.contents import Message, is_ticks, may_hold, read_chunk, split_messages, tick_rows
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.events import FINAL, Event
 from rtloop.recording.header import read_header

@@ -58,9 +58,11 @@ class Recorder:
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
 
     def word(self, index: Word) -> int:
+        """A control word of the block."""
         return int(load_word(self._words, int(index)))
 
     def set_word(self, index: Word, value: int) -> None:
+        """Set a control word of the block."""
         store_word(self._words, int(index), np.uint64(value))
 
     def record(self, session: Session, pause_s: float) -> str:

@@ -22,6 +22,7 @@ from rtloop.recording.reader import Reader, Rows
 from rtloop.recording.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 
+UNFINISHED = ".recovering"
 Progress = Callable[[int], None]
 
 
@@ -94,7 +95,8 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
     _refuse_growing(path)
     with Reader(path, tolerant=True) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
-        writer = Writer(output, header, header["created_unix_ns"])
+        output.with_name(output.name + UNFINISHED).unlink(missing_ok=True)
+        writer = Writer(output, header, header["created_unix_ns"], suffix=UNFINISHED)
         try:
             writer.start_unix_ns = reader.start_unix_ns
             recovery = Recovery(reader, writer)

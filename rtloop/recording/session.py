@@ -175,6 +175,9 @@ class Session:
         self._fill = rest
 
     def _start_unix_ns(self) -> int:
+        """Virtual time starts at 0, so that two unpaced runs are logged alike."""
+        if not self._header["paced"]:
+            return 0
         return int(self._block.words[Word.START_UNIX_NS]) or self._header["created_unix_ns"]
 
     def _time_ns(self, tick: int) -> int:

@@ -14,6 +14,7 @@ from rtloop.signals import Flag, Mode
 MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED)
 NS_PER_US = 1000.0
+CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 BATCH_ROWS = 1 << 18
 
 
@@ -59,6 +60,15 @@ class Histogram:
         ranks = [max(math.ceil(quantile * below[-1]), 1) for quantile in quantiles]
         return [float(values[np.searchsorted(below, rank)]) / NS_PER_US for rank in ranks]
 
+    def classes(self) -> list[dict[str, Any]]:
+        """Counts below each of CLASSES_US, and None for the rest; empty where nothing was measured."""
+        edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
+        small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]
+        small[-1] += sum(self._large.values())
+        if not sum(small):
+            return []
+        return [{"below_us": edge, "count": count} for edge, count in zip((*CLASSES_US, None), small, strict=True)]
+
     def report(self) -> dict[str, float] | None:
         """p50, p99, p999 and max in µs; None where nothing was measured."""
         p50, p99, p999 = self.quantiles_us(0.5, 0.99, 0.999)
@@ -75,12 +85,14 @@ class AxisSums:
         self._square_sum, self._count, self._drive = 0.0, 0, 0.0
 
     def add(self, error_um: Any, drive_v: Any, closed: Any) -> None:
+        """Count a block; `closed` says which ticks ran in closed loop."""
         errors = error_um[closed]
         self._square_sum += float(errors @ errors)
         self._count += len(errors)
         self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
     def report(self) -> dict[str, Any]:
+        """The axis in the summary; no error where the loop was never closed."""
         rms = math.sqrt(self._square_sum / self._count) if self._count else None
         return {"name": self.name, "rms_error_um": rms, "max_abs_drive_v": self._drive}
 
@@ -136,6 +148,7 @@ def summarise(path: Path | str) -> dict[str, Any]:
             "paced": header["paced"],
             "overruns": totals.overruns,
             "lateness_us": reports["lateness_us"],
+            "lateness_histogram": totals.histograms["lateness_us"].classes(),
             "exec_us": reports["exec_us"],
             "phases": {name: report and report["p50"] for name, report in reports.items() if name in MEASURED[2:]},
             "complete": bool(finished and finished["complete"] and lost == 0 and not reader.problems),
@@ -143,7 +156,11 @@ def summarise(path: Path | str) -> dict[str, Any]:
             "problems": reader.problems,
             "realtime": header.get("realtime"),
             "axes": [axis.report() for axis in totals.axes],
-            "trips": sum(event["kind"] == "tripped" for event in events),
+            "trips": [
+                {"tick": event["tick"], "causes": event["what"]["causes"]}
+                for event in events
+                if event["kind"] == "tripped"
+            ],
             "events": len(events),
             "size_bytes": reader.size_bytes,
             "bytes_per_tick": reader.size_bytes / totals.ticks if totals.ticks else None,

@@ -23,8 +23,9 @@ from rtloop.recording.errors import OutputError
 class Writer:
     """`path` is the finished file's name; `header` is kept as the `/configuration` message at `log_time` (UNIX ns).
 
-    Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds an index entry of 16 bytes to every tick: some viewers need it. Below `min_free_bytes` of
-    free space nothing more is written. Raises OutputError, here and from the methods; what was written stays good.
+    Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds 16 bytes of
+    index to every tick: some viewers need it. Below `min_free_bytes` of free space nothing more is written. Raises
+    OutputError, here and from the methods; what was written stays good. `suffix` marks the unfinished file.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Writer:
         *,
         message_index: bool = False,
         min_free_bytes: int = 0,
+        suffix: str = ".part",
     ) -> None:
         self.path = path
         self.start_unix_ns = log_time
@@ -44,7 +46,7 @@ class Writer:
         self._blank = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
         self._check_space()
         repeated = [*format.schemas(self._columns), *format.channels()]
-        self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated)
+        self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
         self._write_header(header, log_time, repeated)
 
     @property

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from hand_made_loop import HandMadeLoop, RecorderProcess
+
+from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess
 
 
 @pytest.fixture

@@ -1,0 +1,117 @@
+"""`rtloop check`: what a configuration would run, and how good it is on paper."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from rtloop.config import load
+from rtloop.design.loop import LoopAnalysis, Tolerance, resonance_shift_tolerated
+from rtloop.prepare import AxisCheck, Prepared, prepare
+
+ROWS = (
+    ("stable", lambda loop: "yes" if loop.stable else "NO"),
+    ("crossover", lambda loop: f"{loop.crossover_hz:.2f} Hz"),
+    ("phase margin", lambda loop: f"{loop.phase_margin_deg:.2f}°"),
+    ("gain margin", lambda loop: f"{loop.gain_margin:.3f}"),
+    ("max |S|", lambda loop: f"{loop.max_sensitivity:.3f} at {loop.max_sensitivity_hz:.1f} Hz"),
+    ("static error", lambda loop: f"{loop.static_error_percent:.4f} %"),
+    ("settling (5 %)", lambda loop: f"{1e3 * loop.settling_time_s:.2f} ms"),
+    ("overshoot", lambda loop: f"{loop.overshoot_percent:.2f} %"),
+    ("peak of v per unit step", lambda loop: f"{loop.peak_command:.4f}"),
+)
+
+
+def check_configuration(config: Path, as_json: bool) -> int:
+    """Check and print; raises ConfigError where the configuration cannot run."""
+    prepared = prepare(load(config))
+    shifts = {check.name: _shifts(check, prepared) for check in prepared.checks}
+    if as_json:
+        click.echo(json.dumps(_report(prepared, shifts)))
+        return 0
+    console = Console(highlight=False)
+    plan, facts = prepared.plan, prepared.facts
+    console.print(
+        f"[bold]{plan.name}[/]: {len(plan.axes)} axis at {plan.pacing.rate_hz:g} Hz, mode {plan.mode.name.lower()}, "
+        f"driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
+    )
+    for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
+        limits, interlocks = axis.limits, axis.interlocks
+        slew = "no running slew limit" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
+        console.print(
+            f"\n[bold]axis {axis.name}[/]: drive ±{limits.drive_v:g} V, command ±{limits.command_um:g} µm, {slew}, "
+            f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{interlocks.position_um:g} µm "
+            f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
+        )
+        _print_axis(console, check, shifts[check.name])
+    for warning in prepared.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    return 0
+
+
+def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Tolerance]) -> None:
+    if check.discrete is None or check.comparison is None:
+        console.print("no controller: feedforward, raw and off only")
+        return
+    comparison = check.comparison
+    console.print(
+        f"C(z) by {check.discrete.method}, order {check.discrete.order}: differs from C(s) by at most "
+        f"{100 * comparison.max_deviation:.1f} %, at {comparison.max_deviation_hz:.0f} Hz"
+    )
+    for shift in comparison.shifts:
+        console.print(f"  {shift.kind} at {shift.frequency_hz:.1f} Hz is at {shift.discrete_hz:.1f} Hz in C(z)")
+    if check.continuous is None or check.running is None:
+        return
+    table = Table("on the model", "continuous C(s)", "as it runs C(z)", box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for label, show in ROWS:
+        table.add_row(label, show(check.continuous), show(check.running))
+    table.add_row("resonance may move by", *(_tolerance(shifts[key]) for key in ("continuous", "running")))
+    console.print(table)
+
+
+def _shifts(check: AxisCheck, prepared: Prepared) -> dict[str, Tolerance]:
+    """Shift of the model's resonance that the loop survives."""
+    if check.continuous is None or check.controller is None or check.discrete is None:
+        return {}
+    model = next(axis.model for axis in prepared.configuration.axes if axis.name == check.name)
+    assert model is not None
+    plant = model.transfer()
+    return {
+        "continuous": resonance_shift_tolerated(check.controller, plant),
+        "running": resonance_shift_tolerated(check.discrete, plant, model.delay_ticks),
+    }
+
+
+def _tolerance(tolerance: Tolerance) -> str:
+    return f"−{abs(tolerance.down_percent):.2f} … +{tolerance.up_percent:.2f} %"
+
+
+def _report(prepared: Prepared, shifts: dict[str, dict[str, Tolerance]]) -> dict[str, Any]:
+    plan = prepared.plan
+    return {
+        "name": plan.name,
+        "rate_hz": plan.pacing.rate_hz,
+        "mode": plan.mode.name.lower(),
+        "driver": plan.driver_kind,
+        "columns": list(plan.columns),
+        "warnings": list(prepared.warnings),
+        "axes": [
+            {
+                "name": check.name,
+                "comparison": check.comparison and check.comparison.as_dict(),
+                "continuous": _analysis(check.continuous),
+                "running": _analysis(check.running),
+                "resonance_shift_tolerated_percent": {name: list(value) for name, value in shifts[check.name].items()},
+            }
+            for check in prepared.checks
+        ],
+    }
+
+
+def _analysis(analysis: LoopAnalysis | None) -> dict[str, Any] | None:
+    return None if analysis is None else analysis.as_dict()

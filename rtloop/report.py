@@ -1,0 +1,173 @@
+"""What the terminal shows: progress of a run, its summary, the list of drivers. No numbers are made here."""
+
+from __future__ import annotations
+
+from typing import IO, Any
+
+from rich.console import Console
+from rich.table import Table
+
+from drivers.base import Wiring
+from drivers.errors import DriverError
+from drivers.registry import driver_class, kinds
+from rtloop import signals
+from rtloop.prepare import Prepared
+from rtloop.recording.load import load
+from rtloop.service.supervisor import Supervisor
+from rtloop.signals import Mode
+from rtloop.steps import PAPER_CLAIM, step_metrics
+
+BAR = " ▁▂▃▄▅▆▇█"
+LONGEST_STEP_ANALYSIS_TICKS = 6_000_000
+
+
+class RunView:
+    """One line on a terminal while the loop runs, nothing where the stream is not a terminal."""
+
+    def __init__(self, prepared: Prepared, stream: IO[str]) -> None:
+        self._plan = prepared.plan
+        self._console = Console(file=stream, highlight=False)
+        self._status = self._console.status("starting") if self._console.is_terminal else None
+
+    def __enter__(self) -> RunView:
+        if self._status:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._status:
+            self._status.stop()
+
+    def show(self, supervisor: Supervisor) -> None:
+        """Time, mode, lateness and the axes of the newest tick."""
+        row = supervisor.latest() if self._status else None
+        if row is None or self._status is None:
+            return
+        parts = [_elapsed(row[signals.TICK] / self._plan.pacing.rate_hz, self._plan.ticks, self._plan.pacing.rate_hz)]
+        parts.append(Mode(int(row[signals.MODE])).name.lower())
+        causes = signals.trip_causes(row[signals.FLAGS])
+        if causes:
+            parts.append(f"[red]tripped: {', '.join(causes)}[/]")
+        if self._plan.pacing.paced:
+            parts.append(f"late {row[signals.LATENESS]:6.1f} µs")
+        for axis, name in enumerate(self._plan.axes[:4]):
+            position, drive = (row[signals.axis_column(axis, which)] for which in (signals.POSITION, signals.DRIVE))
+            parts.append(f"{name} {position:8.3f} µm {drive:7.3f} V")
+        self._status.update("   ".join(parts))
+
+
+def _elapsed(time_s: float, ticks: int | None, rate_hz: float) -> str:
+    return f"{time_s:8.1f} s" if ticks is None else f"{time_s:8.1f} of {ticks / rate_hz:g} s"
+
+
+def print_run(prepared: Prepared, summary: dict[str, Any]) -> None:
+    """The summary of a run, with step metrics where the reference is a series of steps."""
+    print_summary(summary)
+    ticks = summary.get("ticks_logged") or 0
+    if 0 < ticks <= LONGEST_STEP_ANALYSIS_TICKS and not summary["trips"]:
+        _print_steps(prepared, summary["recording"])
+
+
+def print_summary(summary: dict[str, Any]) -> None:
+    """What a recording holds, as tables."""
+    console = Console(highlight=False)
+    if "ticks_logged" not in summary:
+        console.print(f"nothing recorded in {summary.get('recording')}")
+        return
+    console.print(f"[bold]{summary['recording']}[/]  {_size(summary)}")
+    table = _table("", "", "")
+    expected = summary["ticks_expected"]
+    table.add_row(
+        "ticks", f"{summary['ticks_logged']:,}", "of " + ("as many as came" if expected is None else f"{expected:,}")
+    )
+    table.add_row("lost", str(summary["ticks_lost"]), "complete" if summary["complete"] else "[red]not complete[/]")
+    table.add_row("time", f"{summary['duration_s']:.3f} s", f"at {summary['rate_hz']:g} Hz")
+    if summary["lateness_us"] is not None:
+        table.add_row("achieved rate", f"{summary['achieved_rate_hz']:.1f} Hz", _scheduling(summary["realtime"]))
+        table.add_row("periods missed", str(summary["periods_missed"]), "skipped by late ticks, never caught up")
+        table.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
+    else:
+        table.add_row("clock", "virtual", "unpaced: nothing was timed")
+    for trip in summary["trips"]:
+        table.add_row("[red]trip[/]", f"tick {trip['tick']}", ", ".join(trip["causes"]))
+    console.print(table)
+    if summary["lateness_us"] is not None:
+        _print_timing(console, summary)
+    axes = _table("axis", "rms error µm", "largest drive V")
+    for axis in summary["axes"]:
+        error = "–" if axis["rms_error_um"] is None else f"{axis['rms_error_um']:.4f}"
+        axes.add_row(axis["name"], error, f"{axis['max_abs_drive_v']:.3f}")
+    console.print(axes)
+
+
+def _print_timing(console: Console, summary: dict[str, Any]) -> None:
+    table = _table("µs", "p50", "p99", "p99.9", "max")
+    for label, key in (("lateness", "lateness_us"), ("tick", "exec_us")):
+        table.add_row(label, *(f"{summary[key][name]:.2f}" for name in ("p50", "p99", "p999", "max")))
+    console.print(table)
+    histogram = summary.get("lateness_histogram")
+    if histogram:
+        console.print("lateness  " + _bars(histogram))
+    phases = summary["phases"]
+    labels = (("read", "read_us"), ("law", "law_us"), ("write", "write_us"))
+    console.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
+
+
+def _bars(histogram: list[dict[str, Any]]) -> str:
+    """Counts per class as bars on a logarithmic scale."""
+    largest = max((entry["count"] for entry in histogram), default=0)
+    cells = []
+    for entry in histogram:
+        height = 0 if not entry["count"] else 1 + int(7 * entry["count"].bit_length() / max(largest.bit_length(), 1))
+        cells.append(f"<{entry['below_us']:g} {BAR[min(height, 8)]}{entry['count']}")
+    return "  ".join(cells) + "  (µs, count)"
+
+
+def _print_steps(prepared: Prepared, recording: str) -> None:
+    console = Console(highlight=False)
+    table = _table("steps", "overshoot %", "settling ms (5 %)", "static error %")
+    loaded = load(recording)
+    for name in prepared.plan.axes:
+        metrics = step_metrics(
+            loaded[f"{name}_reference_um"], loaded[f"{name}_position_um"], prepared.plan.pacing.rate_hz
+        )
+        if metrics is None:
+            continue
+        table.add_row(f"{name}: median of {metrics.steps}", f"{metrics.overshoot_percent:.2f}",
+                      f"{metrics.settling_time_ms:.2f}", f"{metrics.static_error_percent:.3f}")  # fmt: skip
+        table.add_row(f"{name}: worst", f"{metrics.overshoot_percent_worst:.2f}",
+                      f"{metrics.settling_time_ms_worst:.2f}", f"{metrics.static_error_percent_worst:.3f}")  # fmt: skip
+    if table.row_count:
+        table.add_row("the paper's claim", *PAPER_CLAIM.values())
+        console.print(table)
+
+
+def print_drivers() -> None:
+    """Every registered kind."""
+    table = _table("kind", "moves hardware", "clock", "highest rate", "defined in")
+    for kind, where in kinds().items():
+        try:
+            driver = driver_class(kind)
+            facts = driver(driver.options_model(), {"x": Wiring("adc0", "dac0")}, 1000.0).facts
+        except (DriverError, ValueError) as error:
+            table.add_row(kind, f"[red]{error}[/]", "", "", where)
+            continue
+        rate = "any" if facts.max_rate_hz == float("inf") else f"{facts.max_rate_hz:g} Hz"
+        table.add_row(kind, "yes" if facts.real else "no", "rtloop's", rate, where)
+    Console(highlight=False).print(table)
+
+
+def _size(summary: dict[str, Any]) -> str:
+    return f"{summary['size_bytes'] / 2**20:.1f} MiB, {summary['bytes_per_tick']:.1f} bytes a tick"
+
+
+def _scheduling(realtime: dict[str, Any]) -> str:
+    memory = "memory locked" if realtime.get("mlock") else "memory not locked"
+    return f"{realtime.get('scheduler')} {realtime.get('priority') or ''}, {memory}".replace(" ,", ",")
+
+
+def _table(*headings: str) -> Table:
+    table = Table(*headings, box=None, show_header=any(headings), pad_edge=False, padding=(0, 3, 0, 0))
+    for column in table.columns[1:]:
+        column.justify = "right" if any(headings) else "left"
+    return table

@@ -1,0 +1,91 @@
+"""`rtloop run`: the supervisor with a terminal in front of it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.config import load
+from rtloop.errors import LoopFault, OutputError
+from rtloop.prepare import Prepared, prepare
+from rtloop.recording.summary import summarise
+from rtloop.report import RunView, print_run
+from rtloop.service.supervisor import RunResult, Supervisor
+
+PROGRESS_PERIOD_S = 0.1
+
+
+def run_configuration(config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool) -> int:
+    """Run, record, report; returns the exit code."""
+    prepared = prepare(load(config), duration_s=duration_s, paced=paced)
+    for warning in prepared.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    supervisor = Supervisor(prepared, recording_path(prepared, out))
+    with _stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
+        result = supervisor.run(_every(PROGRESS_PERIOD_S, view.show))
+    summary = run_summary(prepared, result)
+    if as_json:
+        click.echo(json.dumps(summary))
+    else:
+        print_run(prepared, summary)
+    if summary["error"]:
+        click.echo(f"rtloop: {summary['error']}", err=True)
+    return result.exit_code or (LoopFault.exit_code if summary["trips"] else 0)
+
+
+def run_summary(prepared: Prepared, result: RunResult) -> dict[str, Any]:
+    """The recording's summary with what the run adds to it."""
+    summary = summarise(result.recording) if result.recording.exists() else {}
+    summary["recording"] = str(result.recording)
+    summary["outcome"] = result.outcome
+    summary["error"] = result.error
+    summary["recorder"] = result.recorder
+    summary["warnings"] = list(prepared.warnings)
+    summary.setdefault("trips", [])
+    return summary
+
+
+def recording_path(prepared: Prepared, out: Path | None) -> Path:
+    """A new path in the recordings' folder, which is made. Raises OutputError."""
+    folder = out or Path(prepared.configuration.recording.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot make the folder for recordings: {error.strerror}") from None
+    stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
+    for number in range(1, 1000):
+        path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")
+        if not path.exists() and not path.with_name(path.name + ".part").exists():
+            return path
+    raise OutputError(f"{folder}: no free name for {stem}.mcap")
+
+
+@contextmanager
+def _stopped_by_signals(supervisor: Supervisor) -> Any:
+    """SIGINT and SIGTERM ramp the loop down instead of ending this process."""
+    previous = {name: signal.signal(name, lambda *_: supervisor.stop()) for name in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for name, handler in previous.items():
+            signal.signal(name, handler)
+
+
+def _every(period_s: float, action: Any) -> Any:
+    """`action`, at most once a period."""
+    due = 0.0
+
+    def limited(supervisor: Supervisor) -> None:
+        nonlocal due
+        if time.monotonic() >= due:
+            due = time.monotonic() + period_s
+            action(supervisor)
+
+    return limited

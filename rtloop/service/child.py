@@ -1,0 +1,83 @@
+"""A child process of the supervisor: one value on its stdin, JSON lines on its stdout."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import subprocess
+import sys
+import threading
+from typing import Any
+
+from rtloop.engine.memory import SharedBlock
+
+
+class Child:
+    """`python -m MODULE --fd N`, in a process group of its own so that a terminal's Ctrl-C reaches the parent alone."""
+
+    def __init__(self, module: str, block: SharedBlock) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, "--fd", str(block.fd)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=[block.fd],
+            process_group=0,
+        )
+        self._reports: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def send(self, data: bytes) -> None:
+        """Write to the child's stdin; a child that has gone is noticed by its exit code."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.write(data)
+            self.process.stdin.flush()
+
+    def reports(self) -> list[dict[str, Any]]:
+        """The JSON lines that came since the last call."""
+        found = []
+        while not self._reports.empty():
+            found.append(self._reports.get())
+        return found
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs; negative where a signal ended it."""
+        return self.process.poll()
+
+    def wait(self, timeout_s: float) -> int | None:
+        """Its exit code, or None after `timeout_s`."""
+        try:
+            code = self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+        self._reader.join(timeout_s)
+        return code
+
+    def end(self) -> None:
+        """Kill it if it still runs, and close its pipes."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join()
+        self.close_stdin()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+    def close_stdin(self) -> None:
+        """Say that nothing more will come; a child that waits for its orders ends."""
+        if self.process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self.process.stdin.close()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            try:
+                report = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(report, dict):
+                self._reports.put(report)

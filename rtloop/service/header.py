@@ -1,0 +1,64 @@
+"""What a recording says of itself: the run, the law's layout, the host, the versions, what the host granted."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from hil.compiled import cpu_identity
+from rtloop.law.layout import layout_description
+from rtloop.prepare import Prepared
+
+FORMAT = 1
+PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
+
+
+def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
+    """The header of a recording of this plan."""
+    plan, configuration = prepared.plan, prepared.configuration
+    return {
+        "format": FORMAT,
+        "name": plan.name,
+        "created_unix_ns": time.time_ns(),
+        "axes": list(plan.axes),
+        "observed": list(plan.observed),
+        "columns": list(plan.columns),
+        "rate_hz": plan.pacing.rate_hz,
+        "paced": plan.pacing.paced,
+        "ticks_expected": plan.ticks,
+        "mode": plan.mode.name.lower(),
+        "configuration": configuration.text,
+        "configuration_sha256": hashlib.sha256(configuration.text.encode()).hexdigest(),
+        "law": layout_description(),
+        "driver": {
+            "kind": plan.driver_kind,
+            "inputs": [channel.name for channel in prepared.facts.inputs],
+            "outputs": [channel.name for channel in prepared.facts.outputs],
+            "wiring": {axis: list(wiring) for axis, wiring in plan.wiring.items()},
+        },
+        "realtime": realtime,
+        "versions": {name: _version(name) for name in PACKAGES} | {"python": sys.version.split()[0]},
+        "host": {"kernel": platform.release(), "machine": platform.machine(), "cpu": _cpu(), "cpus": os.cpu_count()},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _cpu() -> str:
+    """Model as the kernel names it, and as the compiler does."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as info:
+            model = next((line.split(":", 1)[1].strip() for line in info if line.startswith("model name")), "unknown")
+    except OSError:
+        model = "unknown"
+    return f"{model} ({cpu_identity().split()[0]})"

@@ -1,0 +1,70 @@
+"""Step metrics from recorded positions: overshoot, settling time, static error of each step of the reference."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+SETTLING_BAND = 0.05
+MAX_STEPS = 10_000
+SMALLEST_DWELL_TICKS = 20
+PAPER_CLAIM = {"overshoot_percent": "0", "settling_time_ms": "< 2", "static_error_percent": "negligible (≤ 0.1)"}
+"""Rakotondrabe, Aljanaideh and Al Janaideh, section IV, Fig 10-b and specification a)."""
+
+
+@dataclass(frozen=True)
+class StepMetrics:
+    """Medians and worst cases over the steps of one axis; percentages refer to the height of the step."""
+
+    steps: int
+    overshoot_percent: float
+    overshoot_percent_worst: float
+    settling_time_ms: float
+    settling_time_ms_worst: float
+    static_error_percent: float
+    static_error_percent_worst: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def step_metrics(
+    reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
+) -> StepMetrics | None:
+    """Metrics of a piecewise constant reference (n,) and its position (n,); None where there are no such steps.
+
+    Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth.
+    """
+    starts = np.flatnonzero(np.diff(reference_um) != 0) + 1
+    if starts.size == 0 or starts.size > MAX_STEPS:
+        return None
+    ends = np.append(starts[1:], reference_um.size)
+    rows = []
+    for start, end in zip(starts, ends, strict=True):
+        if end - start >= SMALLEST_DWELL_TICKS:
+            height = reference_um[start] - reference_um[start - 1]
+            rows.append(_one_step(position_um[start:end], reference_um[start], height, rate_hz))
+    if not rows:
+        return None
+    table = np.array(rows)
+    middle, worst = np.median(table, axis=0), np.max(table, axis=0)
+    return StepMetrics(len(rows), *(float(value) for pair in zip(middle, worst, strict=True) for value in pair))
+
+
+def _one_step(
+    position_um: npt.NDArray[np.float64], level_um: float, height_um: float, rate_hz: float
+) -> tuple[float, float, float]:
+    """Overshoot %, settling time ms, static error %."""
+    final_um = float(np.mean(position_um[-max(1, position_um.size // 5) :]))
+    beyond = (position_um - final_um) * np.sign(height_um)
+    outside = np.flatnonzero(np.abs(position_um - final_um) > SETTLING_BAND * abs(height_um))
+    settled_ticks = int(outside[-1]) + 1 if outside.size else 0
+    return (
+        max(0.0, 100 * float(np.max(beyond)) / abs(height_um)),
+        1000 * settled_ticks / rate_hz,
+        100 * abs(final_um - level_um) / abs(height_um),
+    )

@@ -1,0 +1,85 @@
+"""Ten million ticks of nonsense: inputs from a generator of their own, judged tick by tick."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hil.compiled import jit
+from rtloop.law.law import evaluate, reset_trip, set_mode, update
+from rtloop.signals import Mode
+from tests.law.harness import EQ_20, EXACT, PERIOD_S, LawBench, coefficients_of
+
+TICKS_EACH = 2_500_000
+SLEW, TRIP_SLEW = 2.0, 0.05
+LIMITED = {"slew_v_per_s": SLEW / PERIOD_S, "trip_slew_v_per_s": TRIP_SLEW / PERIOD_S, "drive_v": 9.5}
+LAWS = {
+    "formula": coefficients_of(controller=EQ_20, limits=LIMITED),
+    "dead band": coefficients_of(controller=EQ_20, feedforward=EXACT, limits=LIMITED),
+    "filtered": coefficients_of(controller=EQ_20, limits=LIMITED, prefilter={"sections": [[1, 0, 0, -1.99, 0.995]]}),
+    "tustin": coefficients_of(controller=EQ_20 | {"method": "tustin"}, limits=LIMITED),
+}
+WILD = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 9.99e8, -9.99e8, 1e-310, 60.0, -60.0, 9.99, -9.99])
+
+
+@jit
+def soak(coefficients, axes, loop, wild, seed, ticks):
+    """Worst |drive|, worst move above the running slew, worst above the trip's, ticks in a running mode, trips."""
+    np.random.seed(seed)
+    adc, reference = np.zeros(1), np.zeros(1)
+    largest_v, above_slew_v, above_trip_v, running, trips = 0.0, -np.inf, -np.inf, 0, 0
+    level, amplitude, hz = 0.0, 0.0, 0.0
+    for k in range(ticks):
+        if k % 64 == 0:  # another piece of input: a level, a sine or a square wave of any size
+            level = 20.0 * np.random.randn()
+            amplitude, hz = 10.0 ** np.random.uniform(-3, 6), 10.0 ** np.random.uniform(0, 3.6)
+            if np.random.random() < 0.3:
+                hz = 595.5
+            if np.random.random() < 0.7:
+                reset_trip(loop)
+                set_mode(axes, loop, np.random.randint(0, 4), False)
+        wave = np.sin(2.0 * np.pi * hz * 1e-4 * k)
+        if amplitude > 10.0:
+            wave = 1.0 if wave > 0.0 else -1.0
+        reference[0] = level + amplitude * wave
+        adc[0] = 2.0 * np.random.randn()
+        status, age, lost = 0, 0.0, False
+        if np.random.random() < 0.003:
+            adc[0] = wild[np.random.randint(0, wild.size)]
+        if np.random.random() < 0.003:
+            reference[0] = wild[np.random.randint(0, wild.size)]
+        if np.random.random() < 0.001:
+            status, age, lost = np.random.randint(-2, 2), wild[np.random.randint(0, wild.size)], np.random.random() < 0.2
+        if np.random.random() < 0.002:
+            set_mode(axes, loop, np.random.randint(0, 4) if loop.trip == 0 else 0, False)
+        last_v = axes[0].drive_v
+        evaluate(coefficients, axes, loop, adc, reference, status, age, lost)
+        update(coefficients, axes, loop)
+        drive_v = axes[0].drive_v
+        if not abs(drive_v) <= largest_v:
+            largest_v = abs(drive_v)
+        if loop.mode == 0:
+            above_trip_v = max(above_trip_v, abs(drive_v - last_v) - coefficients[0].trip_slew_v_per_tick)
+        else:
+            running += 1
+            above_slew_v = max(above_slew_v, abs(drive_v - last_v) - coefficients[0].slew_v_per_tick)
+        trips += 1 if loop.new_trip != 0 else 0
+        if not np.isfinite(drive_v):
+            return np.inf, above_slew_v, above_trip_v, running, trips
+    return largest_v, above_slew_v, above_trip_v, running, trips
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_soak(law):
+    bench = LawBench(LAWS[law], Mode.CLOSED_LOOP)
+    seed = sorted(LAWS).index(law)
+    largest_v, above_slew_v, above_trip_v, running, trips = soak(
+        bench.coefficients, bench.axes, bench.loops[0], WILD, seed, TICKS_EACH
+    )
+    assert largest_v == 9.5
+    assert above_slew_v <= 8 * np.spacing(9.5)
+    assert above_trip_v <= 8 * np.spacing(9.5)
+    assert running > TICKS_EACH // 10  # it was not just lying there, tripped
+    assert trips > 1000
+    for memory in ("inverse_plays_um", "model_plays_v", "controller", "section_history", "bump"):
+        assert np.all(np.isfinite(bench.axes[memory]))

@@ -1,0 +1,173 @@
+"""The file: read by the public MCAP and protobuf libraries, it says the same numbers as what was written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import MessageIndex
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
+
+from rtloop.recording.contents import Message
+from rtloop.recording.format import EVENTS, TICKS, chunk_rows, tick_dtype, tick_schema
+from rtloop.recording.reader import Reader
+from rtloop.recording.writer import Writer
+from rtloop.signals import columns
+from tests.recording.hand_made_loop import COLUMNS, START_UNIX_NS, make_header, make_rows, snapshot, write_recording
+
+COUNT = 3_000
+SPECIAL = (
+    0.0,
+    -0.0,
+    np.nan,
+    -np.nan,
+    np.inf,
+    -np.inf,
+    5e-324,
+    -5e-324,
+    2.2250738585072014e-308,
+    1.7976931348623157e308,
+)
+
+
+@pytest.fixture(scope="module")
+def rows() -> np.ndarray:
+    rows = make_rows(COUNT)
+    rows[: len(SPECIAL), 12:] = np.array(SPECIAL)[:, None]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory, rows: np.ndarray) -> Path:
+    return write_recording(tmp_path_factory.mktemp("file") / "run.mcap", rows)
+
+
+def stock_rows(path: Path, names: tuple[str, ...] = COLUMNS) -> np.ndarray:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        decoded = [row.decoded_message for row in reader.iter_decoded_messages(topics=["/ticks"])]
+    return np.array([[getattr(message, name) for name in names] for message in decoded])
+
+
+def test_the_public_reader_gives_the_same_numbers(path: Path, rows: np.ndarray):
+    assert stock_rows(path).tobytes() == rows.tobytes()
+
+
+def test_every_field_is_present_even_where_it_is_zero(path: Path):
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        message = next(iter(reader.iter_decoded_messages(topics=["/ticks"]))).decoded_message
+    assert [field.name for field, _ in message.ListFields()] == list(COLUMNS)
+    assert all(message.HasField(name) for name in COLUMNS)
+
+
+def test_our_reader_gives_the_same_numbers(path: Path, rows: np.ndarray):
+    with Reader(path) as reader:
+        assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
+        some = np.concatenate(list(reader.blocks(["x_drive_v", "tick"])))
+    assert some.tobytes() == rows[:, [COLUMNS.index("x_drive_v"), 0]].tobytes()
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(values=arrays(np.float64, (5, len(COLUMNS) - 2), elements=st.floats(allow_subnormal=True)))
+def test_any_double_survives(values: np.ndarray, tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    path.unlink(missing_ok=True)
+    rows = np.column_stack([np.arange(5.0), np.arange(5) * 1e5, values])
+    write_recording(path, rows)
+    assert stock_rows(path).tobytes() == rows.tobytes()
+    with Reader(path) as reader:
+        assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
+
+
+def test_times_topics_and_checksums(path: Path, rows: np.ndarray):
+    with path.open("rb") as file:
+        messages = list(NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False))
+    ticks = [message for _, channel, message in messages if channel.topic == "/ticks"]
+    assert [message.log_time for message in ticks] == [START_UNIX_NS + int(row[1]) for row in rows]
+    assert all(message.publish_time == message.log_time for message in ticks)
+    snapshots = [message.data for _, channel, message in messages if channel.topic == "/law"]
+    assert snapshots == [
+        hashlib.sha256(bytes(snapshot(k))).digest() + bytes(snapshot(k)) for k in range(0, COUNT, 1000)
+    ]
+    configuration = [json.loads(message.data) for _, channel, message in messages if channel.topic == "/configuration"]
+    assert len(configuration) == 1
+    text = configuration[0]["configuration"].encode()
+    assert configuration[0]["configuration_sha256"] == hashlib.sha256(text).hexdigest()
+    events = [json.loads(message.data) for _, channel, message in messages if channel.topic == "/events"]
+    assert set(events[0]) == {"tick", "time_ns", "kind", "who", "axis", "what"}
+    assert events[-1]["kind"] == "finished"
+
+
+def test_seeking_by_time(path: Path):
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.channel_message_counts == {1: COUNT, 2: 4, 3: 3, 4: 1}
+        begin = START_UNIX_NS + 2_500 * 100_000
+        found = list(reader.iter_messages(topics=["/ticks"], starting_at=begin, ending_before=begin + 10 * 100_000))
+    assert len(found) == 10
+
+
+def test_chunks_are_small_and_without_padding(path: Path):
+    assert chunk_rows(COLUMNS) * tick_dtype(COLUMNS).itemsize <= 1 << 20
+    with path.open("rb") as file:
+        chunks = [r for r in StreamReader(file, emit_chunks=True).records if type(r).__name__ == "Chunk"]
+    assert all(chunk.uncompressed_crc for chunk in chunks)
+    assert all(chunk.compression == "zstd" for chunk in chunks)
+
+
+def test_the_schema_is_what_protobuf_itself_would_write():
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+
+    names = columns([f"axis{n}" for n in range(30)], ["a_um", "b_v"])
+    expected = FileDescriptorSet()
+    file = expected.file.add(name="rtloop/tick.proto", package="rtloop", syntax="proto2")
+    message = file.message_type.add(name="Tick")
+    for number, name in enumerate(names, start=1):
+        message.field.add(
+            name=name,
+            number=number,
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+            type=FieldDescriptorProto.TYPE_DOUBLE,
+        )
+    assert FileDescriptorSet.FromString(tick_schema(names)) == expected
+
+
+def test_many_axes(tmp_path: Path):
+    axes = [f"a{n}" for n in range(12)]
+    names = columns(axes, [])
+    rows = np.random.default_rng(3).normal(size=(50, len(names)))
+    rows[:, 0], rows[:, 1] = np.arange(50), np.arange(50) * 1e5
+    path = write_recording(tmp_path / "run.mcap", rows, axes=axes, observed=[], columns=list(names))
+    assert stock_rows(path, names).tobytes() == rows.tobytes()
+
+
+def test_the_message_index_for_viewers_that_need_it(tmp_path: Path):
+    rows = make_rows(2_500)
+    path = tmp_path / "run.mcap"
+    header = make_header()
+    writer = Writer(path, header, START_UNIX_NS, message_index=True)
+    for start in (0, 1_000, 2_000):
+        writer.write_ticks(rows[start : start + 1_000])
+    writer.finish(lambda _: Message(EVENTS, START_UNIX_NS, b"{}"))
+    with path.open("rb") as file:
+        records = list(StreamReader(file, emit_chunks=True).records)
+    indexes = [r for r in records if isinstance(r, MessageIndex) and r.channel_id == TICKS]
+    times = [time for index in indexes for time, _ in index.records]
+    assert times == [START_UNIX_NS + int(row[1]) for row in rows]
+    size = tick_dtype(COLUMNS).itemsize
+    assert [offset for _, offset in indexes[0].records] == [k * size for k in range(1_000)]
+    assert stock_rows(path).tobytes() == rows.tobytes()
+    with Reader(path) as reader:
+        assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
