@@ -1,4 +1,4 @@
-"""Kind `playback`: hands recorded inputs back to the loop, tick by tick. Used by replay, not by configurations."""
+"""Kind `playback`: hands recorded inputs and times back to the loop, tick by tick. Used by replay alone."""
 
 from __future__ import annotations
 
@@ -10,21 +10,36 @@ from hil.compiled import cfunc
 from hil.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype([("rows", np.int64), ("columns", np.int64), ("row", np.int64), ("address", np.int64)])
-EXHAUSTED = -100
+EXHAUSTED = 1
+TIMING_COLUMNS = 4
+"""A row begins with what the clock said, as a driver's `wait` fills it; then the read's status; then its values."""
 
 
 @cfunc(SIGNATURE)
-def playback_read(context, values):
-    """The next row: status in its first column, then what the driver's read gave."""
+def playback_wait(context, timing):
+    """Times of the next row; ends the run where there is none."""
     tape = carray(context, 1, CONTEXT)[0]
     if tape.row >= tape.rows:
         return EXHAUSTED
     data = carray(address_pointer(tape.address), (tape.rows, tape.columns), np.float64)
-    out = carray(values, tape.columns - 1)
-    for i in range(tape.columns - 1):
-        out[i] = data[tape.row, i + 1]
+    out = carray(timing, TIMING_COLUMNS)
+    for i in range(TIMING_COLUMNS):
+        out[i] = data[tape.row, i]
+    return 0
+
+
+@cfunc(SIGNATURE)
+def playback_read(context, values):
+    """Status and values of the row that was waited for."""
+    tape = carray(context, 1, CONTEXT)[0]
+    data = carray(address_pointer(tape.address), (tape.rows, tape.columns), np.float64)
+    first = TIMING_COLUMNS + 1
+    out = carray(values, tape.columns - first)
+    for i in range(tape.columns - first):
+        out[i] = data[tape.row, first + i]
+    status = np.int32(data[tape.row, TIMING_COLUMNS])
     tape.row += 1
-    return np.int32(data[tape.row - 1, 0])
+    return status
 
 
 @cfunc(SIGNATURE)
@@ -34,18 +49,19 @@ def playback_write(context, values):
 
 
 class Playback:
-    """A tape of rows (status, inputs…, age, observed…), which may be replaced by the next stretch at any tick."""
+    """A tape of rows (deadline, wake, missed, now; status; inputs…, age, observed…), replaced stretch by stretch."""
 
     def __init__(self) -> None:
         self._context = np.zeros(1, CONTEXT)
-        self._rows: npt.NDArray[np.float64] = np.empty((0, 1))
+        self._rows: npt.NDArray[np.float64] = np.empty((0, TIMING_COLUMNS + 1))
 
     def load(self, rows: npt.NDArray[np.float64]) -> None:
-        """Continue with `rows` (n, 1 + inputs + 1 + observed)."""
+        """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed)."""
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
         self._context["rows"], self._context["columns"] = self._rows.shape
         self._context["row"], self._context["address"] = 0, self._rows.ctypes.data
 
     def pointers(self) -> Pointers:
-        """Pointers that read from the tape."""
-        return Pointers(self._context.ctypes.data, playback_read.address, playback_write.address)
+        """Pointers that read from the tape, which is the clock as well."""
+        addresses = playback_read.address, playback_write.address, playback_wait.address
+        return Pointers(self._context.ctypes.data, *addresses)

@@ -1,7 +1,7 @@
 """Base of drivers written in plain Python: their methods become C functions.
 
 A call costs about 0.4 µs while the interpreter is otherwise idle, as it is in the loop's process. An exception is
-kept for `error`, and the loop sees a failed driver.
+kept for `error`, and the loop sees a failed driver; so it does where an output is outside its channel's range.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
 from drivers.base import Driver, Facts, Pointers
+from drivers.errors import DriverError
 
 FAILED = -1
 _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
@@ -48,15 +49,16 @@ class PythonDriver(Driver):
         """Start the hardware and wrap `read` and `write`."""
         self.start()
         facts: Facts = self.facts
-        age, outputs = len(facts.inputs), len(facts.outputs)
-        observed = age + 1, age + 1 + len(facts.observed)
+        given = len(facts.inputs) + 1 + len(facts.observed)
+        outputs, ranges = len(facts.outputs), [(channel.minimum_v, channel.maximum_v) for channel in facts.outputs]
 
         def read(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
             try:
-                values[0:age] = self.read()
-                values[age] = self.sample_age_us
-                if facts.observed:
-                    values[observed[0] : observed[1]] = self.observe()
+                row = (*self.read(), self.sample_age_us, *self.observe())
+                if len(row) != given:
+                    raise ValueError(f"driver {self.kind!r}: read gave {len(row)} numbers; its facts say {given}")
+                for i, value in enumerate(row):
+                    values[i] = value
                 return 0
             except Exception as error:  # nothing may propagate into compiled code
                 self.error = error
@@ -64,7 +66,11 @@ class PythonDriver(Driver):
 
         def write(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
             try:
-                self.write(values[0:outputs])
+                volts = values[0:outputs]
+                for value, (minimum_v, maximum_v) in zip(volts, ranges, strict=True):
+                    if not minimum_v <= value <= maximum_v:
+                        raise ValueError(f"driver {self.kind!r}: {value} V is outside {minimum_v} … {maximum_v} V")
+                self.write(volts)
                 return 0
             except Exception as error:
                 self.error = error
@@ -75,10 +81,12 @@ class PythonDriver(Driver):
         return Pointers(0, *addresses)
 
     def close(self) -> None:
-        """Write the safe values, then stop the hardware."""
+        """Write the safe values, then stop the hardware. Raises DriverError where the safe values were refused."""
         if self._callbacks:
             self._callbacks = ()
             try:
                 self.write([channel.safe_v for channel in self.facts.outputs])
+            except Exception as error:
+                raise DriverError(f"driver {self.kind!r}: its outputs could not be made safe: {error}") from error
             finally:
                 self.stop()

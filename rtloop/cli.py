@@ -114,6 +114,26 @@ def info(file: Path, as_json: bool) -> int:
 
 
 @main.command()
+@FILE
+@JSON
+@_fails_clearly
+def replay(file: Path, as_json: bool) -> int:
+    """Re-execute the recording FILE and compare every output of every tick in bytes; exit 1 where one differs."""
+    from rtloop.recording.load import load
+    from rtloop.recording.replay import replay as replay_recording
+    from rtloop.report import Counter, print_replay
+
+    recording = load(file)
+    with Counter("ticks replayed", sys.stderr) as counter:
+        report = replay_recording(recording, counter.show)
+    if as_json:
+        click.echo(json.dumps(report.as_dict()))
+    else:
+        print_replay(file, report)
+    return 0 if report.identical else 1
+
+
+@main.command()
 @_fails_clearly
 def drivers() -> int:
     """List the backends and what each can do."""

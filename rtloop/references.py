@@ -67,16 +67,22 @@ def generator_values(
 def _read_samples(path: Path) -> npt.NDArray[np.float64]:
     """A column of numbers. Raises ValueError."""
     try:
-        loaded = (
-            np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=1)
-        )
+        loaded = np.load(path, allow_pickle=False) if path.suffix == ".npy" else _numbers(path.read_text("utf-8"))
     except OSError as error:
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
-    except ValueError as error:
+    except (ValueError, EOFError) as error:
         raise ValueError(f"file: {path}: not a column of numbers ({error})") from None
-    samples = np.asarray(loaded, dtype=float)
+    if loaded.dtype.kind not in "fiu":
+        raise ValueError(f"file: {path}: holds {loaded.dtype}; real numbers are needed")
+    samples = loaded.astype(float)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"file: {path}: shape {samples.shape}; one column of at least one number is needed")
     if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
         raise ValueError(f"file: {path}: holds numbers that are not finite or beyond {USABLE_MAGNITUDE:g}")
     return samples
+
+
+def _numbers(text: str) -> npt.NDArray[np.float64]:
+    """A number a line; empty lines and what follows a # do not count."""
+    lines = (line.partition("#")[0].strip() for line in text.splitlines())
+    return np.array([float(line) for line in lines if line])

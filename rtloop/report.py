@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import IO, Any
 
 from rich.console import Console
@@ -13,6 +14,7 @@ from drivers.registry import driver_class, kinds
 from rtloop import signals
 from rtloop.prepare import Prepared
 from rtloop.recording.load import load
+from rtloop.recording.replay import ReplayReport
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
 from rtloop.steps import PAPER_CLAIM, step_metrics
@@ -54,6 +56,47 @@ class RunView:
             position, drive = (row[signals.axis_column(axis, which)] for which in (signals.POSITION, signals.DRIVE))
             parts.append(f"{name} {position:8.3f} µm {drive:7.3f} V")
         self._status.update("   ".join(parts))
+
+
+class Counter:
+    """A number that grows, on a terminal."""
+
+    def __init__(self, label: str, stream: IO[str]) -> None:
+        console = Console(file=stream, highlight=False)
+        self._label = label
+        self._status = console.status(label) if console.is_terminal else None
+
+    def __enter__(self) -> Counter:
+        if self._status:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._status:
+            self._status.stop()
+
+    def show(self, count: int) -> None:
+        """The number so far."""
+        if self._status:
+            self._status.update(f"{count:,} {self._label}")
+
+
+def print_replay(path: Path, report: ReplayReport) -> None:
+    """The verdict, the gaps, the first difference."""
+    console = Console(highlight=False)
+    for gap in report.gaps:
+        console.print(f"gap: {gap['count']} ticks from tick {gap['first_tick']} on are not in the recording")
+    if report.unverified:
+        console.print(f"{report.unverified:,} ticks before the next snapshot of the law were passed over")
+    checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
+    if report.first_difference is None:
+        console.print(f"[green]identical[/]: {path}: {checked} compared in bytes")
+        return
+    found = report.first_difference
+    console.print(
+        f"[red]different[/]: {path}: tick {found['tick']}, {found['signal']}: recorded {found['recorded']!r}, "
+        f"replayed {found['replayed']!r} ({checked} compared)"
+    )
 
 
 def _elapsed(time_s: float, ticks: int | None, rate_hz: float) -> str:
@@ -119,7 +162,8 @@ def _bars(histogram: list[dict[str, Any]]) -> str:
     cells = []
     for entry in histogram:
         height = 0 if not entry["count"] else 1 + int(7 * entry["count"].bit_length() / max(largest.bit_length(), 1))
-        cells.append(f"<{entry['below_us']:g} {BAR[min(height, 8)]}{entry['count']}")
+        label = "more" if entry["below_us"] is None else f"<{entry['below_us']:g}"
+        cells.append(f"{label} {BAR[min(height, 8)]}{entry['count']}")
     return "  ".join(cells) + "  (µs, count)"
 
 

@@ -56,6 +56,11 @@ class Assembly:
         self.loop.snapshot_ticks = max(1, round(SNAPSHOT_SECONDS * plan.pacing.rate_hz))
         self.loop.record_limit = UNLIMITED if plan.ticks is None else plan.ticks
 
+    @property
+    def generators(self) -> np.ndarray[Any, Any]:
+        """The reference generators that the loop reads, one GENERATOR record an axis."""
+        return self._arrays["generators"]
+
     def run(self, until_tick: int) -> Outcome:
         """Run the compiled loop."""
         return Outcome(run_ticks(self.loop, until_tick))

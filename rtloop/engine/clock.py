@@ -1,7 +1,8 @@
 """Clocks: what a tick waits for. Each is a pair of C functions, `wait` and `now`, with a context.
 
 `wait` fills timing[0] = deadline and timing[1] = wake, both in ns since the start, timing[2] = whole periods skipped,
-timing[3] = wake in ns of CLOCK_MONOTONIC; `now` fills timing[0] = ns since the start. A non-zero result ends the run.
+timing[3] = wake in ns of CLOCK_MONOTONIC; `now` fills timing[0] = ns since the start. A non-zero result of `wait` ends
+the run. A clock without `now`, 0, measures nothing: the times are NaN.
 
 Paced: absolute deadlines on a fixed grid, sleep until `spin_ns` before the deadline, then spin. A tick that wakes
 late runs once; periods that have passed entirely are skipped and never caught up in a burst.
@@ -48,7 +49,7 @@ CONTEXT = np.dtype(
 
 
 class Clock(NamedTuple):
-    """Addresses of `wait`, `now` and their context. The context's array must outlive the clock."""
+    """Addresses of `wait`, `now` (0 for none) and their context. The context's array must outlive the clock."""
 
     wait: int
     now: int
@@ -96,13 +97,6 @@ def paced_wait(context, timing):
 
 
 @cfunc(SIGNATURE)
-def unpaced_now(context, timing):
-    """NaN: virtual time has no clock."""
-    carray(timing, 4)[0] = np.nan
-    return 0
-
-
-@cfunc(SIGNATURE)
 def unpaced_wait(context, timing):
     """The next instant of virtual time, once the recorder is close enough behind."""
     clock = carray(context, 1, CONTEXT)[0]
@@ -139,4 +133,4 @@ def unpaced_clock(context: np.recarray, head: np.ndarray, words: np.ndarray, cur
     """Virtual time that never gets more than `slack` ticks ahead of the reader at `words[cursor_word]`."""
     context.head_address, context.words_address = head.ctypes.data, words.ctypes.data
     context.cursor_word, context.slack_ticks = cursor_word, slack
-    return Clock(unpaced_wait.address, unpaced_now.address, context.ctypes.data)
+    return Clock(unpaced_wait.address, 0, context.ctypes.data)

@@ -72,7 +72,8 @@ def _apply(loop, command):
     elif command.kind == RESET_TRIP:
         reset_trip(state)
     elif command.kind == STOP:
-        store_release(words_of(loop), STOP_WORD, ONE)
+        store_release(words_of(loop), STOP_WORD, ONE)  # the loop reports it when it stops
+        return
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
     event.tick = loop.tick

@@ -50,7 +50,8 @@ READ_FAILED, WRITE_FAILED = 1, 2
 STOP_WORD, HEARTBEAT_WORD = int(Word.STOP), int(Word.HEARTBEAT_NS)
 OFF = int(Mode.OFF)
 OVERRUN, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.TRIP_HEARTBEAT)
-LOOP_ORIGIN = int(Origin.LOOP)
+LOOP_ORIGIN, SUPERVISOR = int(Origin.LOOP), int(Origin.SUPERVISOR)
+STOP_KIND = int(Kind.STOP)
 TRIPPED, DRIVER_FAILED, PERIODS_MISSED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED), int(Kind.PERIODS_MISSED)
 DONE, STOPPED, FAILURE, ORPHANED = (int(outcome) for outcome in Outcome)
 COEFFICIENT_BYTES, STATE_BYTES, LOOP_STATE_BYTES = COEFFICIENTS.itemsize, STATE.itemsize, LOOP_STATE.itemsize
@@ -88,6 +89,7 @@ def _prepare(loop):
     apply_commands(loop)
     if loop.stopping == 0 and load_acquire(words_of(loop), STOP_WORD) != 0:
         loop.stopping = 1
+        publish_event(loop, STOP_KIND, ALL_AXES, SUPERVISOR, 0.0, 0.0)
         set_mode(axes_of(loop), state_of(loop), OFF, False)
 
 
@@ -97,16 +99,13 @@ def _tick(loop):
     deadline_ns, wake_ns, missed, now_ns = timing[0], timing[1], timing[2], timing[3]
 
     status = call(loop.read, loop.driver_context, loop.inputs)
-    call(loop.now, loop.clock_context, loop.timing)
-    read_ns = timing[0]
+    read_ns = _now(loop)
 
     _evaluate(loop, status, now_ns)
-    call(loop.now, loop.clock_context, loop.timing)
-    law_ns = timing[0]
+    law_ns = _now(loop)
 
     written = call(loop.write, loop.driver_context, loop.outputs)
-    call(loop.now, loop.clock_context, loop.timing)
-    write_ns = timing[0]
+    write_ns = _now(loop)
 
     state = state_of(loop)
     update(coefficients_of(loop), axes_of(loop), state)
@@ -125,11 +124,19 @@ def _tick(loop):
     row[7] = missed
     row[9] = float(state.mode)
     row[10] = float(status)
-    call(loop.now, loop.clock_context, loop.timing)
-    row[6] = (timing[0] - wake_ns) * US_PER_NS
+    row[6] = (_now(loop) - wake_ns) * US_PER_NS
     overrun = row[2] + row[6] > loop.period_us
-    row[8] = float(state.flags | (OVERRUN if overrun else 0))
+    row[8] = float(state.tick_flags | (OVERRUN if overrun else 0))
     publish(ring, position)
+
+
+@jit
+def _now(loop):
+    """ns since the start; NaN in virtual time, whose clock has no `now`."""
+    if loop.now == 0:
+        return np.nan
+    call(loop.now, loop.clock_context, loop.timing)
+    return floats(loop.timing, 1)[0]
 
 
 @jit

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.base import Channel
 from rtloop.design.discretise import DiscreteController
-from rtloop.design.realisation import row_bands
-from rtloop.law.hysteresis import LANES
-from rtloop.law.layout import COEFFICIENTS, MAX_ORDER, Records, records
+from rtloop.design.realisation import blocks, row_bands
+from rtloop.law.layout import COEFFICIENTS, LANES, MAX_ORDER, Records, records
 from rtloop.law.options import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
 
 
@@ -30,6 +31,8 @@ def axis_coefficients(
     fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v}
     fields |= _feedforward(axis.feedforward)
     fields |= _controller(controller)
+    if axis.controller is not None and controller is not None:
+        fields["tracking_share"] = _tracking_share(controller, axis.controller.tracking_s, period_s)
     fields |= _prefilter(axis.prefilter)
     fields |= limit_fields(axis.limits, output, period_s)
     fields |= interlock_fields(axis.interlocks)
@@ -67,18 +70,62 @@ def _controller(controller: DiscreteController | None) -> Mapping[str, object]:
     order = controller.b.size
     if order > MAX_ORDER:
         raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
-    bands = row_bands(controller.a)
-    return {
-        "order": order,
-        "a": controller.a,
+    places = _places(controller.a)
+    vectors = {
         "b": controller.b,
         "c": controller.c,
-        "d": controller.d,
-        "row_start": bands[:, 0],
-        "row_stop": bands[:, 1],
         "tracking": controller.antiwindup,
         "steady_state": controller.steady_state_gain,
     }
+    fields: dict[str, object] = {"d": controller.d}
+    for name, values in vectors.items():
+        fields[name] = np.zeros(MAX_ORDER)
+        fields[name][places] = values
+    a = np.zeros((MAX_ORDER, MAX_ORDER))
+    a[np.ix_(places, places)] = controller.a
+    states = np.arange(MAX_ORDER)
+    partners = states ^ LANES
+    fields |= {"own": a[states, states], "partner": a[states, partners]}
+    a[states, states] = a[states, partners] = 0.0
+    bands = row_bands(a)
+    in_use = -(-(int(places.max(initial=-1)) + 1) // (2 * LANES)) * 2 * LANES
+    return {
+        **fields,
+        "order": in_use,
+        "coupling": a,
+        "coupled": bool(a.any()),
+        "row_start": bands[:, 0],
+        "row_stop": bands[:, 1],
+    }
+
+
+def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Place of each state in the kernels' order: blocks of four pairs, a pair's two states LANES apart.
+
+    The two states of a 2×2 block of A make a pair, and so do the other states, two by two.
+    """
+    found = blocks(a)
+    pairs = [(block.start, block.start + 1) for block in found if block.stop - block.start == 2]
+    single = [block.start for block in found if block.stop - block.start == 1]
+    pairs += [tuple(single[i : i + 2]) for i in range(0, len(single), 2)]
+    places = np.zeros(a.shape[0], np.int64)
+    for number, pair in enumerate(pairs):
+        for half, state in enumerate(pair):
+            places[state] = number // LANES * 2 * LANES + number % LANES + half * LANES
+    return places
+
+
+def _tracking_share(controller: DiscreteController, tracking_s: float, period_s: float) -> float:
+    """Share of a shortfall that the states take up in a tick. Raises ValueError where that is not stable."""
+    share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
+    a, m, c = controller.a, controller.antiwindup, controller.c
+    radius = np.abs(np.linalg.eigvals(a - share * np.outer(a @ m, c))).max(initial=0.0)
+    if not radius < 1:
+        raise ValueError(
+            f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
+            f"(largest |pole| {radius:.6g}); a smaller one, or 0, is needed"
+        )
+    return share
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from hil.compiled import jit
+from hil.compiled import inlined, jit
+from rtloop.law.hysteresis import total
+from rtloop.law.layout import LANES
+
+
+BLOCK = 2 * LANES
+"""States in a block: four, and then the partners of these four."""
 
 
 @jit
 def controller_output(coefficients, state, error_um):
     """Command v = c x + d e in µm."""
-    command = coefficients.d * error_um
-    for i in range(coefficients.order):
-        command += coefficients.c[i] * state.controller[i]
-    return command
+    c, x = coefficients.c, state.controller
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for block in range(coefficients.order // BLOCK):
+        i = block * BLOCK
+        first += c[i] * x[i] + c[i + 4] * x[i + 4]
+        second += c[i + 1] * x[i + 1] + c[i + 5] * x[i + 5]
+        third += c[i + 2] * x[i + 2] + c[i + 6] * x[i + 6]
+        fourth += c[i + 3] * x[i + 3] + c[i + 7] * x[i + 7]
+    return total(state.sums, first, second, third, fourth) + coefficients.d * error_um
 
 
 @jit
@@ -20,13 +31,34 @@ def controller_update(coefficients, state, error_um, shortfall_um):
 
     The vector m has c·m = 1 (observer form of anti-windup; Åström and Wittenmark, Computer-Controlled Systems, 1997).
     """
-    for i in range(coefficients.order):
-        state.scratch[i] = state.controller[i] + coefficients.tracking[i] * shortfall_um
-    for i in range(coefficients.order):
-        moved = coefficients.b[i] * error_um
-        for j in range(coefficients.row_start[i], coefficients.row_stop[i]):
-            moved += coefficients.a[i, j] * state.scratch[j]
-        state.controller[i] = moved
+    if coefficients.coupled != 0:
+        for i in range(coefficients.order):
+            state.scratch[i] = state.controller[i] + coefficients.tracking[i] * shortfall_um
+    x = state.controller
+    for block in range(coefficients.order // BLOCK):
+        i = block * BLOCK
+        one, partner_of_one = _moved_pair(coefficients, state, i, error_um, shortfall_um)
+        two, partner_of_two = _moved_pair(coefficients, state, i + 1, error_um, shortfall_um)
+        three, partner_of_three = _moved_pair(coefficients, state, i + 2, error_um, shortfall_um)
+        four, partner_of_four = _moved_pair(coefficients, state, i + 3, error_um, shortfall_um)
+        x[i], x[i + 1], x[i + 2], x[i + 3] = one, two, three, four
+        x[i + 4], x[i + 5], x[i + 6], x[i + 7] = partner_of_one, partner_of_two, partner_of_three, partner_of_four
+    if coefficients.coupled != 0:
+        for i in range(coefficients.order):
+            for j in range(coefficients.row_start[i], coefficients.row_stop[i]):
+                state.controller[i] += coefficients.coupling[i, j] * state.scratch[j]
+
+
+@inlined
+def _moved_pair(coefficients, state, i, error_um, shortfall_um):
+    """States i and i + LANES after a tick, as far as they depend on each other and on the inputs."""
+    j = i + LANES
+    first = state.controller[i] + coefficients.tracking[i] * shortfall_um
+    second = state.controller[j] + coefficients.tracking[j] * shortfall_um
+    return (
+        coefficients.own[i] * first + coefficients.partner[i] * second + coefficients.b[i] * error_um,
+        coefficients.own[j] * second + coefficients.partner[j] * first + coefficients.b[j] * error_um,
+    )
 
 
 @jit

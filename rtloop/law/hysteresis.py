@@ -17,14 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hil.compiled import jit
-from rtloop.law.layout import MAX_PLAYS
+from hil.compiled import inlined, jit
+from rtloop.law.layout import LANES, MAX_PLAYS
 
 Real = npt.NDArray[np.float64]
-
-LANES = 4
-"""Plays in use are padded to a multiple of this with plays of weight 0, so that the kernels need no remainder."""
-
 
 @dataclass(frozen=True)
 class PlayModel:
@@ -69,7 +65,7 @@ def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> 
     return PlayModel(r, p)
 
 
-@jit
+@inlined
 def play(value, threshold, last):
     """Play operator of half-width `threshold` ≥ 0 after state `last`, by comparisons: NaN and −0 cannot surprise."""
     low = value - threshold
@@ -78,30 +74,80 @@ def play(value, threshold, last):
     return high if high < raised else raised
 
 
+@inlined
+def four_plays(value, thresholds, last, i):
+    """Plays number i … i + 3 after `value`."""
+    return (
+        play(value, thresholds[i], last[i]),
+        play(value, thresholds[i + 1], last[i + 1]),
+        play(value, thresholds[i + 2], last[i + 2]),
+        play(value, thresholds[i + 3], last[i + 3]),
+    )
+
+
 @jit
-def weighted_sum(weights, values, count):
-    """Σ w_i y_i in four interleaved partial sums, a fixed order; `count` is a multiple of LANES."""
-    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
-    for i in range(0, count, LANES):
-        first += weights[i] * values[i]
-        second += weights[i + 1] * values[i + 1]
-        third += weights[i + 2] * values[i + 2]
-        fourth += weights[i + 3] * values[i + 3]
+def total(sums, first, second, third, fourth):
+    """The sum of four partial sums. `sums` keeps them: stored side by side, they are one vector to the compiler."""
+    sums[0], sums[1], sums[2], sums[3] = first, second, third, fourth
     return (first + second) + (third + fourth)
+
+
+@jit
+def plays_sum(value, thresholds, weights, plays, count, sums):
+    """Σ w_i F_i[value] in four interleaved partial sums, a fixed order; the plays do not move."""
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for block in range(count // LANES):
+        i = block * LANES
+        one, two, three, four = four_plays(value, thresholds, plays, i)
+        first += weights[i] * one
+        second += weights[i + 1] * two
+        third += weights[i + 2] * three
+        fourth += weights[i + 3] * four
+    return total(sums, first, second, third, fourth)
+
+
+@jit
+def moved_plays_sum(value, thresholds, weights, plays, count, sums):
+    """The same sum, and the plays move."""
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for block in range(count // LANES):
+        i = block * LANES
+        one, two, three, four = four_plays(value, thresholds, plays, i)
+        first += weights[i] * one
+        second += weights[i + 1] * two
+        third += weights[i + 2] * three
+        fourth += weights[i + 3] * four
+        plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = one, two, three, four
+    return total(sums, first, second, third, fourth)
+
+
+@jit
+def move_plays(value, thresholds, plays, count):
+    """Plays after `value`."""
+    for block in range(count // LANES):
+        i = block * LANES
+        plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = four_plays(value, thresholds, plays, i)
 
 
 @jit
 def inverse_drive(coefficients, state, command_um):
     """Drive in V that the inverse gives for a command in µm, dead band included; the memory does not move."""
-    for i in range(coefficients.play_count):
-        state.moved_um[i] = play(command_um, coefficients.inverse_thresholds_um[i], state.inverse_plays_um[i])
-    drive = weighted_sum(coefficients.inverse_weights_v_per_um, state.moved_um, coefficients.play_count)
+    drive = plays_sum(
+        command_um,
+        coefficients.inverse_thresholds_um,
+        coefficients.inverse_weights_v_per_um,
+        state.inverse_plays_um,
+        coefficients.play_count,
+        state.sums,
+    )
     if coefficients.dead_band_v > 0.0:
         threshold = coefficients.dead_band_threshold_v
         if drive > state.model_plays_v[0] + threshold:
             state.dead_band_direction = 1.0
         elif drive < state.model_plays_v[0] - threshold:
             state.dead_band_direction = -1.0
+        elif state.entering != 0:  # another mode may have left the drive anywhere within the dead band
+            state.dead_band_direction = (state.drive_v - state.model_plays_v[0]) / coefficients.dead_band_v
         drive += state.dead_band_direction * coefficients.dead_band_v
     return drive
 
@@ -109,9 +155,13 @@ def inverse_drive(coefficients, state, command_um):
 @jit
 def follow_drive(coefficients, state, drive_v):
     """Advance the memory by the drive applied, and return v_applied = P̂[u_applied] in µm."""
-    for i in range(coefficients.play_count):
-        state.model_plays_v[i] = play(drive_v, coefficients.model_thresholds_v[i], state.model_plays_v[i])
-    applied = weighted_sum(coefficients.model_weights_um_per_v, state.model_plays_v, coefficients.play_count)
-    for i in range(coefficients.play_count):
-        state.inverse_plays_um[i] = play(applied, coefficients.inverse_thresholds_um[i], state.inverse_plays_um[i])
-    return applied
+    applied_um = moved_plays_sum(
+        drive_v,
+        coefficients.model_thresholds_v,
+        coefficients.model_weights_um_per_v,
+        state.model_plays_v,
+        coefficients.play_count,
+        state.sums,
+    )
+    move_plays(applied_um, coefficients.inverse_thresholds_um, state.inverse_plays_um, coefficients.play_count)
+    return applied_um

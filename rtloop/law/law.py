@@ -52,10 +52,10 @@ def evaluate(coefficients, axes, loop, adc_v, references, driver_status, sample_
     loop.trip |= causes
     if loop.trip != 0:
         loop.mode = OFF
-    loop.flags = loop.trip | (HEARTBEAT_LOST if heartbeat_lost else 0)
+    loop.tick_flags = loop.trip | (HEARTBEAT_LOST if heartbeat_lost else 0)
     loop.settled = 1
     for a in range(axes.shape[0]):
-        loop.flags |= _drive(coefficients[a], axes[a], loop, references[a])
+        loop.tick_flags |= _drive(coefficients[a], axes[a], loop, references[a])
         if axes[a].drive_v != coefficients[a].safe_v:
             loop.settled = 0
 
@@ -118,4 +118,5 @@ def update(coefficients, axes, loop):
         state.applied_command_um = follow_drive(coefficients[a], state, state.drive_v)
         if loop.mode == CLOSED_LOOP:
             shortfall_um = state.applied_command_um - state.command_um
-            controller_update(coefficients[a], state, state.error_um, shortfall_um)
+            tracked_um = coefficients[a].tracking_share * shortfall_um
+            controller_update(coefficients[a], state, state.error_um, tracked_um)

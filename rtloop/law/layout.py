@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+LANES = 4
+"""Play operators and pairs of controller states are computed four at a time. What is in use is padded to a multiple
+of this with zero weights, so that no kernel needs a remainder; counts have 8 bits, so that no index can be negative."""
 MAX_PLAYS = 64
 MAX_ORDER = 24
 MAX_TAPS = 128
@@ -25,22 +28,28 @@ COEFFICIENTS = np.dtype(
         ("um_per_v", np.float64),
         ("offset_v", np.float64),
         # inverse Prandtl-Ishlinskii and the forward model that it inverts
-        ("play_count", np.int64),
+        ("play_count", np.uint8),
         ("inverse_thresholds_um", np.float64, (MAX_PLAYS,)),
         ("inverse_weights_v_per_um", np.float64, (MAX_PLAYS,)),
         ("model_thresholds_v", np.float64, (MAX_PLAYS,)),
         ("model_weights_um_per_v", np.float64, (MAX_PLAYS,)),
         ("dead_band_v", np.float64),
         ("dead_band_threshold_v", np.float64),
-        # controller C(z): x⁺ = A x + b e, v = c x + d e; only columns start ≤ j < stop of a row of A are non-zero
-        ("order", np.int64),
-        ("row_start", np.int64, (MAX_ORDER,)),
-        ("row_stop", np.int64, (MAX_ORDER,)),
-        ("a", np.float64, (MAX_ORDER, MAX_ORDER)),
+        # controller C(z): x⁺ = A x + b e, v = c x + d e. States stand in blocks of four pairs, four first ones and
+        # then their four partners; A within the pairs is `own` and `partner`, `coupling` holds the rest of A, of
+        # whose rows only the columns start ≤ j < stop are non-zero
+        ("order", np.uint8),
+        ("own", np.float64, (MAX_ORDER,)),
+        ("partner", np.float64, (MAX_ORDER,)),
+        ("coupled", np.uint8),
+        ("row_start", np.uint8, (MAX_ORDER,)),
+        ("row_stop", np.uint8, (MAX_ORDER,)),
+        ("coupling", np.float64, (MAX_ORDER, MAX_ORDER)),
         ("b", np.float64, (MAX_ORDER,)),
         ("c", np.float64, (MAX_ORDER,)),
         ("d", np.float64),
         ("tracking", np.float64, (MAX_ORDER,)),
+        ("tracking_share", np.float64),
         ("steady_state", np.float64, (MAX_ORDER,)),
         # reference pre-filter: FIR taps, then second-order sections b0 b1 b2 a1 a2
         ("tap_count", np.int64),
@@ -67,7 +76,7 @@ STATE = np.dtype(
     [
         ("inverse_plays_um", np.float64, (MAX_PLAYS,)),
         ("model_plays_v", np.float64, (MAX_PLAYS,)),
-        ("moved_um", np.float64, (MAX_PLAYS,)),
+        ("sums", np.float64, (LANES,)),
         ("dead_band_direction", np.float64),
         ("controller", np.float64, (MAX_ORDER,)),
         ("scratch", np.float64, (MAX_ORDER,)),
@@ -88,7 +97,7 @@ STATE = np.dtype(
     align=True,
 )
 LOOP_STATE = np.dtype(
-    [("mode", np.int64), ("trip", np.int64), ("new_trip", np.int64), ("flags", np.int64), ("settled", np.int64)],
+    [("mode", np.int64), ("trip", np.int64), ("new_trip", np.int64), ("tick_flags", np.int64), ("settled", np.int64)],
     align=True,
 )
 """State common to all axes: Mode; latched causes and those of this tick, as Flag bits; flags of this tick; 1 when

@@ -113,6 +113,9 @@ class ControllerOptions(TransferOptions):
 
     method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
     prewarp_hz: float | None = Field(default=None, gt=0)
+    tracking_s: float = Field(default=0.0005, ge=0)
+    """Anti-windup: time constant with which the states follow a command that was limited, short against the loop's
+    response. 0 is at once, which lets even a single limited tick throw the slow states off."""
     allow_unstable: bool = False
     """Run although the loop is unstable on the axis's model."""
 

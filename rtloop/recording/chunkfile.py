@@ -32,7 +32,7 @@ LEVEL = 3
 class Content(NamedTuple):
     """What a chunk holds: its records, the span of their log times, messages and index record by channel."""
 
-    records: bytes
+    records: bytes | memoryview
     start: int
     end: int
     counts: dict[int, int]

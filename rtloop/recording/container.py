@@ -35,7 +35,7 @@ MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 FOOTER_HEAD = struct.Struct("<BQQQ")
 FOOTER_BYTES = FOOTER_HEAD.size + 4
 DATA_END_BYTES = PREFIX.size + 4
-LARGEST_CHUNK_BYTES = 64 << 20
+LARGEST_CHUNK_BYTES = 16 << 20
 """Uncompressed; beyond that a chunk is taken as damaged rather than allocated."""
 
 
@@ -67,7 +67,7 @@ def pack_records(records: Iterable[McapRecord]) -> bytes:
     return builder.end()
 
 
-def pack_chunk(records: bytes, start: int, end: int, compressor: zstandard.ZstdCompressor) -> bytes:
+def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zstandard.ZstdCompressor) -> bytes:
     """A chunk record over `records`."""
     data = compressor.compress(records)
     length = CHUNK_HEAD.size - PREFIX.size + len(data)

@@ -7,8 +7,10 @@ RecordingError      66  the file is missing, not a recording, or damaged beyond 
 
 from __future__ import annotations
 
+from rtloop.errors import RtloopError
 
-class RecordingError(Exception):
+
+class RecordingError(RtloopError):
     """The recording cannot be read; the message says the file, the fact and what is possible instead."""
 
     exit_code = 66

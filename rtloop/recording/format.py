@@ -28,8 +28,8 @@ LAW_ENCODING = "rtloop-law"
 MAX_CHUNK_BYTES = 1 << 20
 PREFIX_BYTES = 9
 """Opcode and length in front of every MCAP record."""
-MAX_COLUMNS = 2047
-"""Field numbers up to this need at most two bytes of tag."""
+SHORT_TAGS = 15
+"""Field numbers up to this have a tag of one byte, those up to 2047 of two."""
 
 Records = np.ndarray[Any, Any]
 _DOUBLE = 1
@@ -110,7 +110,7 @@ def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
     fields = [("_opcode", "u1"), ("_length", "<u8"), ("_channel", "<u2"), ("_sequence", "<u4")]
     fields += [("_log_time", "<u8"), ("_publish_time", "<u8")]
     for number, name in enumerate(columns, start=1):
-        fields += [(f"_tag_{number}", "u1" if number < 16 else "<u2"), (name, "<f8")]
+        fields += [(f"_tag_{number}", "u1" if number <= SHORT_TAGS else "<u2"), (name, "<f8")]
     return np.dtype(fields)
 
 
@@ -127,8 +127,12 @@ def blank_ticks(columns: Sequence[str], count: int) -> Records:
 
 def fill_ticks(records: Records, columns: Sequence[str], rows: np.ndarray[Any, Any], start_unix_ns: int) -> None:
     """Put `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`; log time is start + deadline, in ns."""
-    for index, name in enumerate(columns):
-        records[name] = rows[:, index]
+    short = SHORT_TAGS
+    for names, values, tag_bytes in ((columns[:short], rows[:, :short], 1), (columns[short:], rows[:, short:], 2)):
+        if names:  # one strided copy for all columns whose tags are equally long
+            offset = records.dtype.fields[names[0]][1]  # type: ignore[index]
+            strides = (records.dtype.itemsize, tag_bytes + values.itemsize)
+            np.ndarray(values.shape, "<f8", records.view(np.uint8), offset, strides)[:] = values
     records["_log_time"] = rows[:, DEADLINE].astype(np.int64) + start_unix_ns
     records["_publish_time"] = records["_log_time"]
 

@@ -29,7 +29,7 @@ from rtloop.signals import DEADLINE
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
-AHEAD = 8
+AHEAD = 64
 
 
 class Snapshot(NamedTuple):

@@ -30,7 +30,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.rings import RingReader
 from rtloop.recording.session import Options, Session
 
-POLL_S = 0.03
+POLL_S = 0.1
 UNPACED_POLL_S = 0.0002
 ABANDONED_S = 5.0
 """With the supervisor gone and no new tick for this long, the loop is taken as gone too."""

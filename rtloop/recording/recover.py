@@ -96,7 +96,8 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
     with Reader(path, tolerant=True) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         output.with_name(output.name + UNFINISHED).unlink(missing_ok=True)
-        writer = Writer(output, header, header["created_unix_ns"], suffix=UNFINISHED)
+        log_time = header["created_unix_ns"] if header["paced"] else 0
+        writer = Writer(output, header, log_time, suffix=UNFINISHED)
         try:
             writer.start_unix_ns = reader.start_unix_ns
             recovery = Recovery(reader, writer)

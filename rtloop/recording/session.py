@@ -52,7 +52,7 @@ class Session:
         self._paths: list[Path] = []
         self._first_tick, self._logged, self._bytes = 0, 0, 0
         self.error: str | None = None
-        self._writer = self._open(header["created_unix_ns"])
+        self._writer = self._open(header["created_unix_ns"] if header["paced"] else 0)
 
     @property
     def cursor(self) -> int:

@@ -171,16 +171,13 @@ def _sum_up(reader: Reader) -> Totals:
     axes = reader.header["axes"]
     totals = Totals(axes)
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]
-    batch: list[np.ndarray[Any, Any]] = []
+    batch, fill = np.empty((len(names), BATCH_ROWS)), 0
     for rows in reader.blocks(names):
-        batch.append(rows)
-        if len(batch) * len(rows) >= BATCH_ROWS:
-            totals.add(_columns(names, batch))
-            batch = []
-    if batch:
-        totals.add(_columns(names, batch))
+        if fill + len(rows) > BATCH_ROWS:
+            totals.add(dict(zip(names, batch[:, :fill], strict=True)))
+            fill = 0
+        batch[:, fill : fill + len(rows)] = rows.T
+        fill += len(rows)
+    if fill:
+        totals.add(dict(zip(names, batch[:, :fill], strict=True)))
     return totals
-
-
-def _columns(names: list[str], batch: list[np.ndarray[Any, Any]]) -> dict[str, np.ndarray[Any, Any]]:
-    return {name: np.concatenate([rows[:, index] for rows in batch]) for index, name in enumerate(names)}

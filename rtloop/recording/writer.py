@@ -71,7 +71,8 @@ class Writer:
         if self._message_index:
             offsets = np.arange(count) * records.dtype.itemsize
             index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
-        self._file.append(Content(records.tobytes(), int(times[0]), int(times[-1]), {format.TICKS: count}, index))
+        data = records.view(np.uint8).data
+        self._file.append(Content(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:

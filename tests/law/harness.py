@@ -59,7 +59,7 @@ def run_law(coefficients, axes, loop, modes, resets, adc_v, references, status, 
         state = axes[0]
         out[0, k], out[1, k], out[2, k] = state.drive_v, state.demand_v, state.command_um
         out[3, k], out[4, k] = state.applied_command_um, state.error_um
-        out[5, k], out[6, k] = float(loop.flags), float(loop.mode)
+        out[5, k], out[6, k] = float(loop.tick_flags), float(loop.mode)
 
 
 def coefficients_of(output: Channel | None = None, **parts: Any) -> Records:

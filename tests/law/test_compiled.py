@@ -8,7 +8,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.reference import GENERATOR
 from rtloop.signals import Mode
 from tests.law.harness import EQ_20, EXACT, LawBench, coefficients_of
 
@@ -34,6 +37,12 @@ def mixed_run() -> bytes:
     bench = LawBench(axis, Mode.CLOSED_LOOP)
     signals = bench.run(references, adc_v, modes=modes, resets=resets)
     return np.array(signals).tobytes() + bench.state_bytes()
+
+
+@pytest.mark.parametrize("dtype", [COEFFICIENTS, STATE, LOOP_STATE, GENERATOR])
+def test_no_field_hides_behind_an_attribute_of_a_record(dtype):
+    """numpy's scalars have `flags`, `size`, `data` and more: a field of that name works compiled only."""
+    assert not set(dtype.names) & set(dir(np.record))
 
 
 def test_uncompiled_gives_the_same_bits():

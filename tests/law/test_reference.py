@@ -135,7 +135,10 @@ def test_twice_the_same(options):
         ({"kind": "table", "file": "absent.csv"}, r"file: .*absent\.csv: .*(not found|No such file)"),
         ({"kind": "table", "file": "words.csv"}, r"words\.csv: not a column of numbers"),
         ({"kind": "table", "file": "nan.csv"}, r"nan\.csv: holds numbers that are not finite or beyond 1e\+09"),
-        ({"kind": "table", "file": "wide.csv"}, r"wide\.csv: shape \(2, 2\); one column"),
+        ({"kind": "table", "file": "wide.csv"}, r"wide\.csv: not a column of numbers \(could not convert string to float: '1,2'\)"),
+        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy: shape \(2, 2\); one column"),
+        ({"kind": "table", "file": "complex.npy"}, r"complex\.npy: holds complex128; real numbers are needed"),
+        ({"kind": "table", "file": "nothing.npy"}, r"nothing\.npy: not a column of numbers"),
         ({"kind": "table", "file": "empty.csv"}, r"empty\.csv: .*at least one number"),
         ({"kind": "table", "file": "pickled.npy"}, r"pickled\.npy: not a column of numbers"),
     ],
@@ -144,6 +147,9 @@ def test_references_that_cannot_be(tmp_path, options, message):
     contents = {"words": "one\ntwo\n", "nan": "1\nnan\n", "wide": "1,2\n3,4\n", "empty": ""}
     for name, content in contents.items():
         (tmp_path / f"{name}.csv").write_text(content)
+    np.save(tmp_path / "wide.npy", np.zeros((2, 2)))
+    np.save(tmp_path / "complex.npy", np.ones(3, complex))
+    (tmp_path / "nothing.npy").write_bytes(b"")
     np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)
     with pytest.raises(ValueError, match=message):
         generate(options, folder=tmp_path)

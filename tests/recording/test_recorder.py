@@ -50,7 +50,7 @@ def test_records_everything_in_order(loop: HandMadeLoop, recorder: RecorderProce
     assert rows_of(tmp_path / "run.mcap").tobytes() == rows.tobytes()
     with Reader(tmp_path / "run.mcap") as reader:
         assert reader.problems == []
-        assert reader.start_unix_ns == START_UNIX_NS
+        assert reader.start_unix_ns == 0  # virtual time
         assert [event["kind"] for event in reader.events] == ["set_mode", "tripped", "finished"]
         assert [s.data for s in reader.snapshots()] == [snapshot(k).tobytes() for k in (0, 10_000, 20_000)]
     assert os.listdir(tmp_path) == ["run.mcap"]
@@ -88,6 +88,15 @@ def test_snapshots_and_commands_stand_in_front_of_the_ticks_they_precede(loop, r
             else:
                 last_tick = rows[-1, 0]
             assert all(tick in snapshots for tick in range(0, int(last_tick) + 1, 3_000))
+
+
+def test_times_are_those_of_the_run(loop, recorder, tmp_path):
+    recorder.start(tmp_path / "run.mcap")
+    loop.run(make_rows(100))
+    loop.end()
+    recorder.result()
+    with Reader(tmp_path / "run.mcap") as reader:
+        assert reader.start_unix_ns == START_UNIX_NS
 
 
 def test_a_lapped_recorder_counts_what_it_lost(loop, recorder, tmp_path):

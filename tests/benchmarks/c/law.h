@@ -1,0 +1,203 @@
+/* The law of one tick as rtloop.law computes it, operation by operation, for comparison. */
+#pragma once
+#include <math.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include "layout.h"
+
+enum { OFF, RAW, FEEDFORWARD, CLOSED_LOOP };
+enum {
+    COMMAND_LIMITED = 1 << 1, DRIVE_LIMITED = 1 << 2, SLEW_LIMITED = 1 << 3, RAMPING = 1 << 4, HEARTBEAT_LOST = 1 << 5,
+    TRIP_NON_FINITE = 1 << 8, TRIP_SENSOR_RANGE = 1 << 9, TRIP_POSITION = 1 << 10, TRIP_DRIVER = 1 << 11,
+    TRIP_HEARTBEAT = 1 << 12, TRIP_STALE = 1 << 13,
+};
+enum { LANES = 4, BLOCK = 8 };
+
+typedef const struct law_coefficients *restrict law_c;
+typedef struct law_state *restrict law_s;
+typedef struct loop_state *restrict loop_s;
+
+static inline double play(double value, double threshold, double last) {
+    double low = value - threshold, high = value + threshold;
+    double raised = low > last ? low : last;
+    return high < raised ? high : raised;
+}
+
+static inline double total(const double *sums) { return (sums[0] + sums[1]) + (sums[2] + sums[3]); }
+
+static inline double inverse_drive(law_c c, law_s s, double command_um) {
+    double sums[LANES] = {0};
+    for (unsigned i = 0; i < c->play_count; i += LANES)
+        for (unsigned lane = 0; lane < LANES; lane++)
+            sums[lane] += c->inverse_weights_v_per_um[i + lane]
+                * play(command_um, c->inverse_thresholds_um[i + lane], s->inverse_plays_um[i + lane]);
+    double drive = total(sums);
+    if (c->dead_band_v > 0) {
+        double centre = s->model_plays_v[0];
+        if (drive > centre + c->dead_band_threshold_v) s->dead_band_direction = 1;
+        else if (drive < centre - c->dead_band_threshold_v) s->dead_band_direction = -1;
+        else if (s->entering) s->dead_band_direction = (s->drive_v - centre) / c->dead_band_v;
+        drive += s->dead_band_direction * c->dead_band_v;
+    }
+    return drive;
+}
+
+static inline double follow_drive(law_c c, law_s s, double drive_v) {
+    double sums[LANES] = {0};
+    for (unsigned i = 0; i < c->play_count; i += LANES)
+        for (unsigned lane = 0; lane < LANES; lane++) {
+            double moved = play(drive_v, c->model_thresholds_v[i + lane], s->model_plays_v[i + lane]);
+            s->model_plays_v[i + lane] = moved;
+            sums[lane] += c->model_weights_um_per_v[i + lane] * moved;
+        }
+    double applied_um = total(sums);
+    for (unsigned i = 0; i < c->play_count; i += LANES)
+        for (unsigned lane = 0; lane < LANES; lane++)
+            s->inverse_plays_um[i + lane] =
+                play(applied_um, c->inverse_thresholds_um[i + lane], s->inverse_plays_um[i + lane]);
+    return applied_um;
+}
+
+static inline double controller_output(law_c c, law_s s, double error_um) {
+    double sums[LANES] = {0};
+    for (unsigned i = 0; i < c->order; i += BLOCK)
+        for (unsigned lane = 0; lane < LANES; lane++)
+            sums[lane] += c->c[i + lane] * s->controller[i + lane]
+                + c->c[i + lane + LANES] * s->controller[i + lane + LANES];
+    return total(sums) + c->d * error_um;
+}
+
+static inline void controller_update(law_c c, law_s s, double error_um, double shortfall_um) {
+    if (c->coupled)
+        for (unsigned i = 0; i < c->order; i++) s->scratch[i] = s->controller[i] + c->tracking[i] * shortfall_um;
+    for (unsigned i = 0; i < c->order; i += BLOCK)
+        for (unsigned lane = 0; lane < LANES; lane++) {
+            unsigned j = i + lane, k = j + LANES;
+            double first = s->controller[j] + c->tracking[j] * shortfall_um;
+            double second = s->controller[k] + c->tracking[k] * shortfall_um;
+            s->controller[j] = c->own[j] * first + c->partner[j] * second + c->b[j] * error_um;
+            s->controller[k] = c->own[k] * second + c->partner[k] * first + c->b[k] * error_um;
+        }
+    if (c->coupled)
+        for (unsigned i = 0; i < c->order; i++)
+            for (unsigned j = c->row_start[i]; j < c->row_stop[i]; j++)
+                s->controller[i] += c->coupling[i][j] * s->scratch[j];
+}
+
+static inline void controller_enter(law_c c, law_s s, double error_um, double command_um) {
+    for (unsigned i = 0; i < c->order; i++) s->controller[i] = c->steady_state[i] * error_um;
+    double gap = command_um - controller_output(c, s, error_um);
+    for (unsigned i = 0; i < c->order; i++) s->controller[i] += c->tracking[i] * gap;
+}
+
+static inline double prefilter(law_c c, law_s s, double value) {
+    if (c->tap_count > 0) {
+        int64_t index = s->tap_index;
+        s->tap_history[index] = value;
+        value = 0;
+        for (int64_t i = 0; i < c->tap_count; i++) {
+            value += c->taps[i] * s->tap_history[index];
+            index = index == 0 ? c->tap_count - 1 : index - 1;
+        }
+        s->tap_index = s->tap_index + 1 == c->tap_count ? 0 : s->tap_index + 1;
+    }
+    for (int64_t i = 0; i < c->section_count; i++) {
+        const double *q = c->sections[i];
+        double *h = s->section_history[i], output = q[0] * value + h[0];
+        h[0] = q[1] * value - q[3] * output + h[1];
+        h[1] = q[2] * value - q[4] * output;
+        value = output;
+    }
+    return value;
+}
+
+static inline bool usable(double value) { return -1e9 < value && value < 1e9; }
+
+static inline double clip(double value, double low, double high) {
+    return value < low ? low : value > high ? high : value;
+}
+
+static inline double toward(double value, double target, double step) {
+    return clip(target, value - step, value + step);
+}
+
+static inline double bump(law_c c, law_s s, double gap) {
+    s->bump = s->entering ? gap : s->bump * c->bump_decay;
+    if (-1e-9 < s->bump && s->bump < 1e-9) s->bump = 0;
+    return s->bump;
+}
+
+static inline int64_t drive_of(law_c c, law_s s, loop_s loop, double reference) {
+    double last_v = s->drive_v;
+    if (s->usable) {
+        s->error_um = prefilter(c, s, reference) - s->position_um;
+    } else {
+        s->error_um = reference - s->position_um;
+        if (loop->new_trip) {
+            s->demand_v = last_v;
+            return RAMPING;
+        }
+    }
+    if (loop->mode == OFF) {
+        s->drive_v = toward(last_v, c->safe_v, c->trip_slew_v_per_tick);
+        s->demand_v = c->safe_v;
+        s->command_um = s->applied_command_um;
+        return s->drive_v == c->safe_v ? 0 : RAMPING;
+    }
+    int64_t flags = 0;
+    if (loop->mode == RAW) {
+        s->command_um = s->applied_command_um;
+        s->demand_v = reference + bump(c, s, last_v - reference);
+    } else {
+        if (loop->mode == FEEDFORWARD) {
+            s->command_um = reference + bump(c, s, s->applied_command_um - reference);
+        } else {
+            if (s->entering) controller_enter(c, s, s->error_um, s->applied_command_um);
+            s->command_um = controller_output(c, s, s->error_um);
+        }
+        double limited = clip(s->command_um, -c->command_limit_um, c->command_limit_um);
+        if (limited != s->command_um) flags |= COMMAND_LIMITED;
+        s->demand_v = inverse_drive(c, s, limited);
+    }
+    s->entering = 0;
+    double allowed = clip(s->demand_v, c->drive_min_v, c->drive_max_v);
+    if (allowed != s->demand_v) flags |= DRIVE_LIMITED;
+    s->drive_v = toward(last_v, allowed, c->slew_v_per_tick);
+    if (s->drive_v != allowed) flags |= SLEW_LIMITED;
+    return flags;
+}
+
+static inline void evaluate(
+    law_c c, law_s s, loop_s loop, int64_t axes, const double *restrict adc_v, const double *restrict references,
+    int32_t status, double age_us, bool lost
+) {
+    int64_t causes = (status < 0 ? TRIP_DRIVER : 0) | (lost ? TRIP_HEARTBEAT : 0);
+    for (int64_t a = 0; a < axes; a++) {
+        double position_um = (adc_v[a] - c[a].offset_v) * c[a].um_per_v;
+        s[a].position_um = position_um;
+        s[a].usable = usable(adc_v[a]) && usable(references[a]);
+        if (!s[a].usable) causes |= TRIP_NON_FINITE;
+        if (adc_v[a] < c[a].sensor_min_v || adc_v[a] > c[a].sensor_max_v) causes |= TRIP_SENSOR_RANGE;
+        if (position_um < -c[a].position_limit_um || position_um > c[a].position_limit_um) causes |= TRIP_POSITION;
+        if (!(age_us <= c[a].sample_age_limit_us)) causes |= TRIP_STALE;
+    }
+    loop->new_trip = causes & ~loop->trip;
+    loop->trip |= causes;
+    if (loop->trip) loop->mode = OFF;
+    loop->tick_flags = loop->trip | (lost ? HEARTBEAT_LOST : 0);
+    loop->settled = 1;
+    for (int64_t a = 0; a < axes; a++) {
+        loop->tick_flags |= drive_of(&c[a], &s[a], loop, references[a]);
+        if (s[a].drive_v != c[a].safe_v) loop->settled = 0;
+    }
+}
+
+static inline void update(law_c c, law_s s, loop_s loop, int64_t axes) {
+    for (int64_t a = 0; a < axes; a++) {
+        s[a].applied_command_um = follow_drive(&c[a], &s[a], s[a].drive_v);
+        if (loop->mode == CLOSED_LOOP)
+            controller_update(
+                &c[a], &s[a], s[a].error_um, c[a].tracking_share * (s[a].applied_command_um - s[a].command_um)
+            );
+    }
+}

@@ -1,0 +1,89 @@
+/* The simulated rig as hil computes it, operation by operation, for comparison. */
+#pragma once
+#include <math.h>
+#include <stdint.h>
+#include "layout.h"
+
+typedef const struct rig_coefficients *restrict rig_c;
+typedef struct rig_state *restrict rig_s;
+
+static inline double convert(double lsb_v, double lowest_v, double highest_v, double value_v) {
+    if (lsb_v > 0) value_v = rint(value_v / lsb_v) * lsb_v;
+    return value_v < lowest_v ? lowest_v : value_v > highest_v ? highest_v : value_v;
+}
+
+static inline double noise(uint64_t *word) {
+    uint64_t w = *word, lanes = 0;
+    for (int i = 0; i < 3; i++) {
+        w ^= w << 13;
+        w ^= w >> 7;
+        w ^= w << 17;
+        lanes += (w & 0x0000FFFF0000FFFFull) + ((w >> 16) & 0x0000FFFF0000FFFFull);
+    }
+    *word = w;
+    return ((double)((lanes & 0xFFFFFFFFull) + (lanes >> 32)) - 393210.0) / sqrt(4294967295.0);
+}
+
+static inline double rig_sample(rig_c c, rig_s s) {
+    double true_um = c->true_direct * s->input_um, sensed_um = c->sensed_direct * s->input_um;
+    for (int64_t i = 0; i < c->mode_count; i++) {
+        double real = s->modes[i][0], imag = s->modes[i][1];
+        true_um += c->true_weights[i][0] * real + c->true_weights[i][1] * imag;
+        sensed_um += c->sensed_weights[i][0] * real + c->sensed_weights[i][1] * imag;
+    }
+    s->true_position_um = true_um;
+    double reading_um = sensed_um + c->sensor_offset_um;
+    if (c->sensor_noise_um > 0) reading_um += c->sensor_noise_um * noise(&s->noise_word);
+    if (c->sensor_resolution_um > 0)
+        reading_um = rint(reading_um / c->sensor_resolution_um) * c->sensor_resolution_um;
+    return convert(c->adc_lsb_v, c->adc_lowest_v, c->adc_highest_v, reading_um / c->sensor_um_per_v);
+}
+
+static inline double rig_drive(rig_c c, rig_s s, double value_v) {
+    if (!isnan(value_v)) s->dac_v = convert(c->dac_lsb_v, c->dac_lowest_v, c->dac_highest_v, value_v);
+    if (c->latency_ticks == 0) return s->dac_v;
+    int64_t head = s->queue_head;
+    double arrived_v = s->queue_v[head];
+    s->queue_v[head] = s->dac_v;
+    s->queue_head = head + 1 < c->latency_ticks ? head + 1 : 0;
+    return arrived_v;
+}
+
+static inline double rig_play(double drive_v, double threshold_v, double held_v) {
+    if (drive_v - threshold_v > held_v) return drive_v - threshold_v;
+    return drive_v + threshold_v < held_v ? drive_v + threshold_v : held_v;
+}
+
+static inline double rig_disturbance(rig_c c, rig_s s) {
+    if (s->disturbance_wait > 0) {
+        s->disturbance_wait--;
+        return s->disturbance_um;
+    }
+    double sine_um = s->sine_um, cosine_um = s->cosine_um;
+    s->sine_um = c->disturbance_cos * sine_um + c->disturbance_sin * cosine_um;
+    s->cosine_um = c->disturbance_cos * cosine_um - c->disturbance_sin * sine_um;
+    return s->disturbance_um + c->disturbance_step_um + sine_um;
+}
+
+static inline void rig_advance(rig_c c, rig_s s, double dac_v) {
+    double actuator_v = rig_drive(c, s, dac_v), displacement_um = 0;
+    for (int64_t i = 0; i < c->play_count; i++) {
+        double play_v = rig_play(actuator_v, c->thresholds_v[i], s->plays_v[i]);
+        s->plays_v[i] = play_v;
+        displacement_um += c->weights_um_per_v[i] * play_v;
+    }
+    double crept_um = displacement_um;
+    for (int64_t i = 0; i < c->lag_count; i++) {
+        double lag_um = s->lags_um[i];
+        crept_um += c->lag_gains[i] * lag_um;
+        s->lags_um[i] = lag_um + c->lag_shares[i] * (displacement_um - lag_um);
+    }
+    s->hysteresis_um = crept_um;
+    double input_um = crept_um + rig_disturbance(c, s);
+    s->input_um = input_um;
+    for (int64_t i = 0; i < c->mode_count; i++) {
+        double real = s->modes[i][0], imag = s->modes[i][1];
+        s->modes[i][0] = c->mode_real[i] * real - c->mode_imag[i] * imag + input_um;
+        s->modes[i][1] = c->mode_imag[i] * real + c->mode_real[i] * imag;
+    }
+}

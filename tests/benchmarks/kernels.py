@@ -1,0 +1,141 @@
+"""The law of a tick, and the whole unpaced loop with the rig, against the same in C, equal in bits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hil.compiled import jit
+from rtloop.law.law import evaluate, reset_trip, set_mode, update
+from rtloop.law.layout import Records, initial_state
+from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
+from tests.benchmarks import native
+from tests.benchmarks.measure import alternately
+from tests.benchmarks.scenario import NativeLoop, PythonLoop, paper_plan, tripping_plan
+
+CHECKED_TICKS = 200_000
+CHUNK = 50_000
+TIMED_TICKS = 400_000
+WANTED = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.RAMPING | Flag.TRIP_POSITION
+
+
+class Differs(AssertionError):
+    """Python and C do not do the same work: there is no ratio to print."""
+
+
+@jit
+def run_law(coefficients, axes, loop, adc_v, references, modes, out):
+    """The law over arrays of inputs, as `run_law` of loop.c."""
+    adc, reference = np.empty(1), np.empty(1)
+    for k in range(adc_v.size):
+        if modes[k] >= 0:
+            reset_trip(loop)
+            set_mode(axes, loop, modes[k], False)
+        adc[0], reference[0] = adc_v[k], references[k]
+        evaluate(coefficients, axes, loop, adc, reference, 0, 0.0, False)
+        update(coefficients, axes, loop)
+        state = axes[0]
+        out[k, 0], out[k, 1] = state.command_um, state.demand_v
+        out[k, 2], out[k, 3] = state.drive_v, float(loop.tick_flags)
+
+
+def law_inputs(ticks: int) -> tuple[Records, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Coefficients, and the readings and references of a closed loop that ran before."""
+    plan = paper_plan()
+    loop = PythonLoop(plan)
+    adc_v, references = np.empty(ticks), np.empty(ticks)
+    for begin in range(0, ticks, CHUNK):
+        loop.run(begin + CHUNK)
+        rows = loop.rows[np.arange(begin, begin + CHUNK) % loop.rows.shape[0]]
+        adc_v[begin : begin + CHUNK] = rows[:, axis_column(0, ADC)]
+        references[begin : begin + CHUNK] = rows[:, axis_column(0, REFERENCE)]
+    return loop.law.coefficients, adc_v, references
+
+
+def check_law(coefficients: Records, adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> None:
+    """Equal bits in all modes, through limits, trips and unusable inputs. Raises Differs."""
+    random = np.random.default_rng(1)
+    adc_v, references = adc_v.copy(), references * np.where(np.arange(adc_v.size) % 30_000 < 5_000, 3.0, 1.0)
+    modes = np.full(adc_v.size, -1)
+    modes[::700] = random.choice([int(mode) for mode in Mode], modes[::700].size, p=[0.1, 0.2, 0.2, 0.5])
+    adc_v[9_999::10_000] = random.choice([np.nan, np.inf, 9.995, -6.5], adc_v[9_999::10_000].size)
+    outs = [np.empty((adc_v.size, 4)) for _ in range(2)]
+    axes, loop = initial_state(coefficients)
+    run_law(coefficients, axes, loop[0], adc_v, references, modes, outs[0])
+    native_axes, native_loop = initial_state(coefficients)
+    native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, outs[1])
+    _require_equal("law", outs[0], outs[1])
+    _require_equal("law's state", axes["controller"], native_axes["controller"])
+    flags = np.bitwise_or.reduce(outs[0][:, 3].astype(np.int64))
+    wanted = WANTED | Flag.TRIP_NON_FINITE | Flag.TRIP_SENSOR_RANGE
+    if flags & wanted != wanted:
+        raise Differs(f"the law's check saw only {Flag(int(flags))!r}")
+
+
+def law() -> dict[str, Any]:
+    """ns a tick of the law, closed loop, beside C."""
+    coefficients, adc_v, references = law_inputs(CHECKED_TICKS)
+    check_law(coefficients, adc_v, references)
+    modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
+    states = [initial_state(coefficients) for _ in range(2)]
+    for _, loop in states:
+        loop["mode"] = int(Mode.CLOSED_LOOP)
+    (axes, loop), (native_axes, native_loop) = states
+    pair = alternately(
+        lambda: run_law(coefficients, axes, loop[0], adc_v, references, modes, out),
+        lambda: native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, out),
+    )
+    if loop["mode"][0] != Mode.CLOSED_LOOP or axes["controller"].tobytes() != native_axes["controller"].tobytes():
+        raise Differs("the law left closed loop, or its states differ")
+    return _compared(pair, adc_v.size)
+
+
+def check_loop() -> None:
+    """Equal rows through steps, saturation and a trip. Raises Differs."""
+    plan = tripping_plan(CHECKED_TICKS - 10_000)
+    python, baseline, flags = PythonLoop(plan), NativeLoop(plan), 0
+    for begin in range(0, CHECKED_TICKS, CHUNK):
+        python.run(begin + CHUNK)
+        baseline.run(begin + CHUNK)
+        slots = np.arange(begin, begin + CHUNK) % python.rows.shape[0]
+        _require_equal(f"loop, from tick {begin}", python.rows[slots], baseline.rows[slots])
+        flags |= int(np.bitwise_or.reduce(python.rows[slots, 8].astype(np.int64)))
+    if flags & WANTED != WANTED:
+        raise Differs(f"the loop's check saw only {Flag(flags)!r}")
+
+
+def loop() -> dict[str, Any]:
+    """ns a tick of the whole unpaced loop with the rig, without recording, beside C."""
+    check_loop()
+    plan = paper_plan()
+    loops = PythonLoop(plan), NativeLoop(plan)
+    ticks = [0, 0]
+
+    def further(number: int) -> None:
+        ticks[number] += TIMED_TICKS
+        loops[number].run(ticks[number])
+
+    pair = alternately(lambda: further(0), lambda: further(1))
+    _require_equal("loop, at the end", loops[0].rows, loops[1].rows)
+    period_ns = 1e9 / plan.pacing.rate_hz
+    result = _compared(pair, TIMED_TICKS)
+    return result | {"times_real_time": period_ns / result["ns_per_tick"]["median"]}
+
+
+def _compared(pair: Any, ticks: int) -> dict[str, Any]:
+    scale = 1e9 / ticks
+    return {
+        "ns_per_tick": pair.first.scaled(scale)._asdict(),
+        "c_ns_per_tick": pair.second.scaled(scale)._asdict(),
+        "ratio": pair.ratio._asdict(),
+        "ratio_of_minima": pair.first.minimum / pair.second.minimum,
+    }
+
+
+def _require_equal(what: str, ours: np.ndarray[Any, Any], theirs: np.ndarray[Any, Any]) -> None:
+    """Equal in bits, all NaN being one."""
+    ours, theirs = (np.where(np.isnan(values), np.nan, values).view(np.uint64) for values in (ours, theirs))
+    if not np.array_equal(ours, theirs):
+        first = np.argwhere(ours != theirs)[0]
+        raise Differs(f"{what}: Python and C differ first at {first.tolist()}")

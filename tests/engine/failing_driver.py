@@ -1,0 +1,40 @@
+"""A driver in plain Python that does as the test says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drivers.base import Channel, Facts, Wiring
+from drivers.python import PythonDriver
+
+
+class ScriptedDriver(PythonDriver):
+    """Inputs from `volts(k)` at read number k; what is written is kept. The functions may raise."""
+
+    kind = "scripted"
+
+    def __init__(self, volts: Callable[[int], float], refuse: Callable[[int], None] = lambda k: None) -> None:
+        super().__init__(self.options_model(), {"x": Wiring("adc0", "dac0")}, 10_000)
+        self.volts, self.refuse, self.reads = volts, refuse, 0
+        self.written: list[float] = []
+
+    @property
+    def facts(self) -> Facts:
+        return Facts((Channel("adc0"),), (Channel("dac0"),), ("x_true_position_um", "x_hysteresis_um"), real=False)
+
+    def start(self) -> None:
+        """Nothing to take."""
+
+    def stop(self) -> None:
+        """Nothing to let go."""
+
+    def read(self) -> Sequence[float]:
+        self.reads += 1
+        return (self.volts(self.reads - 1),)
+
+    def observe(self) -> Sequence[float]:
+        return 1.5, 2.5
+
+    def write(self, volts: Sequence[float]) -> None:
+        self.refuse(len(self.written))
+        self.written.append(volts[0])

@@ -1,0 +1,171 @@
+"""A whole loop in the test's own process: from a configuration's text to records, in virtual or scripted time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import carray
+
+from drivers.base import Driver
+from hil.compiled import cfunc
+from hil.pointers import SIGNATURE, address_pointer
+from rtloop.config import parse
+from rtloop.engine.assembly import Assembly, law_at_rest
+from rtloop.engine.clock import Clock, clock_context, unpaced_clock
+from rtloop.engine.commands import send
+from rtloop.engine.loop import Outcome
+from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.messages import Kind, Origin, message
+from rtloop.engine.plan import Plan
+from rtloop.engine.ring import drain
+from rtloop.prepare import prepare
+
+FOR_EVER = 1 << 40
+
+HEAD = """
+[loop]
+rate_hz = {rate_hz}
+mode = "{mode}"
+[driver]
+kind = "sim"
+seed = {seed}
+latency_ticks = {latency}
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+"""
+IDEAL = """
+[driver.plant.hysteresis]
+truth = "nominal"
+[driver.plant.sensor]
+noise_um = 0.0
+resolution_um = 0.0
+[driver.plant.adc]
+bits = 0
+[driver.plant.dac]
+bits = 0
+"""
+AXIS = """
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
+weights_um_per_v = [
+    2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09,
+]
+"""
+EXACT = """
+dead_band = "exact"
+dead_band_threshold_v = 1e-12
+"""
+CONTROLLER = """
+[axis.controller]
+form = "factors"
+gain = 0.016
+numerator = [[1.0, 7.9e6], [1.0, 971.0, 4.6e5], [1.0, 43.0, 1.4e7]]
+denominator = [[1.0, 8.8e4], [1.0, 974.0], [1.0, 1.0], [1.0, 1153.0, 1.6e7]]
+"""
+MATCHED = 'method = "matched"\n'
+TUSTIN = 'method = "tustin"\nprewarp_hz = 595.5\n'
+
+
+def text(*parts: str, mode: str = "closed_loop", rate_hz: float = 10_000, seed: int = 1, latency: int = 0) -> str:
+    """A configuration: head, then what comes before [[axis]] and after it, in order."""
+    return HEAD.format(mode=mode, rate_hz=rate_hz, seed=seed, latency=latency) + "".join(parts)
+
+
+def plan_of(configuration: str) -> Plan:
+    """The plan of an unpaced run without end."""
+    return prepare(parse(configuration, "test", Path(), "test"), paced=False).plan
+
+
+class LoopBench:
+    """A loop whose records, events and snapshots the test reads itself; virtual time unless `clock` says otherwise."""
+
+    def __init__(self, plan: str | Plan, driver: Driver | None = None, clock: ScriptedClock | None = None) -> None:
+        self.plan = plan_of(plan) if isinstance(plan, str) else plan
+        self.driver = driver or self.plan.driver()
+        self.block = SharedBlock.create(self.plan.sizes)
+        self._context = clock_context(self.plan.pacing.rate_hz)
+        ticks = self.block.ring("ticks")
+        self._chunk = ticks.marks.size // 2
+        own = unpaced_clock(self._context, ticks.head, self.block.words, Word.RECORDER_CURSOR, self._chunk)
+        self.law = law_at_rest(self.plan)
+        self._script = clock
+        facts = self.driver.facts
+        self.assembly = Assembly(self.plan, self.block, facts, self.driver.open(), clock.clock if clock else own, self.law)
+        self.outcome = Outcome.DONE
+        self._cursors = {"ticks": 0, "events": 0, "snapshots": 0}
+
+    def run(self, ticks: int) -> npt.NDArray[np.float64]:
+        """Records (n, columns) of at most `ticks` more ticks; `outcome` says why there are fewer."""
+        end, rows = int(self.assembly.loop.tick) + ticks, []
+        self.outcome = Outcome.DONE
+        while self.assembly.loop.tick < end and self.outcome is Outcome.DONE:
+            self.outcome = self.assembly.run(min(end, int(self.assembly.loop.tick) + self._chunk))
+            rows.append(self.drain("ticks"))
+            self.block.words[Word.RECORDER_CURSOR] = self._cursors["ticks"]
+        return np.concatenate(rows)
+
+    def drain(self, name: str) -> npt.NDArray[Any]:
+        """What ring `name` has published since the last call; nothing may be lost."""
+        ring = self.block.ring(name)
+        out = np.empty((ring.marks.size, *ring.slots.shape[1:]), ring.slots.dtype)
+        copied, _, lost = drain(ring, np.uint64(self._cursors[name]), out)
+        assert lost == 0
+        self._cursors[name] += int(copied)
+        return out[: int(copied)]
+
+    def events(self) -> list[tuple[int, Kind, float, float]]:
+        """(tick, kind, first value, second value) of each new event."""
+        return [(int(e["tick"]), Kind(int(e["kind"])), *e["values"][:2].tolist()) for e in self.drain("events")]
+
+    def send(self, kind: Kind, *values: float, axis: int = -1, origin: Origin = Origin.OPERATOR) -> None:
+        """Put a command into the queue."""
+        send(self.block, message(kind, axis=axis, origin=origin, values=values))
+
+    def column(self, rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
+        """One signal of the records."""
+        return rows[:, self.plan.columns.index(name)]
+
+
+SCRIPT = np.dtype([("rows", np.int64), ("row", np.int64), ("address", np.int64), ("now_ns", np.float64)])
+
+
+@cfunc(SIGNATURE)
+def scripted_wait(context, timing):
+    """The next row of the script: deadline, wake, periods missed, CLOCK_MONOTONIC."""
+    script = carray(context, 1, SCRIPT)[0]
+    if script.row >= script.rows:
+        return -1
+    data = carray(address_pointer(script.address), (script.rows, 4), np.float64)
+    out = carray(timing, 4)
+    for i in range(4):
+        out[i] = data[script.row, i]
+    script.now_ns = out[1]
+    script.row += 1
+    return 0
+
+
+@cfunc(SIGNATURE)
+def scripted_now(context, timing):
+    """10 µs pass between one look at the clock and the next."""
+    script = carray(context, 1, SCRIPT)[0]
+    script.now_ns += 10_000.0
+    carray(timing, 4)[0] = script.now_ns
+    return 0
+
+
+class ScriptedClock:
+    """Time as the test tells it: rows of deadline_ns, wake_ns, missed, monotonic_ns."""
+
+    def __init__(self, rows: Sequence[Sequence[float]] | npt.NDArray[np.float64]) -> None:
+        self._rows = np.ascontiguousarray(rows, dtype=float)
+        self._context = np.zeros(1, SCRIPT)
+        self._context["rows"], self._context["address"] = len(self._rows), self._rows.ctypes.data
+        self.clock = Clock(scripted_wait.address, scripted_now.address, self._context.ctypes.data)

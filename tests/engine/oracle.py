@@ -1,0 +1,106 @@
+"""The linear closed loop written out from the paper's factors: no line of it is shared with what it judges.
+
+    C(s): eq (20)      D(s): eq (5)      e_k = r_k − x_k      v_k = C(z) e      x: D(s) on v held, `latency` ticks later
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mpmath as mp
+import numpy as np
+import numpy.typing as npt
+
+Real = npt.NDArray[np.float64]
+PERIOD_S = mp.mpf(1) / 10_000
+
+C_GAIN = mp.mpf("0.016")
+C_ABOVE = (("1", "7.9e6"), ("1", "971", "4.6e5"), ("1", "43", "1.4e7"))
+C_BELOW = (("1", "8.8e4"), ("1", "974"), ("1", "1"), ("1", "1153", "1.6e7"))
+D_GAIN = mp.mpf("-20.7")
+D_ABOVE = (
+    *(("1", "-1.22e5"), ("1", "2.99e4"), ("1", "-2.776e4"), ("1", "-1.07e4"), ("1", "1430")),
+    ("1", "4.3e4", "3.2e9"),
+)
+D_BELOW = (("1", "925", "4.59e5"), ("1", "55", "1.4e7"), ("1", "1.54e4", "4.0e9"), ("1", "964", "3.95e9"))
+
+
+def roots(factors: tuple[tuple[str, ...], ...]) -> list[mp.mpc]:
+    """All roots, by the quadratic formula at 60 digits."""
+    found: list[mp.mpc] = []
+    for factor in factors:
+        numbers = [mp.mpf(number) for number in factor[1:]]
+        if len(numbers) == 1:
+            found.append(mp.mpc(-numbers[0]))
+        else:
+            half = mp.sqrt(mp.mpc(numbers[0] ** 2 - 4 * numbers[1]))
+            found += [(-numbers[0] + half) / 2, (-numbers[0] - half) / 2]
+    return found
+
+
+class Modes(NamedTuple):
+    """x⁺ = poles·x + inputs·u, y = Re Σ x + direct·u: complex modes, conjugates both kept."""
+
+    poles: npt.NDArray[np.complex128]
+    inputs: npt.NDArray[np.complex128]
+    direct: float
+
+
+def partial_fractions(zeros: list, poles: list, gain) -> tuple[list, mp.mpc]:
+    """Residues at simple poles, and the value at infinity."""
+    residues = [
+        gain * mp.fprod(p - z for z in zeros) / mp.fprod(p - q for j, q in enumerate(poles) if j != i)
+        for i, p in enumerate(poles)
+    ]
+    return residues, gain if len(zeros) == len(poles) else mp.mpf(0)
+
+
+def as_modes(poles: list, inputs: list, direct) -> Modes:
+    return Modes(np.array([complex(p) for p in poles]), np.array([complex(b) for b in inputs]), float(mp.re(direct)))
+
+
+def controller(method: str) -> Modes:
+    """C(z): "tustin" with s = ω₀/tan(ω₀T/2) · (z − 1)/(z + 1), ω₀ = 2π·595.5; "matched" with z = exp(sT), gain at DC."""
+    with mp.workdps(60):
+        zeros, poles = roots(C_ABOVE), roots(C_BELOW)
+        if method == "matched":
+            z_zeros, z_poles = [mp.exp(r * PERIOD_S) for r in zeros], [mp.exp(r * PERIOD_S) for r in poles]
+            at_dc = C_GAIN * mp.fprod(-z for z in zeros) / mp.fprod(-p for p in poles)
+            gain = at_dc * mp.fprod(1 - p for p in z_poles) / mp.fprod(1 - z for z in z_zeros)
+        else:
+            omega = 2 * mp.pi * mp.mpf("595.5")
+            w = omega / mp.tan(omega * PERIOD_S / 2)
+            z_zeros, z_poles = [(w + r) / (w - r) for r in zeros], [(w + r) / (w - r) for r in poles]
+            gain = C_GAIN * mp.fprod(w - z for z in zeros) / mp.fprod(w - p for p in poles)
+        residues, direct = partial_fractions(z_zeros, z_poles, gain)
+        return as_modes(z_poles, residues, direct)
+
+
+def plant() -> Modes:
+    """D(s) = Σ r/(s − p), its input held over each period: z = exp(pT), input r (exp(pT) − 1)/p."""
+    with mp.workdps(60):
+        poles = roots(D_BELOW)
+        residues, direct = partial_fractions(roots(D_ABOVE), poles, D_GAIN)
+        grown = [mp.exp(p * PERIOD_S) for p in poles]
+        return as_modes(grown, [r * (g - 1) / p for r, g, p in zip(residues, grown, poles, strict=True)], direct)
+
+
+class Response(NamedTuple):
+    position_um: Real
+    command_um: Real
+
+
+def closed_loop(reference: Real, method: str, latency: int = 0, limit_um: float = np.inf) -> Response:
+    """From rest. With `limit_um` the plant gets v limited and the controller does not know: no anti-windup."""
+    c, d = controller(method), plant()
+    x_c, x_d = np.zeros(c.poles.size, complex), np.zeros(d.poles.size, complex)
+    waiting = [0.0] * latency
+    position, command = np.empty(reference.size), np.empty(reference.size)
+    for k, wanted in enumerate(reference):
+        position[k] = x_d.sum().real
+        error = wanted - position[k]
+        command[k] = x_c.sum().real + c.direct * error
+        x_c = c.poles * x_c + c.inputs * error
+        waiting.append(min(max(command[k], -limit_um), limit_um))
+        x_d = d.poles * x_d + d.inputs * waiting.pop(0)
+    return Response(position, command)

@@ -1,0 +1,47 @@
+"""A change of mode under a sine, on the rig: no larger step of the demand than the sine itself makes."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from tests.engine.harness import AXIS, CONTROLLER, IDEAL, MATCHED, TUSTIN, LoopBench, text
+
+SWITCH, TICKS = 5137, 8000
+SINES = {"raw": (2.5, 1.0), "feedforward": (12.0, 3.0), "closed_loop": (12.0, 3.0)}
+PAPER_RIG = ""
+
+
+def reference(mode: str) -> str:
+    """A 5 Hz sine, in V for raw and in µm otherwise; not at rest when the mode changes."""
+    amplitude, offset = SINES[mode]
+    return f'{{ kind = "sine", amplitude = {amplitude}, offset = {offset}, frequency_hz = 5.0, phase_deg = 90.0 }}'
+
+
+def run(before: str, after: str | None, rig: str, lines: str) -> np.ndarray:
+    """Demand in V of each tick."""
+    schedule = f'[[schedule]]\nat_tick = {SWITCH}\nmode = "{after}"\n' if after else ""
+    if after:
+        schedule += f"[[schedule]]\nat_tick = {SWITCH}\nreference = {reference(after)}\n"
+    axis = AXIS.replace('name = "x"', f'name = "x"\nreference = {reference(before)}')
+    bench = LoopBench(text(rig, axis, CONTROLLER, lines, schedule, mode=before))
+    rows = bench.run(TICKS)
+    names = ["off", "raw", "feedforward", "closed_loop"]
+    assert bench.column(rows, "mode")[-1] == names.index(after or before)
+    assert not np.any(bench.column(rows, "flags"))
+    return bench.column(rows, "x_demand_v")
+
+
+@pytest.mark.parametrize("rig", [IDEAL, PAPER_RIG], ids=["ideal sensor", "paper's rig"])
+@pytest.mark.parametrize("lines", [MATCHED, TUSTIN], ids=["matched", "tustin"])
+@pytest.mark.parametrize(("before", "after"), [*permutations(SINES, 2)])
+def test_changes_are_bumpless(before, after, lines, rig, record_property):
+    switched = run(before, after, rig, lines)
+    unswitched = run(before, None, rig, lines)
+    assert np.array_equal(switched[:SWITCH], unswitched[:SWITCH])
+    bump = abs(switched[SWITCH] - switched[SWITCH - 1])
+    usual = np.abs(np.diff(unswitched[SWITCH - 2000 :])).max()  # a period of the sine, long after the start
+    record_property("bump_ratio", bump / usual)
+    assert bump <= 1.1 * usual

@@ -1,0 +1,100 @@
+"""Clocks: an exact grid; what is missed is counted and never made up for."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+
+import numpy as np
+import pytest
+
+from rtloop.engine.clock import Clock, clock_context, paced_clock, unpaced_clock
+from rtloop.engine.messages import Kind
+from rtloop.signals import Flag
+from tests.engine.harness import AXIS, IDEAL, LoopBench, ScriptedClock, text
+
+FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
+PERIOD_NS = 1_000_000_000_000
+RAW = text(IDEAL, AXIS, mode="raw")
+
+
+def wait(clock: Clock) -> tuple[float, float, float, float]:
+    """Deadline, wake, periods missed, monotonic time, all in ns."""
+    timing = (ctypes.c_double * 4)()
+    assert FUNCTION(clock.wait)(clock.context, timing) == 0
+    return tuple(timing)
+
+
+@pytest.mark.parametrize("rate_hz", [10_000.0, 3_000.0, 44_100.0, 7.0])
+def test_virtual_time_is_the_exact_grid(rate_hz):
+    """Deadline k is k/rate in whole ns, without an error that adds up; nothing is measured."""
+    context = clock_context(rate_hz)
+    head, words = np.zeros(1, np.uint64), np.zeros(64, np.uint64)
+    clock = unpaced_clock(context, head, words, 3, 10)
+    k = np.arange(5000)
+    timings = np.array([wait(clock) for _ in k])
+    assert np.array_equal(timings[:, 0], np.floor(k * (1e9 / rate_hz)))
+    assert np.all(np.isnan(timings[:, [1, 3]]))
+    assert not np.any(timings[:, 2])
+
+
+def test_a_tick_on_time():
+    context = clock_context(1e9 / PERIOD_NS)
+    clock = paced_clock(context, 50.0)
+    context.start_ns = time.monotonic_ns() + 2_000_000
+    deadline, wake, missed, monotonic = wait(clock)
+    assert (deadline, missed) == (0, 0)
+    assert wake >= 0
+    assert monotonic - wake == float(context.start_ns[0])
+    assert context["index"][0] == 1
+
+
+def test_missed_periods_are_counted_and_skipped():
+    """The clock's start is set into the past instead of waiting: the same arithmetic, periods of 1000 s."""
+    context = clock_context(1e9 / PERIOD_NS)
+    clock = paced_clock(context, 0.0)
+    late = [0.5, 10.5, 13.25, 14.25, 14.75 + 1e3]  # in periods, at each wait
+    grid, missed_in_all = [], 0
+    for periods in late:
+        context.start_ns = time.monotonic_ns() - round(periods * PERIOD_NS)
+        if periods == 14.25:  # tick 14 was due 0.25 periods ago: late, yet no whole period has passed
+            assert context["index"][0] == 14
+        deadline, wake, missed, _ = wait(clock)
+        grid.append(deadline / PERIOD_NS)
+        missed_in_all += int(missed)
+        assert wake >= deadline
+        assert wake - deadline < PERIOD_NS
+        assert context["index"][0] == len(grid) + missed_in_all
+    assert grid == [0, 10, 13, 14, 1014]
+
+
+def test_a_late_tick_runs_once():
+    """In the loop: missed periods stand in the record of the next tick, each tick has one index, one event begins it."""
+    us = 1000.0
+    script = np.array([[0, 20, 0], [100, 120, 0], [700, 790, 5], [800, 820, 0], [1500, 1510, 6]]) * [us, us, 1]
+    bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([script, np.zeros(5)])))
+    rows = bench.run(5)
+    assert bench.column(rows, "tick").tolist() == [0, 1, 2, 3, 4]
+    assert bench.column(rows, "periods_missed").tolist() == [0, 0, 5, 0, 6]
+    np.testing.assert_allclose(bench.column(rows, "lateness_us"), [20, 20, 90, 20, 10])
+    assert bench.events() == [(2, Kind.PERIODS_MISSED, 5.0, 0.0)]  # the second belongs to the same episode
+
+
+def test_measured_times_and_overruns():
+    """10 µs between two looks at the clock: read, law, write, then the record; late and long together overrun."""
+    us = 1000.0
+    script = np.array([[0, 20], [100, 159], [200, 261]]) * us
+    bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([script, np.zeros((3, 2))])))
+    rows = bench.run(3)
+    for name, wanted in (("read_us", 10), ("law_us", 10), ("write_us", 10), ("exec_us", 40)):
+        np.testing.assert_allclose(bench.column(rows, name), wanted)
+    assert bench.column(rows, "flags").tolist() == [0, 0, Flag.OVERRUN]
+
+
+def test_virtual_time_waits_for_the_recorder():
+    """Nothing in the ring is overwritten before it was read: the writer stops where the reader's slack ends."""
+    bench = LoopBench(RAW)
+    rows = bench.run(150_000)  # more than twice what the ring holds; `run` reads in between, and loses nothing
+    assert np.array_equal(bench.column(rows, "tick"), np.arange(150_000))
+    assert np.array_equal(bench.column(rows, "deadline_ns"), np.arange(150_000) * 100_000.0)
+    assert np.all(np.isnan(rows[:, 2:7]))

@@ -1,0 +1,133 @@
+"""Trips, failing drivers, a silent supervisor: each ends in a ramp to the safe value, and is told."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.playback import Playback
+from rtloop.engine.loop import Outcome
+from rtloop.engine.memory import Word
+from rtloop.engine.messages import Kind
+from rtloop.signals import Flag, Mode
+from tests.engine.failing_driver import ScriptedDriver
+from tests.engine.harness import AXIS, FOR_EVER, IDEAL, LoopBench, ScriptedClock, text
+
+RAW = text(IDEAL, AXIS, '[axis.reference]\nkind = "hold"\nvalue = 3.0\n', mode="raw")
+RAMP = 3.0 - 0.1 * np.arange(1, 31)
+"""The trip's 1000 V/s at 10 kHz, from 3 V."""
+
+
+def fail_at(tick: int):
+    def volts(k: int) -> float:
+        if k == tick:
+            raise OSError("the cable is out")
+        return 0.1
+
+    return volts
+
+
+def test_stop_word_parks():
+    bench = LoopBench(RAW)
+    bench.run(100)
+    bench.block.words[Word.STOP] = 1
+    rows = bench.run(FOR_EVER)
+    assert bench.outcome is Outcome.STOPPED
+    np.testing.assert_allclose(bench.column(rows, "x_drive_v"), RAMP, rtol=0, atol=1e-12)
+    assert bench.column(rows, "x_drive_v")[-1] == 0.0
+    assert np.all(bench.column(rows, "mode") == Mode.OFF)
+    assert bench.block["last_drive_v"][0] == 0.0
+
+
+def test_the_last_drive_lies_in_shared_memory():
+    bench = LoopBench(RAW)
+    bench.run(10)
+    assert bench.block["last_drive_v"].tolist() == [3.0]
+
+
+def test_ticks_after_the_limit_are_run_but_not_recorded():
+    plan = LoopBench(RAW).plan
+    bench = LoopBench(replace(plan, ticks=50))
+    assert bench.run(50).shape[0] == 50
+    bench.block.words[Word.STOP] = 1
+    assert bench.run(FOR_EVER).shape[0] == 0
+    assert bench.outcome is Outcome.STOPPED
+    assert bench.block["last_drive_v"][0] == 0.0
+
+
+def test_a_read_that_fails_is_ramped_down_and_ends_the_run():
+    driver = ScriptedDriver(fail_at(40))
+    bench = LoopBench(RAW, driver)
+    rows = bench.run(FOR_EVER)
+    assert bench.outcome is Outcome.DRIVER_FAILED
+    assert bench.column(rows, "driver_status")[40] == -1
+    assert bench.events() == [
+        (40, Kind.TRIPPED, Flag.TRIP_DRIVER, 0.0),
+        (40, Kind.DRIVER_FAILED, -1.0, 0.0),
+    ]
+    drive = bench.column(rows, "x_drive_v")
+    assert np.all(drive[:40] == 3.0)
+    np.testing.assert_allclose(drive[40:], RAMP, rtol=0, atol=1e-12)
+    assert driver.written == drive.tolist()
+    assert str(driver.error) == "the cable is out"
+
+
+def test_a_write_that_fails_ends_the_run_at_once():
+    def refuse(k: int) -> None:
+        if k == 25:
+            raise OSError("no such device")
+
+    driver = ScriptedDriver(lambda k: 0.0, refuse)
+    bench = LoopBench(RAW, driver)
+    rows = bench.run(FOR_EVER)
+    assert bench.outcome is Outcome.DRIVER_FAILED
+    assert rows.shape[0] == 26  # the tick that failed is recorded
+    assert bench.events() == [(25, Kind.DRIVER_FAILED, -1.0, 1.0)]
+    assert str(driver.error) == "no such device"
+
+
+def test_a_nan_from_the_driver_holds_then_ramps():
+    bench = LoopBench(RAW, ScriptedDriver(lambda k: math.nan if k == 10 else 0.1))
+    rows = bench.run(100)
+    drive = bench.column(rows, "x_drive_v")
+    assert drive[10] == 3.0
+    np.testing.assert_allclose(drive[11:41], RAMP, rtol=0, atol=1e-12)
+    assert np.all(drive[41:] == 0.0)
+    assert bench.events() == [(10, Kind.TRIPPED, Flag.TRIP_NON_FINITE, 0.0)]
+
+
+def test_a_wait_that_fails_ends_the_run():
+    bench = LoopBench(RAW, clock=ScriptedClock(np.zeros((7, 4))))
+    assert bench.run(FOR_EVER).shape[0] == 7
+    assert bench.outcome is Outcome.DRIVER_FAILED
+
+
+def test_a_lost_heartbeat_parks():
+    """The supervisor was last heard at 5 s; the time allowed, 1 s, is over after 6 s."""
+    ticks = np.arange(200)
+    monotonic_ns = 6e9 + (ticks - 100) * 1e5
+    grid = ticks * 1e5
+    bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([grid, grid, 0 * grid, monotonic_ns])))
+    bench.block.words[Word.HEARTBEAT_NS] = 5_000_000_000
+    rows = bench.run(FOR_EVER)
+    assert bench.outcome is Outcome.HEARTBEAT_LOST
+    flags = bench.column(rows, "flags").astype(int)
+    assert np.all(flags[:101] == 0)
+    assert np.all(flags[101:] & (Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST) == Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST)
+    np.testing.assert_allclose(bench.column(rows, "x_drive_v")[101:], RAMP, rtol=0, atol=1e-12)
+    assert bench.events() == [(101, Kind.TRIPPED, Flag.TRIP_HEARTBEAT, 0.0)]
+
+
+@pytest.mark.parametrize(("status", "tripped"), [(2, False), (-7, True)])
+def test_a_status_above_zero_is_recorded_and_no_trip(status, tripped):
+    tape = Playback()
+    tape.load(np.column_stack([np.zeros((50, 4)), np.full(50, status), np.zeros((50, 4))]))
+    driver = ScriptedDriver(lambda k: 0.0)
+    driver.open = tape.pointers  # type: ignore[method-assign]
+    bench = LoopBench(RAW, driver)
+    rows = bench.run(20)
+    assert np.all(bench.column(rows, "driver_status") == status)
+    assert bool(int(bench.column(rows, "flags")[0]) & Flag.TRIP_DRIVER) is tripped

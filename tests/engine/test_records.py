@@ -1,0 +1,70 @@
+"""What the loop leaves behind: records equal in bytes, snapshots from which the law goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.law.layout import split_snapshot
+from tests.engine.harness import AXIS, CONTROLLER, MATCHED, LoopBench, text
+from tests.law.harness import LawBench
+
+SINE = '[axis.reference]\nkind = "sine"\namplitude = 20.0\nfrequency_hz = 17.0\n'
+PREFILTER = "[axis.prefilter]\ntaps = [0.5, 0.3, 0.2]\n"
+TICKS = 25_000
+
+
+def bench(seed: int = 1) -> LoopBench:
+    """The paper's noisy rig."""
+    return LoopBench(text(AXIS, CONTROLLER, MATCHED, PREFILTER, SINE, seed=seed))
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    first, again, other = (bench(seed).run(TICKS) for seed in (1, 1, 2))
+    assert first.tobytes() == again.tobytes()
+    assert first.tobytes() != other.tobytes()
+    assert np.array_equal(first[:, 0], np.arange(TICKS))
+
+
+def test_pieces_give_the_same_bytes_as_a_whole():
+    whole, pieces = bench(), bench()
+    parts = [pieces.run(count) for count in (1, 999, 1, 7000, 16_999)]
+    assert np.concatenate(parts).tobytes() == whole.run(TICKS).tobytes()
+
+
+def test_a_snapshot_a_second_each_at_the_state_before_its_tick():
+    loop = bench()
+    rows = loop.run(TICKS)
+    snapshots = loop.drain("snapshots")
+    assert [split_snapshot(one, 1)[0] for one in snapshots] == [0, 10_000, 20_000]
+    for one in snapshots:
+        tick, coefficients, axes, state = split_snapshot(one, 1)
+        law = LawBench(coefficients)
+        law.axes, law.loops = axes, state
+        rest = rows[tick:]
+        inputs = {"adc_v": loop.column(rest, "x_adc_v"), "age_us": loop.column(rest, "sample_age_us")}
+        signals = law.run(loop.column(rest, "x_reference_um"), **inputs)
+        assert signals.drive_v.tobytes() == loop.column(rest, "x_drive_v").tobytes()
+        assert signals.demand_v.tobytes() == loop.column(rest, "x_demand_v").tobytes()
+        assert law.axes.tobytes() == loop.law.axes.tobytes()
+
+
+def test_records_agree_with_each_other():
+    loop = bench()
+    rows = loop.run(2000)
+    position = 10.0 * loop.column(rows, "x_adc_v")
+    assert np.array_equal(loop.column(rows, "x_position_um"), position)
+    wanted = np.convolve(loop.column(rows, "x_reference_um"), [0.5, 0.3, 0.2])[:2000]
+    np.testing.assert_allclose(loop.column(rows, "x_error_um"), wanted - position, rtol=0, atol=1e-12)
+    assert np.abs(loop.column(rows, "x_true_position_um") - position).max() < 0.06  # noise and resolution of 10 nm
+
+
+def test_two_axes_do_not_touch_each_other():
+    """An axis beside another one gives the bits that it gives alone."""
+    both = text(AXIS, CONTROLLER, MATCHED, SINE, AXIS.replace('"x"', '"y"'), CONTROLLER, MATCHED)
+    channels = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n[[axis]]'
+    two = LoopBench(both.replace("[[axis]]", channels, 1))
+    one = LoopBench(text(AXIS, CONTROLLER, MATCHED, SINE))
+    rows, alone = two.run(3000), one.run(3000)
+    for name in ("x_adc_v", "x_drive_v", "x_true_position_um"):
+        assert two.column(rows, name).tobytes() == one.column(alone, name).tobytes()
+    assert np.abs(two.column(rows, "y_true_position_um")).max() < 1.0

@@ -1,0 +1,124 @@
+"""The ring: whole slots or none, in order, and the reader knows what it lost."""
+
+from __future__ import annotations
+
+import threading
+
+import numba
+import numpy as np
+import pytest
+
+from hil.atomics import load_acquire
+from rtloop.engine.ring import ONE, Ring, claim, drain, publish
+
+COLUMNS = 40
+
+
+def new_ring(slots: int = 8) -> Ring:
+    return Ring(np.zeros(1, np.uint64), np.zeros(slots, np.uint64), np.zeros((slots, COLUMNS)))
+
+
+def write(ring: Ring, first: int, count: int) -> None:
+    for position in range(first, first + count):
+        ring.slots[claim(ring, np.uint64(position))] = position
+        publish(ring, np.uint64(position))
+
+
+def read(ring: Ring, cursor: int, room: int = 100) -> tuple[list[float], int, int]:
+    """(values, first, lost); each slot must be of one piece."""
+    out = np.full((room, COLUMNS), np.nan)
+    copied, first, lost = drain(ring, np.uint64(cursor), out)
+    assert np.all(out[:copied] == out[:copied, :1])
+    return out[:copied, 0].tolist(), int(first), int(lost)
+
+
+def test_in_order_and_once():
+    ring = new_ring()
+    assert read(ring, 0) == ([], 0, 0)
+    write(ring, 0, 5)
+    assert read(ring, 0) == ([0, 1, 2, 3, 4], 0, 0)
+    assert read(ring, 5) == ([], 5, 0)
+    write(ring, 5, 8)
+    assert read(ring, 5, room=3) == ([5, 6, 7], 5, 0)
+    assert read(ring, 8) == ([8, 9, 10, 11, 12], 8, 0)
+
+
+def test_every_reader_has_its_own_cursor():
+    ring = new_ring()
+    write(ring, 0, 6)
+    assert read(ring, 0)[0] == [0, 1, 2, 3, 4, 5]
+    assert read(ring, 4)[0] == [4, 5]
+
+
+def test_a_lapped_reader_knows_what_it_lost():
+    ring = new_ring()
+    write(ring, 0, 21)
+    assert read(ring, 3) == ([13, 14, 15, 16, 17, 18, 19, 20], 13, 10)
+
+
+def test_a_slot_that_is_being_written_is_not_read():
+    ring = new_ring()
+    write(ring, 0, 8)
+    ring.slots[claim(ring, np.uint64(8))][: COLUMNS // 2] = 8  # torn: position 0 overwritten by half
+    assert read(ring, 0) == ([1, 2, 3, 4, 5, 6, 7], 1, 1)
+    publish(ring, np.uint64(8))
+    ring.slots[0] = 8
+    assert read(ring, 8) == ([8], 8, 0)
+
+
+def test_a_reader_may_come_late_to_a_long_run():
+    ring = new_ring()
+    start = (1 << 40) + 3
+    write(ring, start, 10)
+    values, first, lost = read(ring, 7)
+    assert (first, lost) == (start + 2, start + 2 - 7)
+    assert values == list(range(start + 2, start + 10))
+
+
+@numba.njit(nogil=True)
+def hammer(ring, stop):
+    """Publish slots of one value each as fast as it goes, until told to stop."""
+    position = np.uint64(0)
+    while load_acquire(stop, 0) == np.uint64(0):
+        slot = claim(ring, position)
+        for i in range(ring.slots.shape[1]):
+            ring.slots[slot, i] = float(position)
+        publish(ring, position)
+        position += ONE
+
+
+@numba.njit(nogil=True)
+def watch(ring, out, wanted):
+    """Drain until `wanted` slots were read: slots torn or out of place, lost, laps."""
+    cursor, read_, wrong, lost, laps = np.uint64(0), 0, 0, 0, 0
+    while read_ < wanted:
+        copied, first, missed = drain(ring, cursor, out)
+        lost += np.int64(missed)
+        laps += 1 if missed > np.uint64(0) else 0
+        for i in range(copied):
+            for j in range(out.shape[1]):
+                if out[i, j] != float(first + np.uint64(i)):
+                    wrong += 1
+        cursor = first + np.uint64(copied)
+        read_ += copied
+    return wrong, lost, laps
+
+
+@pytest.mark.parametrize("slots", [4, 64])
+def test_no_torn_read_under_a_writer_that_never_waits(slots):
+    ring, stop, out = new_ring(slots), np.zeros(1, np.uint64), np.empty((64, COLUMNS))
+    warm = np.ones(1, np.uint64)
+    hammer(ring, warm)  # compiles
+    write(ring, 0, 1)
+    watch(ring, out, 1)
+    ring = new_ring(slots)
+    writer = threading.Thread(target=hammer, args=(ring, stop))
+    writer.start()
+    try:
+        wrong, lost, laps = watch(ring, out, 300_000)
+    finally:
+        stop[0] = 1
+        writer.join()
+    assert wrong == 0
+    assert lost > 0
+    assert laps > 0

@@ -1,0 +1,235 @@
+"""`rtloop run` as a user meets it: real processes, real signals, a real recording."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rtloop
+
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = ROOT / "deploy" / "paper.toml"
+TIMEOUT_S = 120
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def start(*arguments: str | Path, **options: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
+    settings: dict = {"env": ENVIRONMENT, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, **(settings | options))
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, dict, str]:
+    out, err = process.communicate(timeout=TIMEOUT_S)
+    assert "Traceback" not in err, err
+    return process.returncode, json.loads(out) if out.strip() else {}, err
+
+
+def run(*arguments: str | Path, **options: object) -> tuple[int, dict, str]:
+    return finish(start("run", *arguments, "--json", **options))
+
+
+def children(process: subprocess.Popen[str]) -> dict[str, int]:
+    """Process ids of loop and recorder, once both were started."""
+    found: dict[str, int] = {}
+    deadline = time.monotonic() + TIMEOUT_S
+    while len(found) < 2 and time.monotonic() < deadline:
+        for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+            command = Path(f"/proc/{child}/cmdline").read_bytes().decode()
+            for name in ("engine.process", "recording.recorder"):
+                if name in command:
+                    found[name] = int(child)
+        time.sleep(0.01)
+    return found
+
+
+def wait_for_ticks(folder: Path) -> None:
+    """Until the recorder has written ticks, so that the loop surely runs."""
+    deadline = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < deadline:
+        if any(path.stat().st_size > 20_000 for path in folder.glob("*.part")):
+            return
+        time.sleep(0.02)
+    raise AssertionError("no recording grew")
+
+
+def test_a_paced_run_accounts_for_every_tick(tmp_path: Path) -> None:
+    code, summary, _ = run(PAPER, "--duration", "1.5", "--out", tmp_path)
+    assert code == 0
+    assert summary["ticks_expected"] == summary["ticks_logged"] == 15_000
+    assert summary["ticks_lost"] == 0
+    assert summary["complete"] is True
+    assert summary["outcome"] == "done"
+    assert summary["realtime"]["scheduler"] in ("SCHED_FIFO", "SCHED_OTHER")
+    recording = rtloop.load(summary["recording"])
+    assert np.array_equal(recording["tick"], np.arange(15_000))
+    # the grid of deadlines is fixed: what is skipped is said
+    periods = 1 + recording["periods_missed"][1:]
+    assert np.array_equal(np.diff(recording["deadline_ns"]), periods * 100_000)
+    assert np.all(recording["lateness_us"] >= 0)
+
+
+def test_two_unpaced_runs_are_equal_in_bytes_and_another_seed_is_not(tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(PAPER.read_text().replace("seed = 1 ", "seed = 2 "))
+    records = []
+    for config in (PAPER, PAPER, other):
+        code, summary, _ = run(config, "--duration", "1", "--unpaced", "--out", tmp_path)
+        assert code == 0
+        assert summary["lateness_us"] is None
+        recording = rtloop.load(summary["recording"])
+        records.append(np.concatenate([block for block in recording.blocks()]).tobytes())
+    assert records[0] == records[1]
+    assert records[0] != records[2]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ramps_down_and_completes_the_recording(tmp_path: Path, number: signal.Signals) -> None:
+    process = start("run", PAPER, "--out", tmp_path, "--json")
+    wait_for_ticks(tmp_path)
+    process.send_signal(number)
+    code, summary, _ = finish(process)
+    assert code == 0
+    assert summary["outcome"] == "stopped"
+    assert summary["complete"] is True
+    recording = rtloop.load(summary["recording"])
+    assert recording["x_drive_v"][-1] == 0.0
+    ramp = np.diff(recording["x_drive_v"][recording["mode"] == 0])
+    assert np.all(np.abs(ramp) <= 1000 * 1e-4 * (1 + 1e-12))
+
+
+def test_a_killed_loop_is_parked_and_said(tmp_path: Path) -> None:
+    process = start("run", PAPER, "--out", tmp_path, "--json")
+    loop = children(process)["engine.process"]
+    wait_for_ticks(tmp_path)
+    os.kill(loop, signal.SIGKILL)
+    code, summary, err = finish(process)
+    assert code == 1
+    assert "signal 9" in err
+    assert "parked" in err
+    assert summary["complete"] is False
+    assert summary["ticks_lost"] == 0
+    assert len(rtloop.load(summary["recording"])) == summary["ticks_logged"] > 0
+
+
+def test_a_killed_recorder_does_not_end_the_loop_and_is_said(tmp_path: Path) -> None:
+    process = start("run", PAPER, "--out", tmp_path, "--duration", "4", "--json")
+    recorder = children(process)["recording.recorder"]
+    wait_for_ticks(tmp_path)
+    os.kill(recorder, signal.SIGKILL)
+    code, summary, err = finish(process)
+    assert code == 1
+    assert summary["outcome"] == "done"
+    assert "recorder" in err
+
+
+def test_a_loop_without_its_supervisor_parks_and_ends(tmp_path: Path) -> None:
+    process = start("run", PAPER, "--out", tmp_path, "--json")
+    pids = children(process)
+    wait_for_ticks(tmp_path)
+    process.kill()
+    process.communicate(timeout=TIMEOUT_S)
+    deadline = time.monotonic() + TIMEOUT_S
+    while any(Path(f"/proc/{pid}").exists() for pid in pids.values()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
+    recording = rtloop.load(next(tmp_path.glob("*.mcap")))
+    assert recording["x_drive_v"][-1] == 0.0
+    tripped = [event for event in recording.events if event["kind"] == "tripped"]
+    assert tripped[0]["what"]["causes"] == ["heartbeat"]
+
+
+def test_a_trip_is_recorded_and_ends_with_exit_1(tmp_path: Path) -> None:
+    config = tmp_path / "tight.toml"
+    config.write_text(PAPER.read_text().replace("position_um = 60.0", "position_um = 15.0"))
+    code, summary, _ = run(config, "--duration", "0.2", "--unpaced", "--out", tmp_path)
+    assert code == 1
+    assert summary["complete"] is True
+    assert summary["trips"][0]["causes"] == ["position"]
+    recording = rtloop.load(summary["recording"])
+    tick = summary["trips"][0]["tick"]
+    assert abs(recording["x_position_um"][tick]) > 15.0
+    assert np.all(np.abs(recording["x_position_um"][:tick]) <= 15.0)
+    assert np.all(recording["mode"][tick:] == 0)
+
+
+def test_realtime_that_is_required_and_refused_ends_with_77(tmp_path: Path) -> None:
+    config = tmp_path / "strict.toml"
+    config.write_text(PAPER.read_text().replace("# require_realtime = false", "require_realtime = true"))
+    code, summary, err = run(config, "--duration", "0.1", "--out", tmp_path, preexec_fn=_without_realtime)
+    assert code == 77
+    assert "require_realtime" in err
+    assert summary["exit_code"] == 77
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+def _without_realtime() -> None:
+    """Take CAP_SYS_NICE and CAP_IPC_LOCK away for good, and the limits that would grant the same."""
+    import ctypes
+    import resource
+
+    libc = ctypes.CDLL(None)
+    for capability in (23, 14):
+        libc.prctl(24, capability, 0, 0, 0)
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+
+
+def test_eight_axes_lose_nothing(tmp_path: Path) -> None:
+    config = tmp_path / "eight.toml"
+    config.write_text(eight_axes())
+    code, summary, _ = run(config, "--duration", "1", "--out", tmp_path)
+    assert code == 0
+    assert summary["ticks_logged"] == 10_000
+    assert summary["ticks_lost"] == 0
+    assert [axis["name"] for axis in summary["axes"]] == [f"a{i}" for i in range(8)]
+
+
+def eight_axes() -> str:
+    """The paper's axis eight times, each on a plant of its own."""
+    text = PAPER.read_text()
+    head, axis = text[: text.index("[[axis]]")], text[text.index("[[axis]]") : text.index("[recording]")]
+    channel = head[head.index("[driver.channels.x]") : head.index("# The rig's truth")]
+    channels = [
+        channel.replace("channels.x", f"channels.a{i}").replace("adc0", f"adc{i}").replace("dac0", f"dac{i}")
+        for i in range(8)
+    ]
+    axes = [axis.replace('name = "x"', f'name = "a{i}"') for i in range(8)]
+    return head.replace(channel, "\n".join(channels)) + "\n".join(axes)
+
+
+def test_an_output_folder_that_cannot_be_made_ends_with_73(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    code, summary, err = run(PAPER, "--duration", "0.1", "--out", blocked / "recordings")
+    assert code == 73
+    assert str(blocked) in err
+    assert summary["exit_code"] == 73
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small file system needs root")
+def test_a_full_disk_costs_records_and_nothing_else(tmp_path: Path) -> None:
+    small = tmp_path / "small"
+    small.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=700k", "tmpfs", str(small)], check=False)
+    if mounted.returncode != 0:
+        pytest.skip("mounting is not permitted here")
+    try:
+        config = tmp_path / "paper.toml"
+        config.write_text(PAPER.read_text().replace("# min_free_mib = 64.0", "min_free_mib = 0.0"))
+        code, summary, err = run(config, "--duration", "3", "--out", small)
+        assert code == 1
+        assert summary["outcome"] == "done"
+        assert summary["ticks_expected"] == summary["ticks_logged"] + summary["ticks_lost"] == 30_000
+        assert 0 < summary["ticks_logged"] < 30_000
+        assert "space" in err.lower()
+        assert len(rtloop.load(summary["recording"])) == summary["ticks_logged"]
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
