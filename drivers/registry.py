@@ -6,9 +6,11 @@ from importlib import import_module
 from importlib.metadata import entry_points
 
 from drivers.base import Driver
+from drivers.errors import MissingExtra
 
 GROUP = "rtloop.drivers"
 BUILT_IN = {
+    "shm": "drivers.shm:ShmDriver",
     "sim": "drivers.sim:SimDriver",
 }
 
@@ -22,10 +24,13 @@ def kinds() -> dict[str, str]:
 def driver_class(kind: str) -> type[Driver]:
     """The class of a kind.
 
-    Raises ValueError for an unknown kind, MissingExtra (from the driver's module) for a package that is not there.
+    Raises ValueError for an unknown kind, MissingExtra for a module, or a package that it needs, that is not there.
     """
     known = kinds()
     if kind not in known:
         raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(known)}")
     module, _, name = known[kind].partition(":")
-    return getattr(import_module(module), name)
+    try:
+        return getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise MissingExtra(f"driver {kind!r}, {known[kind]}: cannot be imported: {error}") from error

@@ -11,11 +11,11 @@ import numpy as np
 
 from drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from hil.compiled import cfunc
-from hil.options import RigOptions
+from hil.options import ConverterOptions, RigOptions
 from hil.pointers import SIGNATURE, address_pointer, carray
 from hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
-CONTEXT = np.dtype([("count", np.int64), ("coefficients", np.int64), ("state", np.int64)])
+CONTEXT = np.dtype([("count", np.uint32), ("coefficients", np.int64), ("state", np.int64)], align=True)
 OBSERVED_PER_AXIS = 2
 
 
@@ -55,6 +55,7 @@ class SimDriver(Driver):
 
     def __init__(self, options: RigOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
         super().__init__(options, wiring, rate_hz)
+        self._rig_options = options
         self._rig = build_rig(options, self._axes_by_plant(), 1.0 / rate_hz)
         self._context = np.zeros(1, CONTEXT)
 
@@ -75,11 +76,12 @@ class SimDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """As many channel pairs as there are axes."""
+        """As many channel pairs as there are axes, with the ranges of the rig's converters."""
         axes = self._axes_by_plant()
+        plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
         return Facts(
-            inputs=tuple(Channel(f"adc{i}") for i in range(len(axes))),
-            outputs=tuple(Channel(f"dac{i}") for i in range(len(axes))),
+            inputs=tuple(_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)),
+            outputs=tuple(_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)),
             observed=tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um")),
             exclusive=False,
             real=False,
@@ -92,5 +94,15 @@ class SimDriver(Driver):
         self._context["coefficients"], self._context["state"] = coefficients.ctypes.data, state.ctypes.data
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
 
+    @property
+    def dac_v(self) -> list[float]:
+        """What each DAC was given last, as it renders it."""
+        return self._rig[1]["dac_v"].tolist()
+
     def close(self) -> None:
-        """Nothing to let go: the rig exists only while it is called."""
+        """Outputs at 0 V; no time passes, for the rig exists only while it is called."""
+        self._rig[1]["dac_v"] = 0.0
+
+
+def _channel(name: str, converter: ConverterOptions) -> Channel:
+    return Channel(name, -converter.range_v, converter.range_v)

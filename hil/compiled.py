@@ -69,13 +69,19 @@ def _cache_folder() -> tuple[Path, bool]:
 
 CACHE_FOLDER, CACHE_IS_PERSISTENT = _cache_folder()
 numba_config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIssue]
-# Four equal operations on neighbours become one vector operation; no sum is reordered.
-numba_config.SLP_VECTORIZE = 1  # pyright: ignore[reportAttributeAccessIssue]
+# Four equal operations written side by side become one vector operation, which reorders no sum. Loops are left as they
+# are: they run over an axis, five states or fifteen plays, and their vector forms cost more than they save.
+numba_config.SLP_VECTORIZE, numba_config.LOOP_VECTORIZE = 1, 0  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def jit(function: Callable[..., Any]) -> Any:
-    """Compile a kernel on first use; `.py_func` is the same kernel uncompiled."""
+    """Compile a kernel on first use, part of its compiled callers; `.py_func` is the same kernel uncompiled."""
     return numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
+
+
+def seldom(function: Callable[..., Any]) -> Any:
+    """A kernel for what most ticks do not do: called, so that it does not crowd its callers."""
+    return numba.njit(cache=True, error_model="numpy")(function)
 
 
 def intrinsic(function: Callable[..., Any]) -> Any:

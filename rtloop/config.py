@@ -8,6 +8,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -156,8 +157,10 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
         faults.append("driver: missing; a section [driver] with kind and channels is needed")
         return "", None, {}
     rest = dict(raw)
-    kind = rest.pop("kind", None)
-    channels = _validated(TypeAdapter(dict[str, ChannelOptions]), rest.pop("channels", {}), "driver.channels", faults)
+    kind, given = rest.pop("kind", None), rest.pop("channels", {})
+    channels = _validated(TypeAdapter(dict[str, ChannelOptions]), given, "driver.channels", faults)
+    if channels is None and isinstance(given, dict):
+        channels = given  # their names are known all the same
     if not isinstance(kind, str):
         faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; the name of a driver is needed")
         return "", None, channels or {}
@@ -174,11 +177,23 @@ def _validated(adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[st
     try:
         return adapter.validate_python(raw)
     except ValidationError as error:
-        faults += [_fault(detail, prefix, raw) for detail in error.errors(include_url=False)]
+        known = _keys(adapter.json_schema())
+        details = error.errors(include_url=False)
+        details = [detail for detail in details if not (detail["type"] == "too_short" and detail["input"])]
+        faults += [_fault(detail, prefix, raw, known) for detail in details]
         return None
 
 
-def _fault(detail: Any, prefix: str, raw: Any) -> str:
+def _keys(schema: Any) -> set[str]:
+    """All keys that a JSON schema knows, at any depth."""
+    if isinstance(schema, list):
+        return set().union(*map(_keys, schema))
+    if not isinstance(schema, dict):
+        return set()
+    return set(schema.get("properties", ())).union(*map(_keys, schema.values()))
+
+
+def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
     """One line: key, value, what is allowed."""
     path = [prefix] if prefix else []
     node = raw
@@ -194,7 +209,14 @@ def _fault(detail: Any, prefix: str, raw: Any) -> str:
     if detail["type"] == "missing":
         return f"{where}: missing; it is needed"
     if detail["type"] == "extra_forbidden":
-        return f"{where}: unknown key"
+        near = get_close_matches(path[-1], known_keys, n=1)
+        return f"{where}: unknown key" + (f"; did you mean {near[0]}?" if near else "")
+    if detail["type"] == "union_tag_not_found":
+        return f"{where}.kind: missing; it is needed"
+    if detail["type"] == "union_tag_invalid":
+        return f"{where}.kind: {detail['ctx']['tag']!r}: allowed are {detail['ctx']['expected_tags']}"
+    if detail["type"] == "tuple_type" and isinstance(detail["input"], dict):
+        return f"{where}: one table; a list of tables, each headed [[{where}]], is needed"
     message = detail["msg"].removeprefix("Value error, ")
     value = detail["input"]
     shown = f" {value!r}:" if isinstance(value, str | int | float | bool) else ""

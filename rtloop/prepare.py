@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.base import Channel, Facts, index_of
+from drivers.base import Channel, Driver, Facts, index_of
 from drivers.errors import DriverError
 from drivers.registry import driver_class
 from rtloop.config import Configuration, ScheduleOptions
@@ -25,7 +25,6 @@ from rtloop.law.options import AxisOptions
 from rtloop.law.reference import GENERATOR
 from rtloop.references import TableOfSamples, generator_values
 from rtloop.signals import Mode
-
 
 COMPARED_PART = 0.2
 """C(z) is compared with C(s) up to this part of the rate; toward half of it every method must differ."""
@@ -71,7 +70,8 @@ class _Findings:
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
     """Build law, references and schedule. Raises ConfigError with all faults, DriverError for a missing library."""
     findings, rate_hz = _Findings(), configuration.loop.rate_hz
-    facts = findings.attempt("driver.", lambda: _facts(configuration, paced))
+    driver = findings.attempt("driver.", lambda: _driver(configuration))
+    facts = driver and findings.attempt("", lambda: require_facts(driver, rate_hz, paced))
     if facts is None:
         raise ConfigError(configuration.name, findings.faults)
     checks, coefficients = [], []
@@ -105,11 +105,10 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
 
 
-def _facts(configuration: Configuration, paced: bool) -> Facts:
+def _driver(configuration: Configuration) -> Driver:
     kind = driver_class(configuration.driver_kind)
     try:
-        driver = kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
-        return require_facts(driver, configuration.loop.rate_hz, paced)
+        return kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
     except DriverError as error:
         raise ConfigError(configuration.name, [f"driver: {error}"]) from None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import IO, Any
 
 from rich.console import Console
@@ -14,7 +13,6 @@ from drivers.registry import driver_class, kinds
 from rtloop import signals
 from rtloop.prepare import Prepared
 from rtloop.recording.load import load
-from rtloop.recording.replay import ReplayReport
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
 from rtloop.steps import PAPER_CLAIM, step_metrics
@@ -79,24 +77,6 @@ class Counter:
         """The number so far."""
         if self._status:
             self._status.update(f"{count:,} {self._label}")
-
-
-def print_replay(path: Path, report: ReplayReport) -> None:
-    """The verdict, the gaps, the first difference."""
-    console = Console(highlight=False)
-    for gap in report.gaps:
-        console.print(f"gap: {gap['count']} ticks from tick {gap['first_tick']} on are not in the recording")
-    if report.unverified:
-        console.print(f"{report.unverified:,} ticks before the next snapshot of the law were passed over")
-    checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
-    if report.first_difference is None:
-        console.print(f"[green]identical[/]: {path}: {checked} compared in bytes")
-        return
-    found = report.first_difference
-    console.print(
-        f"[red]different[/]: {path}: tick {found['tick']}, {found['signal']}: recorded {found['recorded']!r}, "
-        f"replayed {found['replayed']!r} ({checked} compared)"
-    )
 
 
 def _elapsed(time_s: float, ticks: int | None, rate_hz: float) -> str:

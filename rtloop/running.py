@@ -17,20 +17,21 @@ from rtloop.errors import LoopFault, OutputError
 from rtloop.prepare import Prepared, prepare
 from rtloop.recording.summary import summarise
 from rtloop.report import RunView, print_run
-from rtloop.service.supervisor import RunResult, Supervisor
+from rtloop.service.supervisor import Processes, RunResult, Supervisor
 
 PROGRESS_PERIOD_S = 0.1
 
 
 def run_configuration(config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool) -> int:
     """Run, record, report; returns the exit code."""
-    prepared = prepare(load(config), duration_s=duration_s, paced=paced)
-    for warning in prepared.warnings:
-        click.echo(f"warning: {warning}", err=True)
-    supervisor = Supervisor(prepared, recording_path(prepared, out))
-    with _stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
-        result = supervisor.run(_every(PROGRESS_PERIOD_S, view.show))
-    summary = run_summary(prepared, result)
+    with Processes() as processes:
+        prepared = prepare(load(config), duration_s=duration_s, paced=paced)
+        for warning in prepared.warnings:
+            click.echo(f"warning: {warning}", err=True)
+        supervisor = Supervisor(processes, prepared, recording_path(prepared, out))
+        with _stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
+            result = supervisor.run(_every(PROGRESS_PERIOD_S, view.show))
+    summary = run_summary(prepared, result) | {"startup_s": supervisor.startup_s}
     if as_json:
         click.echo(json.dumps(summary))
     else:

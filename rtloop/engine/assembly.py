@@ -12,8 +12,8 @@ from rtloop.engine.context import LOOP
 from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.plan import Plan
-from rtloop.law.layout import Records, initial_state
 from rtloop.law.law import set_mode
+from rtloop.law.layout import Records, copied, initial_state
 
 SNAPSHOT_SECONDS = 1.0
 UNLIMITED = np.iinfo(np.int64).max
@@ -29,7 +29,7 @@ class LawArrays(NamedTuple):
 
 def law_at_rest(plan: Plan) -> LawArrays:
     """The plan's law before its first tick."""
-    coefficients = plan.coefficients.view(np.recarray)
+    coefficients = copied(plan.coefficients)
     axes, state = initial_state(coefficients)
     set_mode(axes, state[0], int(plan.mode), True)
     return LawArrays(coefficients, axes, state)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.atomics import load_acquire, store_release
-from hil.compiled import jit
+from hil.compiled import jit, seldom
 from rtloop.engine.context import axes_of, event_ring, generators_of, messages, state_of, words_of
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
@@ -59,7 +59,7 @@ def apply_commands(loop):
         store_release(words, TAIL, tail)
 
 
-@jit
+@seldom
 def _apply(loop, command):
     state = state_of(loop)
     if command.kind == SET_MODE:
@@ -99,7 +99,7 @@ def _set_reference(loop, command):
                 generators[a].parameters[i] = command.values[1 + i]
 
 
-@jit
+@seldom
 def publish_event(loop, kind, axis, origin, first, second):
     """An event of this tick with two values."""
     ring, position = event_ring(loop), np.uint64(loop.events)

@@ -27,6 +27,7 @@ _ADDRESSES = (
     *("words", "last_drive_v", "commands", "schedule"),
     *(f"{ring}_{part}" for ring in ("ticks", "events", "snapshots") for part in ("head", "marks", "slots")),
 )
+# of 32 bits and unsigned: sums of them are never negative, so that no index needs a check of its sign
 _COUNTS = (
     *("axis_count", "input_count", "output_count", "observed_count", "table_count", "command_count", "schedule_count"),
     *("ticks_capacity", "events_capacity", "snapshots_capacity", "column_count", "snapshot_bytes"),
@@ -43,7 +44,7 @@ _COUNTERS = ("tick", "events", "snapshots", "scheduled", "stopping", "failed", "
 LOOP = np.dtype(
     [
         *((name, np.int64) for name in _ADDRESSES),
-        *((name, np.int64) for name in _COUNTS),
+        *((name, np.uint32) for name in _COUNTS),
         *_SETTINGS,
         *((name, np.int64) for name in _COUNTERS),
     ],

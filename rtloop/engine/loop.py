@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 
 from hil.atomics import load_acquire
-from hil.compiled import jit
+from hil.compiled import jit, seldom
 from hil.pointers import call
 from rtloop.engine.commands import apply_commands, publish_event
 from rtloop.engine.context import (
@@ -168,9 +168,10 @@ def _fill_signals(loop, row):
     """Sample age, the signals of each axis, the observed signals."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
-    axes, column = axes_of(loop), COMMON_COUNT
+    axes = axes_of(loop)
     row[11] = inputs[loop.input_count]
     for a in range(loop.axis_count):
+        column = COMMON_COUNT + a * PER_AXIS_COUNT
         row[column] = adc_v[a]
         row[column + 1] = axes[a].position_um
         row[column + 2] = references[a]
@@ -178,7 +179,7 @@ def _fill_signals(loop, row):
         row[column + 4] = axes[a].command_um
         row[column + 5] = axes[a].demand_v
         row[column + 6] = axes[a].drive_v
-        column += PER_AXIS_COUNT
+    column = COMMON_COUNT + loop.axis_count * PER_AXIS_COUNT
     for i in range(loop.observed_count):
         row[column + i] = inputs[loop.input_count + 1 + i]
 
@@ -199,7 +200,7 @@ def _report(loop, status, written, missed):
         loop.next_late_event = loop.tick + np.int64(1.0 / loop.period_s)
 
 
-@jit
+@seldom
 def _publish_snapshot(loop):
     """Tick, coefficients and state as bytes, as they are before the commands of this tick."""
     ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)

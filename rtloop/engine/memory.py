@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import mmap
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 
 DIRECTORY_BYTES = 8192
+ATTACH_POLL_S = 0.001
 RING_SECONDS = 6.0
 # numbers of slots are powers of two: the rings rely on it
 MIN_RING_TICKS = 4096
@@ -43,6 +45,10 @@ class Word(IntEnum):
     RECORDER_PID = 9
     START_UNIX_NS = 10
     FINISHED_TICKS = 11
+    FLUSHED_TICKS = 12
+    """Positions up to which the recorder has written the rings: where the next one goes on if it dies."""
+    FLUSHED_EVENTS = 13
+    FLUSHED_SNAPSHOTS = 14
 
 
 class ProcessState(IntEnum):
@@ -82,9 +88,23 @@ class SharedBlock:
             for name, (offset, descr, shape) in directory.items()
         }
 
+    @staticmethod
+    def reserve() -> int:
+        """An anonymous file for a block that is created later; child processes may inherit it already."""
+        return os.memfd_create("rtloop")
+
     @classmethod
-    def create(cls, sizes: Sizes, path: str | None = None) -> SharedBlock:
-        """A new zeroed block, anonymous or at `path` (replaced if present, mode 0600)."""
+    def attach(cls, fd: int, given_up: Callable[[], bool]) -> SharedBlock:
+        """The block in `fd`, once it was created. Raises EOFError when `given_up` says that it never will be."""
+        while os.pread(fd, 1, 0) != b"{":
+            if given_up():
+                raise EOFError("no shared block was created")
+            time.sleep(ATTACH_POLL_S)
+        return cls(fd)
+
+    @classmethod
+    def create(cls, sizes: Sizes, fd: int | None = None) -> SharedBlock:
+        """A new zeroed block in `fd`, which must be empty, or in an anonymous file."""
         specification = _specification(sizes)
         offset, directory = DIRECTORY_BYTES, {}
         for name, (dtype, shape) in specification.items():
@@ -93,12 +113,9 @@ class SharedBlock:
         header = json.dumps(directory).encode()
         if len(header) > DIRECTORY_BYTES:
             raise ValueError(f"directory of the shared block: {len(header)} bytes, at most {DIRECTORY_BYTES}")
-        if path is None:
-            fd = os.memfd_create("rtloop")
-        else:
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        fd = cls.reserve() if fd is None else fd
         os.ftruncate(fd, offset)
-        os.pwrite(fd, header, 0)
+        os.pwrite(fd, header, 0)  # last: a block that can be read is complete
         return cls(fd)
 
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:

@@ -23,8 +23,15 @@ from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
-from rtloop.errors import RefusedError, RtloopError, UnavailableError
+from rtloop.engine.rehearsal import rehearse
+from rtloop.errors import ConfigError, LoopFault, RefusedError, RtloopError, UnavailableError
 
+EXIT_CODES = {
+    Outcome.DONE: 0,
+    Outcome.STOPPED: 0,
+    Outcome.DRIVER_FAILED: UnavailableError.exit_code,
+    Outcome.HEARTBEAT_LOST: LoopFault.exit_code,
+}
 START_DELAY_NS = 20_000_000
 GO_POLL_S = 0.001
 
@@ -40,8 +47,13 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     parser = argparse.ArgumentParser()
     parser.add_argument("--fd", type=int, required=True)
-    block = SharedBlock(parser.parse_args().fd)
-    plan: Plan = pickle.load(sys.stdin.buffer)
+    fd = parser.parse_args().fd
+    rehearse()  # loads the compiled loop while the supervisor still reads the configuration
+    try:
+        plan: Plan = pickle.load(sys.stdin.buffer)
+    except EOFError:
+        return 0  # there was nothing to run
+    block = SharedBlock(fd)
     driver: Driver | None = None
     state = ProcessState.FAILED
     try:
@@ -50,16 +62,23 @@ def main() -> int:
         outcome = _run(plan, block, driver, facts)
         report("finished", outcome=outcome.name.lower(), driver_error=_driver_error(driver))
         state = ProcessState.FINISHED
-        code = 0 if outcome in (Outcome.DONE, Outcome.STOPPED) else UnavailableError.exit_code
+        code = EXIT_CODES[outcome]
     except DriverError as error:
         report("failed", message=str(error), exit_code=UnavailableError.exit_code)
         code = UnavailableError.exit_code
+    except ValueError as error:
+        report("failed", message=f"driver.{error}", exit_code=ConfigError.exit_code)
+        code = ConfigError.exit_code
     except RtloopError as error:
         report("failed", message=str(error), exit_code=error.exit_code)
         code = error.exit_code
     finally:
-        if driver is not None:
-            driver.close()
+        try:
+            if driver is not None:
+                driver.close()
+        except DriverError as error:
+            report("failed", message=str(error), exit_code=UnavailableError.exit_code)
+            code, state = UnavailableError.exit_code, ProcessState.FAILED
         block.words[Word.LOOP_STATE] = state
     return code
 

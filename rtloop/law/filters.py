@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from hil.compiled import inlined, jit
+from hil.compiled import inlined, jit, seldom
 from rtloop.law.hysteresis import total
 from rtloop.law.layout import LANES
-
 
 BLOCK = 2 * LANES
 """States in a block: four, and then the partners of these four."""
@@ -61,7 +60,7 @@ def _moved_pair(coefficients, state, i, error_um, shortfall_um):
     )
 
 
-@jit
+@seldom
 def controller_enter(coefficients, state, error_um, command_um):
     """State from which C continues at `command_um`: its steady state for the error, corrected along m."""
     for i in range(coefficients.order):

@@ -22,6 +22,7 @@ from rtloop.law.layout import LANES, MAX_PLAYS
 
 Real = npt.NDArray[np.float64]
 
+
 @dataclass(frozen=True)
 class PlayModel:
     """Thresholds (n,) ascending from ≥ 0 and weights (n,) of a Prandtl-Ishlinskii operator."""

@@ -63,40 +63,44 @@ def evaluate(coefficients, axes, loop, adc_v, references, driver_status, sample_
 @jit
 def _drive(coefficients, state, loop, reference):
     """Set the signals and the drive of one axis; returns its flags."""
-    last_v = state.drive_v
+    last_v, mode = state.drive_v, loop.mode
     if state.usable != 0:
-        state.error_um = prefilter(coefficients, state, reference) - state.position_um
+        error_um = prefilter(coefficients, state, reference) - state.position_um
+        state.error_um = error_um
     else:
-        state.error_um = reference - state.position_um
+        error_um = reference - state.position_um
+        state.error_um = error_um
         if loop.new_trip != 0:  # hold for the tick that trips; the ramp below needs no input
             state.demand_v = last_v
             return RAMPING
-    if loop.mode == OFF:
+    if mode == OFF:
         state.drive_v = toward(last_v, coefficients.safe_v, coefficients.trip_slew_v_per_tick)
         state.demand_v = coefficients.safe_v
         state.command_um = state.applied_command_um
         return 0 if state.drive_v == coefficients.safe_v else RAMPING
     flags = 0
-    if loop.mode == RAW:
+    if mode == RAW:
         state.command_um = state.applied_command_um
-        state.demand_v = reference + _bump(coefficients, state, last_v - reference)
+        demand_v = reference + _bump(coefficients, state, last_v - reference)
     else:
-        if loop.mode == FEEDFORWARD:
-            state.command_um = reference + _bump(coefficients, state, state.applied_command_um - reference)
+        if mode == FEEDFORWARD:
+            command_um = reference + _bump(coefficients, state, state.applied_command_um - reference)
         else:
             if state.entering != 0:
-                controller_enter(coefficients, state, state.error_um, state.applied_command_um)
-            state.command_um = controller_output(coefficients, state, state.error_um)
-        limited = clip(state.command_um, -coefficients.command_limit_um, coefficients.command_limit_um)
-        if limited != state.command_um:
+                controller_enter(coefficients, state, error_um, state.applied_command_um)
+            command_um = controller_output(coefficients, state, error_um)
+        state.command_um = command_um
+        limited_um = clip(command_um, -coefficients.command_limit_um, coefficients.command_limit_um)
+        if limited_um != command_um:
             flags |= COMMAND_LIMITED
-        state.demand_v = inverse_drive(coefficients, state, limited)
-    state.entering = 0
-    allowed = clip(state.demand_v, coefficients.drive_min_v, coefficients.drive_max_v)
-    if allowed != state.demand_v:
+        demand_v = inverse_drive(coefficients, state, limited_um)
+    state.entering, state.demand_v = 0, demand_v
+    allowed_v = clip(demand_v, coefficients.drive_min_v, coefficients.drive_max_v)
+    if allowed_v != demand_v:
         flags |= DRIVE_LIMITED
-    state.drive_v = toward(last_v, allowed, coefficients.slew_v_per_tick)
-    if state.drive_v != allowed:
+    drive_v = toward(last_v, allowed_v, coefficients.slew_v_per_tick)
+    state.drive_v = drive_v
+    if drive_v != allowed_v:
         flags |= SLEW_LIMITED
     return flags
 

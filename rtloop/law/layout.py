@@ -22,40 +22,51 @@ MAX_SECTIONS = 12
 
 Records = np.recarray[Any, Any]
 
-COEFFICIENTS = np.dtype(
+LINE_BYTES = 64
+"""Records begin at a cache line and arrays come first in them: no load of four numbers straddles two lines."""
+
+
+def _whole_lines(fields: list[Any]) -> np.dtype[Any]:
+    """A record of `fields` and what fills up its last cache line."""
+    size = np.dtype(fields, align=True).itemsize
+    return np.dtype([*fields, ("reserved", np.float64, (-size % LINE_BYTES // 8,))], align=True)
+
+
+COEFFICIENTS = _whole_lines(
     [
-        # sensor scale
-        ("um_per_v", np.float64),
-        ("offset_v", np.float64),
         # inverse Prandtl-Ishlinskii and the forward model that it inverts
-        ("play_count", np.uint8),
         ("inverse_thresholds_um", np.float64, (MAX_PLAYS,)),
         ("inverse_weights_v_per_um", np.float64, (MAX_PLAYS,)),
         ("model_thresholds_v", np.float64, (MAX_PLAYS,)),
         ("model_weights_um_per_v", np.float64, (MAX_PLAYS,)),
-        ("dead_band_v", np.float64),
-        ("dead_band_threshold_v", np.float64),
         # controller C(z): x⁺ = A x + b e, v = c x + d e. States stand in blocks of four pairs, four first ones and
         # then their four partners; A within the pairs is `own` and `partner`, `coupling` holds the rest of A, of
         # whose rows only the columns start ≤ j < stop are non-zero
-        ("order", np.uint8),
         ("own", np.float64, (MAX_ORDER,)),
         ("partner", np.float64, (MAX_ORDER,)),
+        ("b", np.float64, (MAX_ORDER,)),
+        ("c", np.float64, (MAX_ORDER,)),
+        ("tracking", np.float64, (MAX_ORDER,)),
+        ("steady_state", np.float64, (MAX_ORDER,)),
+        ("coupling", np.float64, (MAX_ORDER, MAX_ORDER)),
+        # reference pre-filter: FIR taps, then second-order sections b0 b1 b2 a1 a2
+        ("taps", np.float64, (MAX_TAPS,)),
+        ("sections", np.float64, (MAX_SECTIONS, 5)),
+        ("tap_count", np.int64),
+        ("section_count", np.int64),
+        # plays and controller
+        ("play_count", np.uint8),
+        ("order", np.uint8),
         ("coupled", np.uint8),
         ("row_start", np.uint8, (MAX_ORDER,)),
         ("row_stop", np.uint8, (MAX_ORDER,)),
-        ("coupling", np.float64, (MAX_ORDER, MAX_ORDER)),
-        ("b", np.float64, (MAX_ORDER,)),
-        ("c", np.float64, (MAX_ORDER,)),
         ("d", np.float64),
-        ("tracking", np.float64, (MAX_ORDER,)),
         ("tracking_share", np.float64),
-        ("steady_state", np.float64, (MAX_ORDER,)),
-        # reference pre-filter: FIR taps, then second-order sections b0 b1 b2 a1 a2
-        ("tap_count", np.int64),
-        ("taps", np.float64, (MAX_TAPS,)),
-        ("section_count", np.int64),
-        ("sections", np.float64, (MAX_SECTIONS, 5)),
+        ("dead_band_v", np.float64),
+        ("dead_band_threshold_v", np.float64),
+        # sensor scale
+        ("um_per_v", np.float64),
+        ("offset_v", np.float64),
         # limits; rates are per tick
         ("command_limit_um", np.float64),
         ("drive_min_v", np.float64),
@@ -69,20 +80,19 @@ COEFFICIENTS = np.dtype(
         ("sensor_max_v", np.float64),
         ("position_limit_um", np.float64),
         ("sample_age_limit_us", np.float64),
-    ],
-    align=True,
+    ]
 )
-STATE = np.dtype(
+STATE = _whole_lines(
     [
         ("inverse_plays_um", np.float64, (MAX_PLAYS,)),
         ("model_plays_v", np.float64, (MAX_PLAYS,)),
-        ("sums", np.float64, (LANES,)),
-        ("dead_band_direction", np.float64),
         ("controller", np.float64, (MAX_ORDER,)),
         ("scratch", np.float64, (MAX_ORDER,)),
-        ("tap_index", np.int64),
         ("tap_history", np.float64, (MAX_TAPS,)),
         ("section_history", np.float64, (MAX_SECTIONS, 2)),
+        ("sums", np.float64, (LANES,)),
+        ("tap_index", np.int64),
+        ("dead_band_direction", np.float64),
         ("bump", np.float64),
         ("entering", np.int64),
         ("usable", np.int64),
@@ -93,8 +103,7 @@ STATE = np.dtype(
         ("applied_command_um", np.float64),
         ("demand_v", np.float64),
         ("drive_v", np.float64),
-    ],
-    align=True,
+    ]
 )
 LOOP_STATE = np.dtype(
     [("mode", np.int64), ("trip", np.int64), ("new_trip", np.int64), ("tick_flags", np.int64), ("settled", np.int64)],
@@ -105,8 +114,17 @@ every output is at its safe value."""
 
 
 def records(dtype: np.dtype[Any], count: int) -> Records:
-    """Zeroed records, with attribute access also where the kernels run uncompiled."""
-    return np.zeros(count, dtype).view(np.recarray)
+    """Zeroed records at a cache line, with attribute access also where the kernels run uncompiled."""
+    room = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
+    begin = -room.ctypes.data % LINE_BYTES
+    return room[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
+
+
+def copied(source: npt.NDArray[Any]) -> Records:
+    """A copy of records, at a cache line."""
+    copy = records(source.dtype, source.size)
+    copy[:] = source
+    return copy
 
 
 def initial_state(coefficients: Records) -> tuple[Records, Records]:
@@ -131,7 +149,7 @@ def split_snapshot(snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[
         raise ValueError(f"law snapshot: {len(data)} bytes, but {axes} axes take {snapshot_bytes(axes)}")
     offset, parts = 8, []
     for dtype, count in ((COEFFICIENTS, axes), (STATE, axes), (LOOP_STATE, 1)):
-        parts.append(np.frombuffer(data, dtype, count, offset).copy().view(np.recarray))
+        parts.append(copied(np.frombuffer(data, dtype, count, offset)))
         offset += count * dtype.itemsize
     return int.from_bytes(data[:8], "little"), parts[0], parts[1], parts[2]
 

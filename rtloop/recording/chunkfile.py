@@ -6,6 +6,7 @@ everything up to its last chunk; a full disk leaves room for the index by giving
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import zlib
@@ -88,7 +89,10 @@ class ChunkFile:
         """Take the last chunk off the file; returns its messages by channel."""
         chunk = self._chunks.pop()
         self.size, self._crc = chunk.entry.chunk_start_offset, chunk.crc_before
-        os.ftruncate(self._fd, self.size)
+        try:
+            os.ftruncate(self._fd, self.size)
+        except OSError as error:
+            raise self._refused(error) from None
         return chunk.counts
 
     def write_end(self) -> None:
@@ -135,7 +139,8 @@ class ChunkFile:
             while done < len(data):
                 done += os.pwrite(self._fd, data[done:], self.size + done)
         except OSError as error:
-            os.ftruncate(self._fd, self.size)
+            with contextlib.suppress(OSError):  # what is left of it is overwritten, or recognised as cut off
+                os.ftruncate(self._fd, self.size)
             raise self._refused(error) from None
         self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)

@@ -37,7 +37,7 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
         "kind": _name(Kind, kind),
         "who": _name(Origin, int(message["origin"])),
         "axis": axes[axis] if 0 <= axis < len(axes) else None,
-        "what": {**meaning, "values": [_json(value) for value in values], "identity": int(message["identity"])},
+        "what": {**meaning, "values": [json_value(value) for value in values], "identity": int(message["identity"])},
     }
 
 
@@ -70,6 +70,6 @@ def _number(kinds: Any, name: str) -> int:
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 
 
-def _json(value: float) -> float | str:
+def json_value(value: Any) -> Any:
     """JSON has no words for NaN and infinity: they are written as strings that float() understands."""
-    return value if math.isfinite(value) else repr(value)
+    return repr(value) if isinstance(value, float) and not math.isfinite(value) else value

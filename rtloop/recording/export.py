@@ -14,6 +14,7 @@ import numpy as np
 
 from rtloop.recording.errors import MissingExtra, OutputError, RecordingError
 from rtloop.recording.load import Recording, load
+from rtloop.recording.parts import Files, find_files
 
 FORMATS = ("csv", "parquet", "npz")
 PASS_BYTES = 512 << 20
@@ -23,18 +24,17 @@ ROW_GROUP = 1 << 18
 Progress = Callable[[int], None]
 
 
-def export(
-    path: Path | str, to: str, output: Path | str | None = None, progress: Progress | None = None
-) -> dict[str, Any]:
-    """Write `path` as `to`, one of FORMATS; `progress` is told the ticks so far.
+def export(files: Files, to: str, output: Path | str | None = None, progress: Progress | None = None) -> dict[str, Any]:
+    """Write a recording as `to`, one of FORMATS; `progress` is told the ticks so far.
 
     Returns {recording, output, ticks, bytes, problems}. Raises RecordingError, OutputError, MissingExtra.
     """
     writers = {"csv": _write_csv, "parquet": _write_parquet, "npz": _write_npz}
     if to not in writers:
         raise RecordingError(f"export to {to!r}: possible are {', '.join(FORMATS)}")
-    recording = load(path)
-    target = Path(path).with_suffix(f".{to}") if output is None else Path(output)
+    recording = load(files)
+    path = find_files(files)[0]
+    target = path.with_suffix(f".{to}") if output is None else Path(output)
     with _new_file(target) as part:
         ticks = writers[to](recording, part, progress or (lambda _: None))
     size = target.stat().st_size

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rtloop.recording.errors import RecordingError
 from rtloop.recording.events import Event
+from rtloop.recording.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.reader import Reader, Rows, Snapshot
-from rtloop.signals import COMMON, PER_AXIS
+from rtloop.signals import COMMON, DEADLINE, PER_AXIS
 
 Signal = np.ndarray[Any, Any]
 SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": "Hz"}
@@ -27,16 +25,15 @@ class Recording:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self.paths = tuple(paths)
         self._signals: dict[str, Signal] = {}
-        with self._readers() as readers:
-            readers.sort(key=lambda reader: reader.header.get("sequence", 1))
+        self.problems: list[str] = []
+        with Parts(paths) as readers:
             self.paths = tuple(reader.path for reader in readers)
             self.header: dict[str, Any] = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
-            self.problems = [problem for reader in readers for problem in reader.problems]
-            self.problems += _check_set(readers)
+            self.problems += absent_parts(readers)
+            self._note_problems(readers)
 
     @property
     def configuration(self) -> str:
@@ -68,10 +65,9 @@ class Recording:
 
     def read(self, *names: str) -> list[Signal]:
         """Several signals in one pass over the files."""
-        missing = [name for name in names if name not in self._signals]
+        missing = [name for name in dict.fromkeys(names) if name not in self._signals]
         if missing:
-            with self._readers() as readers:
-                blocks = [rows for reader in readers for rows in reader.blocks(missing)]
+            blocks = list(self.blocks(missing))
             for index, name in enumerate(missing):
                 parts = [rows[:, index] for rows in blocks]
                 signal = np.concatenate(parts) if parts else np.empty(0)
@@ -81,47 +77,42 @@ class Recording:
 
     def blocks(self, names: Sequence[str] | None = None) -> Iterator[Rows]:
         """Arrays (n, names) of consecutive ticks, for what does not fit into memory."""
-        with self._readers() as readers:
+        with Parts(self.paths) as readers:
             for reader in readers:
                 yield from reader.blocks(names)
+            self._note_problems(readers)
 
-    def snapshots(self) -> list[Snapshot]:
+    def between(self, names: Sequence[str], start_s: float, end_s: float) -> Iterator[Rows]:
+        """Arrays (n, names) of the ticks that were due between two times; chunks outside are not read."""
+        with Parts(self.paths) as readers:
+            for reader in readers:
+                entries = reader.chunks_between(start_s, end_s)
+                for rows in reader.blocks([self.columns[DEADLINE], *names], entries):
+                    inside = (rows[:, 0] >= start_s * 1e9) & (rows[:, 0] <= end_s * 1e9)
+                    if inside.all():
+                        yield rows[:, 1:]
+                    elif inside.any():
+                        yield rows[inside, 1:]
+            self._note_problems(readers)
+
+    def snapshots(self) -> Iterator[Snapshot]:
         """The recorded states of the law, in order."""
-        with self._readers() as readers:
-            return [snapshot for reader in readers for snapshot in reader.snapshots()]
+        with Parts(self.paths) as readers:
+            for reader in readers:
+                yield from reader.snapshots()
+            self._note_problems(readers)
 
-    def _readers(self) -> _Readers:
-        return _Readers(self.paths)
-
-
-class _Readers(ExitStack):
-    """Readers of several files, closed together."""
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        super().__init__()
-        self._paths = paths
-
-    def __enter__(self) -> list[Reader]:  # type: ignore[override]
-        try:
-            return [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
-        except BaseException:
-            self.close()
-            raise
+    def _note_problems(self, readers: Sequence[Reader]) -> None:
+        found = [problem for reader in readers for problem in reader.problems]
+        self.problems += [problem for problem in found if problem not in self.problems]
 
 
-def load(path: Path | str | Sequence[Path | str]) -> Recording:
+def load(path: Files) -> Recording:
     """Open a recording: a file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order.
 
     Raises RecordingError.
     """
-    given = [path] if isinstance(path, str | Path) else list(path)
-    paths: list[Path] = []
-    for item in given:
-        found = sorted(glob.glob(str(item))) if glob.has_magic(str(item)) and not Path(item).exists() else [str(item)]
-        paths += map(Path, found)
-    if not paths:
-        raise RecordingError(f"{path}: no such file")
-    return Recording(paths)
+    return Recording(find_files(path))
 
 
 def unit_of(name: str) -> str:
@@ -130,16 +121,3 @@ def unit_of(name: str) -> str:
         if name == signal.name or name.endswith(f"_{signal.name}"):
             return signal.unit
     return SUFFIX_UNITS.get(name.rpartition("_")[2], "")
-
-
-def _check_set(readers: Sequence[Reader]) -> list[str]:
-    """What is missing between the files of one run. Raises RecordingError where they are not of one run."""
-    first = readers[0].header
-    for reader in readers[1:]:
-        if any(reader.header.get(key) != first.get(key) for key in ("created_unix_ns", "name", "columns")):
-            raise RecordingError(f"{reader.path}: is not of the same run as {readers[0].path}")
-    numbers = [reader.header.get("sequence", 1) for reader in readers]
-    if len(set(numbers)) != len(numbers):
-        raise RecordingError(f"{readers[0].path}: the same part of the run is given twice")
-    absent = sorted(set(range(1, max(numbers) + 1)) - set(numbers))
-    return [f"part {number} of the run is missing" for number in absent]

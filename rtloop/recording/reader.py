@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -90,6 +91,18 @@ class Reader:
     def tick_chunks(self) -> list[Entry]:
         """The chunks that may hold ticks."""
         return [entry for entry in self._entries if may_hold(entry, format.TICKS)]
+
+    def chunks_between(self, start_s: float, end_s: float) -> list[Entry]:
+        """The chunks that may hold ticks due between two times, in s since the start of the run."""
+        if start_s <= 0.0 and math.isinf(end_s):
+            return self.tick_chunks
+        start_ns, end_ns = start_s * 1e9 + self.start_unix_ns, end_s * 1e9 + self.start_unix_ns
+        return [
+            entry
+            for entry in self.tick_chunks
+            if entry.index is None
+            or (entry.index.message_end_time >= start_ns - 1e3 and entry.index.message_start_time <= end_ns + 1e3)
+        ]
 
     def blocks(self, names: Sequence[str] | None = None, entries: Iterable[Entry] | None = None) -> Iterator[Rows]:
         """Arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.

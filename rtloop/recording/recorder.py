@@ -85,6 +85,13 @@ class Recorder:
                 time.sleep(pause_s)
 
 
+def _supervisor_gone() -> bool:
+    """Whether stdin has no writer any more; reads nothing from it."""
+    poll = select.poll()
+    poll.register(0, 0)
+    return bool(poll.poll(0))
+
+
 def _stdin_closed() -> bool:
     readable, _, _ = select.select([0], [], [], 0)
     return bool(readable) and os.read(0, 4096) == b""
@@ -103,7 +110,10 @@ def _read_command() -> dict[str, Any]:
 
 def run(fd: int) -> int:
     """Record one run from the shared block at `fd`; returns the exit code."""
-    block = SharedBlock(fd)
+    try:
+        block = SharedBlock.attach(fd, _supervisor_gone)
+    except EOFError:
+        return 0  # there was nothing to record
     recorder = Recorder(block)
     recorder.set_word(Word.RECORDER_STATE, ProcessState.READY)
     totals: dict[str, Any]

@@ -8,6 +8,7 @@ replay goes on from the next snapshot.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,14 +18,15 @@ from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.layout import layout_description, split_snapshot
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.events import message_of
+from rtloop.recording.events import json_value, message_of
 from rtloop.recording.load import Recording
 from rtloop.recording.reader import Snapshot
-from rtloop.recording.rerun import SLICE_TICKS, Law, Rerun
+from rtloop.recording.rerun import Law, Rerun, Rows, Tape
+from rtloop.recording.snapshots import first_difference
 from rtloop.signals import Flag
 
 MEASURED = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
-"""Columns that a clock made and that no output depends on."""
+"""Columns that a clock made and that no output depends on; so is the flag OVERRUN."""
 REPLAYED = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
 Progress = Callable[[int], None]
 
@@ -38,6 +40,7 @@ class ReplayReport:
     gaps: list[dict[str, int]] = field(default_factory=list)
     snapshots: int = 0
     first_difference: dict[str, Any] | None = None
+    problems: list[str] = field(default_factory=list)
 
     @property
     def identical(self) -> bool:
@@ -53,12 +56,15 @@ class ReplayReport:
             "unverified": self.unverified,
             "gaps": self.gaps,
             "snapshots_compared": self.snapshots,
+            "problems": self.problems,
         }
 
 
 def replay(recording: Recording, progress: Progress | None = None) -> ReplayReport:
     """Replay up to the first difference. Raises RecordingError for a recording of another layout, or without a law."""
-    return _Replay(recording, progress).run()
+    check_layout(recording)
+    with closing(recording.snapshots()) as snapshots:
+        return _Replay(recording, snapshots, progress).run()
 
 
 def check_layout(recording: Recording) -> None:
@@ -71,94 +77,110 @@ def check_layout(recording: Recording) -> None:
         )
 
 
-def recorded_commands(recording: Recording, axes: list[str]) -> np.ndarray[Any, Any]:
+def recorded_commands(recording: Recording) -> np.ndarray[Any, Any]:
     """The commands that took effect, as a schedule; those for references are not needed, whose samples are inputs."""
-    commands = [message_of(event, axes) for event in recording.events]
+    commands = [message_of(event, recording.header["axes"]) for event in recording.events]
     parts = [command for command in commands if command is not None and command["kind"][0] in REPLAYED]
     return np.concatenate([np.zeros(0, MESSAGE), *parts])
 
 
+def consecutive(rows: Rows) -> list[Rows]:
+    """The rows, split where ticks are missing."""
+    return np.split(rows, np.flatnonzero(np.diff(rows[:, signals.TICK]) != 1) + 1)
+
+
 class _Replay:
-    def __init__(self, recording: Recording, progress: Progress | None) -> None:
-        check_layout(recording)
-        self._recording, self._progress = recording, progress
-        self._axes: list[str] = recording.header["axes"]
-        self._commands = recorded_commands(recording, self._axes)
-        self._compared = [i for i in range(len(recording.columns)) if i not in MEASURED]
-        self._snapshots: Iterator[Snapshot] = iter(recording.snapshots())
-        self._next: Snapshot | None = next(self._snapshots, None)
+    def __init__(self, recording: Recording, snapshots: Iterator[Snapshot], progress: Progress | None) -> None:
+        self._recording, self._snapshots, self._progress = recording, snapshots, progress
+        self._commands = recorded_commands(recording)
+        self._next: Snapshot | None = next(snapshots, None)
         self._rerun: Rerun | None = None
-        self._report = ReplayReport()
+        self._report = ReplayReport(problems=recording.problems)
 
     def run(self) -> ReplayReport:
+        """Replay all blocks, up to the first difference."""
         expected: int | None = None
-        for block in self._recording.blocks():
-            breaks = np.flatnonzero(np.diff(block[:, signals.TICK]) != 1) + 1
-            for rows in np.split(block, breaks):
-                first = int(rows[0, signals.TICK])
-                if expected is not None and first != expected:
-                    self._report.gaps.append({"first_tick": expected, "count": first - expected})
-                    self._rerun = None
-                expected = first + len(rows)
-                self._consume(rows)
+        with closing(self._recording.blocks()) as blocks:
+            for block in blocks:
+                for rows in consecutive(block):
+                    first = int(rows[0, signals.TICK])
+                    if expected is not None and first != expected:
+                        self._report.gaps.append({"first_tick": expected, "count": first - expected})
+                        self._rerun = None
+                    expected = first + len(rows)
+                    self._consume(rows)
                 if self._report.first_difference:
                     return self._report
-            if self._progress:
-                self._progress(self._report.ticks)
+                if self._progress:
+                    self._progress(self._report.ticks)
         if not self._report.ticks:
-            raise RecordingError(
-                f"{self._recording.paths[0]}: holds no tick after a snapshot of the law to replay from"
-            )
+            path = self._recording.paths[0]
+            raise RecordingError(f"{path}: holds no tick after a snapshot of the law to replay from")
         return self._report
 
-    def _consume(self, rows: np.ndarray[Any, Any]) -> None:
+    def _consume(self, rows: Rows) -> None:
         """Replay consecutive rows, in stretches that end where a snapshot lies."""
         while len(rows) and not self._report.first_difference:
             tick = int(rows[0, signals.TICK])
-            while self._next is not None and self._next.tick < tick:
-                self._next = next(self._snapshots, None)
-            if self._next is not None and self._next.tick == tick:
-                self._meet(self._next)
-                self._next = next(self._snapshots, None)
-                if self._report.first_difference:
-                    return
+            self._meet_snapshot(tick)
+            if self._report.first_difference:
+                return
             until = tick + len(rows) if self._next is None else self._next.tick
-            count = min(len(rows), until - tick, SLICE_TICKS)
+            count = min(len(rows), until - tick)
             if self._rerun is None:
                 self._report.unverified += count
             else:
+                count = min(count, self._rerun.room(tick))
                 self._compare(self._rerun, rows[:count])
             rows = rows[count:]
 
-    def _meet(self, snapshot: Snapshot) -> None:
-        """Compare the law's state with a snapshot, or start from it."""
-        tick, coefficients, axes, state = split_snapshot(snapshot.data, len(self._axes))
+    def _meet_snapshot(self, tick: int) -> None:
+        """At a snapshot compare the law's state with it, or start from it."""
+        while self._next is not None and self._next.tick < tick:
+            self._next = next(self._snapshots, None)
+        if self._next is None or self._next.tick != tick:
+            return
+        snapshot, self._next = self._next, next(self._snapshots, None)
         if self._rerun is None:
-            law = Law(coefficients, axes, state)
-            self._rerun = Rerun(self._recording.header, law, self._commands, tick)
+            self._start(snapshot)
             return
         self._report.snapshots += 1
-        if self._rerun.law_bytes() != snapshot.data[8:]:
-            self._report.first_difference = {"tick": tick, "signal": "law state", "recorded": None, "replayed": None}
+        replayed, recorded = self._rerun.law_bytes(), snapshot.data[8:]
+        if replayed != recorded:
+            self._differs(tick, *first_difference(recorded, replayed, self._recording.header["axes"]))
 
-    def _compare(self, rerun: Rerun, rows: np.ndarray[Any, Any]) -> None:
-        replayed = rerun.execute(rows)
+    def _start(self, snapshot: Snapshot) -> None:
+        header = self._recording.header
+        try:
+            _, *law = split_snapshot(snapshot.data, len(header["axes"]))
+        except ValueError as error:
+            raise RecordingError(f"{self._recording.paths[0]}: {error}") from None
+        self._rerun = Rerun(header, Tape(header), Law(*law), self._commands, snapshot.tick)
+
+    def _compare(self, rerun: Rerun, recorded: Rows) -> None:
+        replayed = rerun.execute(recorded)
         count = len(replayed)
-        recorded = rows[:count].copy()
-        for table in (recorded, replayed):
-            overruns = (table[:, signals.FLAGS].astype(np.int64) & ~int(Flag.OVERRUN)).astype(np.float64)
-            table[:, signals.FLAGS] = overruns
-        same = recorded.view(np.uint64) == replayed.view(np.uint64)
-        same = same[:, self._compared]
-        self._report.ticks += count
-        if same.all() and count == len(rows):
-            return
+        same = _same(recorded[:count], replayed)
         if same.all():
-            first, signal, values = count, "end of the run", (None, None)
-        else:
-            first = int(np.argmin(same.all(axis=1)))
-            column = self._compared[int(np.argmin(same[first]))]
-            signal = self._recording.columns[column]
-            values = float(recorded[first, column]), float(replayed[first, column])
-        tick = int(rows[first, signals.TICK])
-        self._report.first_difference = {"tick": tick, "signal": signal, "recorded": values[0], "replayed": values[1]}
+            self._report.ticks += count
+            if count < len(recorded):
+                self._differs(int(recorded[count, signals.TICK]), "end of the run", None, None)
+            return
+        row = int(np.argmin(same.all(axis=1)))
+        column = int(np.argmin(same[row]))
+        self._report.ticks += row + 1
+        values = float(recorded[row, column]), float(replayed[row, column])
+        self._differs(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
+
+    def _differs(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
+        values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
+        self._report.first_difference = {"tick": tick, "signal": signal, **values}
+
+
+def _same(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
+    """Which values are equal in bytes; what was measured counts as equal."""
+    same = recorded.view(np.uint64) == replayed.view(np.uint64)
+    same[:, MEASURED] = True
+    flags = [table[:, signals.FLAGS].astype(np.int64) | int(Flag.OVERRUN) for table in (recorded, replayed)]
+    same[:, signals.FLAGS] = flags[0] == flags[1]
+    return same

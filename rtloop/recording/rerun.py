@@ -1,13 +1,13 @@
-"""A loop that runs on recorded inputs: the playback driver in place of hardware and clock."""
+"""The compiled loop on recorded references and commands, with recorded inputs or another source in place of hardware."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from drivers.base import Channel, Facts, Wiring
+from drivers.base import Channel, Facts, Pointers, Wiring
 from drivers.playback import TIMING_COLUMNS, Playback
 from rtloop import signals
 from rtloop.engine.assembly import Assembly, LawArrays
@@ -18,75 +18,98 @@ from rtloop.law.reference import GENERATOR, Generator
 from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048
+SMALLEST_RING_HZ = 1.0
+"""A ring of the least size: it holds a slice, and stays in the processor's cache."""
 UNLIMITED_SLACK = 1 << 62
 Law = LawArrays
+Rows = np.ndarray[Any, Any]
+
+
+class Source(Protocol):
+    """Where a rerun's inputs come from."""
+
+    facts: Facts
+    wiring: dict[str, Wiring]
+
+    def pointers(self) -> Pointers:
+        """What the loop calls."""
+        ...
+
+    def load(self, rows: Rows) -> None:
+        """Prepare for the ticks that were recorded as `rows`, at most SLICE_TICKS."""
+        ...
+
+
+class Tape:
+    """Recorded inputs, times, driver status and observed signals, through the playback driver."""
+
+    def __init__(self, header: Mapping[str, Any]) -> None:
+        axes, observed = header["axes"], tuple(header["observed"])
+        channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
+        self.facts = Facts(channels[0], channels[1], observed, real=False)
+        self.wiring = {axis: Wiring(f"{axis} in", f"{axis} out") for axis in axes}
+        self._columns, self._axes, self._observed = len(header["columns"]), len(axes), len(observed)
+        self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + self._axes + 1 + self._observed), np.nan)
+        self._playback = Playback()
+
+    def pointers(self) -> Pointers:
+        """The playback driver's."""
+        return self._playback.pointers()
+
+    def load(self, rows: Rows) -> None:
+        """Lay out the rows as the playback driver hands them out."""
+        tape, first = self._rows[: len(rows)], TIMING_COLUMNS + 1
+        tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
+        lost = (rows[:, signals.FLAGS].astype(np.int64) & int(Flag.HEARTBEAT_LOST)) != 0
+        tape[:, 3] = np.where(lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again
+        tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
+        for axis in range(self._axes):
+            tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
+        tape[:, first + self._axes] = rows[:, signals.SAMPLE_AGE]
+        if self._observed:
+            tape[:, first + self._axes + 1 :] = rows[:, self._columns - self._observed :]
+        self._playback.load(tape)
 
 
 class Rerun:
-    """The compiled loop with the law `law`, about to execute `first_tick`, under the commands of a recording."""
+    """The loop with the law `law`, about to execute `first_tick`, under the commands of a recording."""
 
-    def __init__(self, header: Mapping[str, Any], law: Law, commands: np.ndarray[Any, Any], first_tick: int) -> None:
-        axes: list[str] = header["axes"]
-        self._columns = len(header["columns"])
-        self._observed = len(header["observed"])
-        self._law, self._tape = law, Playback()
-        inputs = tuple(Channel(f"{axis} in") for axis in axes)
-        outputs = tuple(Channel(f"{axis} out") for axis in axes)
-        plan = Plan(
-            name="replay",
-            axes=tuple(axes),
-            pacing=Pacing(header["rate_hz"], paced=False),
-            ticks=None,
-            driver_kind="playback",
-            driver_options={},
-            wiring={axis: Wiring(f"{axis} in", f"{axis} out") for axis in axes},
-            coefficients=law.coefficients,
-            mode=Mode.OFF,
-            generators=np.zeros(len(axes), GENERATOR),
-            table=np.zeros(SLICE_TICKS * len(axes)),
-            schedule=commands[commands["tick"] >= first_tick],
-            observed=tuple(header["observed"]),
-        )
-        facts = Facts(inputs, outputs, plan.observed, real=False)
-        self._block, context = SharedBlock.create(plan.sizes), clock_context(header["rate_hz"])
-        ring = self._block.ring("ticks")
-        clock = unpaced_clock(context, ring.head, self._block.words, Word.RECORDER_CURSOR, UNLIMITED_SLACK)
-        self._keep = context
-        self._assembly = Assembly(plan, self._block, facts, self._tape.pointers(), clock, law)
-        self._assembly.loop.tick = first_tick
+    def __init__(
+        self, header: Mapping[str, Any], source: Source, law: Law, commands: np.ndarray[Any, Any], first_tick: int
+    ) -> None:
+        self._law, self._source = law, source
+        plan = _plan(header, source, law, commands[commands["tick"] >= first_tick])
+        self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
+        self._slots = self._block["ticks_slots"]
+        self._context = clock_context(header["rate_hz"])
+        self._context.index = first_tick
+        head, words = self._block.ring("ticks").head, self._block.words
+        clock = unpaced_clock(self._context, head, words, Word.RECORDER_CURSOR, UNLIMITED_SLACK)
+        self._assembly = Assembly(plan, self._block, source.facts, source.pointers(), clock, law)
         self._assembly.loop.next_snapshot = np.iinfo(np.int64).max
 
-    def execute(self, rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Records (m, columns) of re-executing `rows` (n ≤ SLICE_TICKS, columns); m < n where the loop ended."""
-        first = self._assembly.loop.tick
-        self._tape.load(self._tape_of(rows))
+    def room(self, tick: int) -> int:
+        """Ticks from `tick` on that one call can execute."""
+        return min(SLICE_TICKS, len(self._slots) - tick % len(self._slots))
+
+    def execute(self, rows: Rows) -> Rows:
+        """Records (m, columns) of executing `rows` (n ≤ room, columns), valid until the next call.
+
+        m < n where the loop ended. Ticks that are missing in front of `rows` are passed over.
+        """
+        first = int(rows[0, signals.TICK])
+        self._assembly.loop.tick = first
+        self._source.load(rows)
         self._load_references(rows, first)
         self._assembly.run(first + len(rows))
-        executed = self._assembly.loop.tick - first
-        slots = self._block["ticks_slots"]
-        return slots[(first + np.arange(executed)) & (len(slots) - 1)]
+        start = first % len(self._slots)
+        return self._slots[start : start + int(self._assembly.loop.tick) - first]
 
     def law_bytes(self) -> bytes:
         """Coefficients and state as a snapshot holds them."""
         return b"".join(part.tobytes() for part in self._law)
 
-    def _tape_of(self, rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Times, status, inputs, age and observed signals of each row, as the playback driver hands them out."""
-        axes = len(self._law.axes)
-        tape = np.full((len(rows), TIMING_COLUMNS + 1 + axes + 1 + self._observed), np.nan)
-        tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
-        lost = (rows[:, signals.FLAGS].astype(np.int64) & int(Flag.HEARTBEAT_LOST)) != 0
-        tape[lost, 3] = np.inf  # a heartbeat that was found too old is too old again
-        tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
-        first = TIMING_COLUMNS + 1
-        for axis in range(axes):
-            tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
-        tape[:, first + axes] = rows[:, signals.SAMPLE_AGE]
-        if self._observed:
-            tape[:, first + axes + 1 :] = rows[:, self._columns - self._observed :]
-        return tape
-
-    def _load_references(self, rows: np.ndarray[Any, Any], first_tick: int) -> None:
+    def _load_references(self, rows: Rows, first_tick: int) -> None:
         """Recorded references, as a table that starts with these rows; commands cannot change them."""
         table, generators = self._block["table"], self._assembly.generators
         for axis in range(len(self._law.axes)):
@@ -95,3 +118,22 @@ class Rerun:
             generators["kind"][axis] = Generator.TABLE
             generators["parameters"][axis, :4] = start, len(rows), 1, 0
             generators["start_tick"][axis] = generators["held_until"][axis] = first_tick
+
+
+def _plan(header: Mapping[str, Any], source: Source, law: Law, commands: np.ndarray[Any, Any]) -> Plan:
+    axes = tuple(header["axes"])
+    return Plan(
+        name="rerun",
+        axes=axes,
+        pacing=Pacing(header["rate_hz"], paced=False),
+        ticks=None,
+        driver_kind="playback",
+        driver_options={},
+        wiring=source.wiring,
+        coefficients=law.coefficients,
+        mode=Mode.OFF,
+        generators=np.zeros(len(axes), GENERATOR),
+        table=np.zeros(SLICE_TICKS * len(axes)),
+        schedule=commands,
+        observed=source.facts.observed,
+    )

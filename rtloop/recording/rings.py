@@ -11,11 +11,11 @@ from rtloop.engine.ring import drain
 
 
 class RingReader:
-    """Reads the ring `name` of `block` from its beginning."""
+    """Reads the ring `name` of `block` from `position` on."""
 
-    def __init__(self, block: SharedBlock, name: str) -> None:
+    def __init__(self, block: SharedBlock, name: str, position: int = 0) -> None:
         self._ring = block.ring(name)
-        self.position, self.lost = 0, 0
+        self.position, self.lost = position, 0
 
     def take_into(self, out: np.ndarray[Any, Any]) -> tuple[int, int]:
         """Copy whole slots into `out` as far as it reaches; returns (slots copied, slots lost in front of them)."""

@@ -25,6 +25,7 @@ from rtloop.recording.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 
 FLUSH_S = 0.5
+FLUSHED = {"ticks": Word.FLUSHED_TICKS, "snapshots": Word.FLUSHED_SNAPSHOTS, "events": Word.FLUSHED_EVENTS}
 NS_PER_S = 1e9
 
 
@@ -35,6 +36,8 @@ class Options(NamedTuple):
     rotate_s: float | None = None
     min_free_bytes: int = 64 << 20
     message_index: bool = False
+    sequence: int = 1
+    """Number of the first file: above 1 where another recorder of the same run died."""
 
 
 class Session:
@@ -46,11 +49,12 @@ class Session:
         self._fill, self._written_s = 0, time.monotonic()
         self._anchor = (0.0, 0.0)
         self._ticks, self._snapshots, self._events = (
-            RingReader(block, name) for name in ("ticks", "snapshots", "events")
+            RingReader(block, name, int(block.words[word])) for name, word in FLUSHED.items()
         )
         self._pending: list[tuple[int, Message]] = []
         self._paths: list[Path] = []
-        self._first_tick, self._logged, self._bytes = 0, 0, 0
+        self._first_tick, self._logged, self._bytes = self._ticks.position, 0, 0
+        self._begin_tick = self._first_tick
         self.error: str | None = None
         self._writer = self._open(header["created_unix_ns"] if header["paced"] else 0)
 
@@ -92,7 +96,7 @@ class Session:
         """Write the rest and the end; returns the totals that the recorder prints."""
         self._write(self._fill, self._pending)
         self._close(FINISHED, result, self.cursor)
-        lost = self.cursor - self._logged
+        lost = self.cursor - self._begin_tick - self._logged
         return {
             "path": str(self._paths[-1]),
             "paths": [str(path) for path in self._paths],
@@ -105,13 +109,14 @@ class Session:
         }
 
     def _complete(self, lost: int, result: str) -> bool:
-        return lost == 0 and self._events.lost == 0 and self.error is None and result != "failed"
+        return lost == 0 and self._events.lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
     def _open(self, log_time: int) -> Writer:
         path, header = self._path, self._header
-        if self._options.rotate_bytes or self._options.rotate_s:
-            path = path.with_name(f"{path.stem}-{len(self._paths) + 1:04d}{path.suffix}")
-            header = {**header, "sequence": len(self._paths) + 1, "first_tick": self._first_tick}
+        if self._options.rotate_bytes or self._options.rotate_s or self._options.sequence > 1:
+            sequence = len(self._paths) + self._options.sequence
+            path = path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
+            header = {**header, "sequence": sequence, "first_tick": self._first_tick}
         self._paths.append(path)
         return Writer(
             path,
@@ -170,9 +175,16 @@ class Session:
                 self.error = str(error)
         if count:
             self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
+        self._say_flushed(count)
         rest = self._fill - count
         self._rows[:rest] = self._rows[count : self._fill].copy()
         self._fill = rest
+
+    def _say_flushed(self, count: int) -> None:
+        """Positions up to which everything is in the file, or lost."""
+        if count == self._fill:
+            for reader, word in zip((self._ticks, self._snapshots, self._events), FLUSHED.values(), strict=True):
+                self._block.words[word] = reader.position
 
     def _start_unix_ns(self) -> int:
         """Virtual time starts at 0, so that two unpaced runs are logged alike."""

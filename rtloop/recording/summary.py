@@ -3,78 +3,22 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from rtloop.recording.histogram import Histogram
+from rtloop.recording.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.reader import Reader
 from rtloop.signals import Flag, Mode
 
 MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED)
-NS_PER_US = 1000.0
-CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 BATCH_ROWS = 1 << 18
+"""More than any chunk holds."""
 
-
-class Histogram:
-    """Counts of times in whole nanoseconds; beyond `LINEAR_NS` in steps of 2⁻¹² of their size."""
-
-    LINEAR_NS = 1 << 20
-    STEPS = 1 << 12
-
-    def __init__(self) -> None:
-        self._counts = np.zeros(self.LINEAR_NS, np.int64)
-        self._large: dict[int, int] = {}
-        self._maximum = -math.inf
-
-    def add(self, values_us: np.ndarray[Any, Any]) -> None:
-        """Count values in µs; NaN is not counted."""
-        if not len(values_us) or np.isnan(values_us.max()):
-            values_us = values_us[np.isfinite(values_us)]
-        if not len(values_us):
-            return
-        self._maximum = max(self._maximum, float(values_us.max()))
-        ns = np.maximum(values_us, 0.0) * NS_PER_US + 0.5
-        large = ns >= self.LINEAR_NS
-        if large.any():
-            self._add_large(ns[large])
-            ns = ns[~large]
-        counts = np.bincount(ns.astype(np.int64))
-        self._counts[: len(counts)] += counts
-
-    def _add_large(self, ns: np.ndarray[Any, Any]) -> None:
-        fraction, exponent = np.frexp(ns)
-        rounded = np.ldexp(np.floor(fraction * 2 * self.STEPS) / (2 * self.STEPS), exponent)
-        for value, count in zip(*np.unique(rounded, return_counts=True), strict=True):
-            self._large[int(value)] = self._large.get(int(value), 0) + int(count)
-
-    def quantiles_us(self, *quantiles: float) -> list[float | None]:
-        """The smallest recorded value that at least this share of all values does not exceed."""
-        large = sorted(self._large.items())
-        values = np.concatenate([np.arange(self.LINEAR_NS), np.array([value for value, _ in large], np.int64)])
-        below = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
-        if below[-1] == 0:
-            return [None] * len(quantiles)
-        ranks = [max(math.ceil(quantile * below[-1]), 1) for quantile in quantiles]
-        return [float(values[np.searchsorted(below, rank)]) / NS_PER_US for rank in ranks]
-
-    def classes(self) -> list[dict[str, Any]]:
-        """Counts below each of CLASSES_US, and None for the rest; empty where nothing was measured."""
-        edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
-        small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]
-        small[-1] += sum(self._large.values())
-        if not sum(small):
-            return []
-        return [{"below_us": edge, "count": count} for edge, count in zip((*CLASSES_US, None), small, strict=True)]
-
-    def report(self) -> dict[str, float] | None:
-        """p50, p99, p999 and max in µs; None where nothing was measured."""
-        p50, p99, p999 = self.quantiles_us(0.5, 0.99, 0.999)
-        if p50 is None or p99 is None or p999 is None:
-            return None
-        return {"p50": p50, "p99": p99, "p999": p999, "max": self._maximum}
+Progress = Callable[[int], None]
 
 
 class AxisSums:
@@ -126,56 +70,70 @@ class Totals:
         return (self.last[1] - self.first[1]) / 1e9 if self.first else 0.0
 
 
-def summarise(path: Path | str) -> dict[str, Any]:
-    """The object of `rtloop info --json`, tolerant of damage, which it names. Raises RecordingError."""
-    with Reader(path, tolerant=True) as reader:
-        totals = _sum_up(reader)
-        events, finished = reader.events, reader.totals
-        header, rate_hz = reader.header, float(reader.header["rate_hz"])
-        executed = finished["ticks_executed"] if finished else int(totals.last[0]) + 1 if totals.first else 0
-        lost = executed - header.get("first_tick", 0) - totals.ticks
-        reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
-        return {
-            "recording": str(reader.path),
-            "name": header.get("name"),
-            "ticks_expected": header.get("ticks_expected"),
-            "ticks_logged": totals.ticks,
-            "ticks_lost": lost,
-            "periods_missed": totals.periods_missed,
-            "rate_hz": rate_hz,
-            "achieved_rate_hz": (totals.ticks - 1) / totals.span_s if totals.span_s else None,
-            "duration_s": totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
-            "paced": header["paced"],
-            "overruns": totals.overruns,
-            "lateness_us": reports["lateness_us"],
-            "lateness_histogram": totals.histograms["lateness_us"].classes(),
-            "exec_us": reports["exec_us"],
-            "phases": {name: report and report["p50"] for name, report in reports.items() if name in MEASURED[2:]},
-            "complete": bool(finished and finished["complete"] and lost == 0 and not reader.problems),
-            "result": finished["result"] if finished else None,
-            "problems": reader.problems,
-            "realtime": header.get("realtime"),
-            "axes": [axis.report() for axis in totals.axes],
-            "trips": [
-                {"tick": event["tick"], "causes": event["what"]["causes"]}
-                for event in events
-                if event["kind"] == "tripped"
-            ],
-            "events": len(events),
-            "size_bytes": reader.size_bytes,
-            "bytes_per_tick": reader.size_bytes / totals.ticks if totals.ticks else None,
-        }
+def summarise(path: Files, progress: Progress | None = None) -> dict[str, Any]:
+    """The object of `rtloop info --json`, tolerant of damage, which it names; a rotated run is summed up as one.
+
+    Raises RecordingError.
+    """
+    with Parts(find_files(path)) as readers:
+        totals = _sum_up(readers, progress)
+        return _report(readers, totals)
 
 
-def _sum_up(reader: Reader) -> Totals:
-    axes = reader.header["axes"]
+def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
+    header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
+    events = [event for reader in readers for event in reader.events]
+    ends = [reader.totals for reader in readers]
+    finished = ends[-1]
+    executed = finished["ticks_executed"] if finished else int(totals.last[0]) + 1 if totals.first else 0
+    lost = executed - header.get("first_tick", 0) - totals.ticks
+    problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
+    whole = all(end and end["complete"] for end in ends) and lost == 0 and not problems
+    reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
+    size_bytes = sum(reader.size_bytes for reader in readers)
+    return {
+        "recording": str(readers[0].path),
+        "parts": [str(reader.path) for reader in readers],
+        "name": header.get("name"),
+        "ticks_expected": header.get("ticks_expected"),
+        "ticks_logged": totals.ticks,
+        "ticks_lost": lost,
+        "periods_missed": totals.periods_missed,
+        "rate_hz": rate_hz,
+        "achieved_rate_hz": (totals.ticks - 1) / totals.span_s if totals.span_s else None,
+        "duration_s": totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
+        "paced": header["paced"],
+        "overruns": totals.overruns,
+        "lateness_us": reports["lateness_us"],
+        "lateness_histogram": totals.histograms["lateness_us"].classes(),
+        "exec_us": reports["exec_us"],
+        "phases": {name: report and report["p50"] for name, report in reports.items() if name in MEASURED[2:]},
+        "complete": whole,
+        "result": finished["result"] if finished else None,
+        "problems": problems,
+        "realtime": header.get("realtime"),
+        "host": header.get("host"),
+        "axes": [axis.report() for axis in totals.axes],
+        "trips": [
+            {"tick": event["tick"], "causes": event["what"]["causes"]} for event in events if event["kind"] == "tripped"
+        ],
+        "events": len(events),
+        "size_bytes": size_bytes,
+        "bytes_per_tick": size_bytes / totals.ticks if totals.ticks else None,
+    }
+
+
+def _sum_up(readers: Sequence[Reader], progress: Progress | None) -> Totals:
+    axes = readers[0].header["axes"]
     totals = Totals(axes)
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]
     batch, fill = np.empty((len(names), BATCH_ROWS)), 0
-    for rows in reader.blocks(names):
+    for rows in (rows for reader in readers for rows in reader.blocks(names)):
         if fill + len(rows) > BATCH_ROWS:
             totals.add(dict(zip(names, batch[:, :fill], strict=True)))
             fill = 0
+            if progress:
+                progress(totals.ticks)
         batch[:, fill : fill + len(rows)] = rows.T
         fill += len(rows)
     if fill:

@@ -10,18 +10,16 @@ import sys
 import threading
 from typing import Any
 
-from rtloop.engine.memory import SharedBlock
-
 
 class Child:
     """`python -m MODULE --fd N`, in a process group of its own so that a terminal's Ctrl-C reaches the parent alone."""
 
-    def __init__(self, module: str, block: SharedBlock) -> None:
+    def __init__(self, module: str, fd: int) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", module, "--fd", str(block.fd)],
+            [sys.executable, "-m", module, "--fd", str(fd)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            pass_fds=[block.fd],
+            pass_fds=[fd],
             process_group=0,
         )
         self._reports: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()

@@ -7,6 +7,7 @@ older than its limit.
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import threading
 import time
@@ -29,6 +30,8 @@ HEARTBEAT_PERIOD_S = 0.02
 POLL_S = 0.02
 END_TIMEOUT_S = 30.0
 START_TIMEOUT_S = 120.0
+START_TIME_FIELD = 19
+"""Of /proc/PID/stat, counted after the process's name."""
 
 
 @dataclass
@@ -43,14 +46,35 @@ class RunResult:
     exit_code: int = 0
 
 
-class Supervisor:
-    """Runs a plan once, recording to `recording` (without its `.part`)."""
+class Processes:
+    """Loop and recorder, started before there is anything for them to do: they import while a plan is prepared."""
 
-    def __init__(self, prepared: Prepared, recording: Path) -> None:
+    def __init__(self) -> None:
+        self.fd = SharedBlock.reserve()
+        self.loop = Child("rtloop.engine.process", self.fd)
+        self.recorder = Child("rtloop.recording.recorder", self.fd)
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for child in (self.loop, self.recorder):
+            child.close_stdin()
+        for child in (self.loop, self.recorder):
+            child.wait(END_TIMEOUT_S)
+            child.end()
+
+
+class Supervisor:
+    """Runs a plan once in `processes`, recording to `recording` (without its `.part`)."""
+
+    def __init__(self, processes: Processes, prepared: Prepared, recording: Path) -> None:
         self.prepared = prepared
         self.recording = recording
-        self.block = SharedBlock.create(prepared.plan.sizes)
+        self.block = SharedBlock.create(prepared.plan.sizes, processes.fd)
+        self._loop, self._recorder = processes.loop, processes.recorder
         self.realtime: dict[str, Any] = {}
+        self.startup_s: float | None = None
         self._done = threading.Event()
         self._reports: dict[str, dict[str, Any]] = {}
 
@@ -70,13 +94,13 @@ class Supervisor:
         """Start, watch and end everything. Raises RtloopError for what prevented the run."""
         beat = threading.Thread(target=self._beat, daemon=True)
         beat.start()
-        loop = Child("rtloop.engine.process", self.block)
-        recorder = Child("rtloop.recording.recorder", self.block)
+        loop, recorder = self._loop, self._recorder
         try:
             loop.send(pickle.dumps(self.prepared.plan))
             self._await_ready(loop, recorder)
             self._start_recorder(recorder)
             self.block.words[Word.GO] = 1
+            self.startup_s = seconds_since_start()
             while loop.exit_code is None:
                 self._collect("loop", loop)
                 if on_progress is not None:
@@ -85,11 +109,9 @@ class Supervisor:
             return self._finish(loop, recorder)
         finally:
             self.stop()
+            if loop.wait(END_TIMEOUT_S) is None:
+                loop.end()
             self._done.set()
-            for child in (loop, recorder):
-                child.close_stdin()
-                child.wait(END_TIMEOUT_S)
-                child.end()
             beat.join()
 
     def _beat(self) -> None:
@@ -183,6 +205,13 @@ class Supervisor:
         except DriverError as error:
             return f"its outputs could not be parked: {error}"
         return "its outputs were parked in its place"
+
+
+def seconds_since_start() -> float:
+    """Age of this process in s, interpreter start and imports included."""
+    after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    started_s = int(after_name[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - started_s
 
 
 def _ending(code: int | None) -> str:

@@ -18,7 +18,7 @@ from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
 from rtloop.law.reference import GENERATOR
 
 SOURCE = Path(__file__).parent / "c"
-OPTIONS = ("-O3", "-march=native", "-ffp-contract=off", "-std=gnu11", "-Wall", "-Wextra", "-fPIC", "-shared")
+OPTIONS = ("-O3", "-mprefer-vector-width=256", "-march=native", "-ffp-contract=off", "-std=gnu11", "-Wall", "-Wextra", "-fPIC", "-shared")
 STRUCTS = {
     "law_coefficients": COEFFICIENTS,
     "law_state": STATE,
@@ -74,7 +74,8 @@ def library() -> ctypes.CDLL:
 def run_law(arrays: tuple[np.ndarray[Any, Any], ...], ticks: int, out: np.ndarray[Any, Any]) -> None:
     """`run_law` of loop.c on coefficients, state, loop state, inputs [V], references and modes (−1: as before)."""
     addresses = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
-    library().run_law(*addresses, ctypes.c_int64(ticks), ctypes.c_void_p(out.ctypes.data))
+    axes, last = ctypes.c_int64(arrays[0].size), (ctypes.c_int64(ticks), ctypes.c_void_p(out.ctypes.data))
+    library().run_law(*addresses[:3], axes, *addresses[3:], *last)
 
 
 def run_loop(run: np.ndarray[Any, Any], until_tick: int) -> None:

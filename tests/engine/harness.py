@@ -98,7 +98,9 @@ class LoopBench:
         self.law = law_at_rest(self.plan)
         self._script = clock
         facts = self.driver.facts
-        self.assembly = Assembly(self.plan, self.block, facts, self.driver.open(), clock.clock if clock else own, self.law)
+        self.assembly = Assembly(
+            self.plan, self.block, facts, self.driver.open(), clock.clock if clock else own, self.law
+        )
         self.outcome = Outcome.DONE
         self._cursors = {"ticks": 0, "events": 0, "snapshots": 0}
 

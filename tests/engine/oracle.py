@@ -1,6 +1,6 @@
 """The linear closed loop written out from the paper's factors: no line of it is shared with what it judges.
 
-    C(s): eq (20)      D(s): eq (5)      e_k = r_k − x_k      v_k = C(z) e      x: D(s) on v held, `latency` ticks later
+C(s): eq (20)      D(s): eq (5)      e_k = r_k − x_k      v_k = C(z) e      x: D(s) on v held, `latency` ticks later
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def as_modes(poles: list, inputs: list, direct) -> Modes:
 
 
 def controller(method: str) -> Modes:
-    """C(z): "tustin" with s = ω₀/tan(ω₀T/2) · (z − 1)/(z + 1), ω₀ = 2π·595.5; "matched" with z = exp(sT), gain at DC."""
+    """C(z): "tustin" by s = ω₀/tan(ω₀T/2) · (z − 1)/(z + 1), ω₀ = 2π·595.5; "matched" by z = exp(sT), gain at DC."""
     with mp.workdps(60):
         zeros, poles = roots(C_ABOVE), roots(C_BELOW)
         if method == "matched":

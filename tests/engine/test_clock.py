@@ -69,7 +69,7 @@ def test_missed_periods_are_counted_and_skipped():
 
 
 def test_a_late_tick_runs_once():
-    """In the loop: missed periods stand in the record of the next tick, each tick has one index, one event begins it."""
+    """In the loop: missed periods stand in the record of the tick after them; one event begins an episode."""
     us = 1000.0
     script = np.array([[0, 20, 0], [100, 120, 0], [700, 790, 5], [800, 820, 0], [1500, 1510, 6]]) * [us, us, 1]
     bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([script, np.zeros(5)])))

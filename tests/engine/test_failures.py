@@ -116,7 +116,9 @@ def test_a_lost_heartbeat_parks():
     assert bench.outcome is Outcome.HEARTBEAT_LOST
     flags = bench.column(rows, "flags").astype(int)
     assert np.all(flags[:101] == 0)
-    assert np.all(flags[101:] & (Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST) == Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST)
+    assert np.all(
+        flags[101:] & (Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST) == Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST
+    )
     np.testing.assert_allclose(bench.column(rows, "x_drive_v")[101:], RAMP, rtol=0, atol=1e-12)
     assert bench.events() == [(101, Kind.TRIPPED, Flag.TRIP_HEARTBEAT, 0.0)]
 

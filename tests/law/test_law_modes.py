@@ -7,8 +7,8 @@ import pytest
 from scipy import signal
 
 from rtloop.signals import Flag, Mode
-from tests.law.harness import EQ_20, EQ_4, PERIOD_S, LawBench, coefficients_of
-from tests.law.oracle import Hysteresis, R, P, sine
+from tests.law.harness import EQ_4, EQ_20, PERIOD_S, LawBench, coefficients_of
+from tests.law.oracle import Hysteresis, P, R, sine
 
 PLAIN = coefficients_of(controller=EQ_20)
 PI = coefficients_of(

@@ -49,7 +49,11 @@ def soak(coefficients, axes, loop, wild, seed, ticks):
         if np.random.random() < 0.003:
             reference[0] = wild[np.random.randint(0, wild.size)]
         if np.random.random() < 0.001:
-            status, age, lost = np.random.randint(-2, 2), wild[np.random.randint(0, wild.size)], np.random.random() < 0.2
+            status, age, lost = (
+                np.random.randint(-2, 2),
+                wild[np.random.randint(0, wild.size)],
+                np.random.random() < 0.2,
+            )
         if np.random.random() < 0.002:
             set_mode(axes, loop, np.random.randint(0, 4) if loop.trip == 0 else 0, False)
         last_v = axes[0].drive_v

@@ -128,6 +128,17 @@ def test_is_not_stopped_by_signals_and_ends_with_the_loop(loop, recorder, tmp_pa
     assert load(tmp_path / "run.mcap").events[-1]["what"]["result"] == "failed"
 
 
+def test_ends_by_itself_when_everybody_else_is_gone(loop, recorder, tmp_path):
+    recorder.start(tmp_path / "run.mcap")
+    loop.run(make_rows(100))
+    recorder.wait_until(lambda: loop.cursor == 100)
+    recorder.process.stdin.close()
+    recorder.process.stdin = None
+    code, totals = recorder.result()
+    assert (code, totals["ticks_logged"], totals["complete"]) == (0, 100, False)
+    assert load(tmp_path / "run.mcap").events[-1]["what"]["result"] == "abandoned"
+
+
 def test_never_overwrites(loop, recorder, tmp_path):
     (tmp_path / "run.mcap").write_bytes(b"precious")
     recorder.start(tmp_path / "run.mcap")

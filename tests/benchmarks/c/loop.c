@@ -7,17 +7,17 @@
 
 void run_law(
     const struct law_coefficients *restrict c, struct law_state *restrict s, struct loop_state *restrict loop,
-    const double *restrict adc_v, const double *restrict references, const int64_t *restrict modes, int64_t ticks,
-    double *restrict out
+    int64_t axes, const double *restrict adc_v, const double *restrict references, const int64_t *restrict modes,
+    int64_t ticks, double *restrict out
 ) {
     for (int64_t k = 0; k < ticks; k++) {
         if (modes[k] >= 0) {
             loop->trip = 0;
             loop->mode = modes[k];
-            s->entering = 1;
+            for (int64_t a = 0; a < axes; a++) s[a].entering = 1;
         }
-        evaluate(c, s, loop, 1, &adc_v[k], &references[k], 0, 0.0, false);
-        update(c, s, loop, 1);
+        evaluate(c, s, loop, axes, &adc_v[k * axes], &references[k * axes], 0, 0.0, false);
+        update(c, s, loop, axes);
         out[4 * k] = s->command_um;
         out[4 * k + 1] = s->demand_v;
         out[4 * k + 2] = s->drive_v;

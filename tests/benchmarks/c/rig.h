@@ -50,8 +50,9 @@ static inline double rig_drive(rig_c c, rig_s s, double value_v) {
 }
 
 static inline double rig_play(double drive_v, double threshold_v, double held_v) {
-    if (drive_v - threshold_v > held_v) return drive_v - threshold_v;
-    return drive_v + threshold_v < held_v ? drive_v + threshold_v : held_v;
+    double low_v = drive_v - threshold_v, high_v = drive_v + threshold_v;
+    double lowered_v = high_v < held_v ? high_v : held_v;
+    return low_v > lowered_v ? low_v : lowered_v;
 }
 
 static inline double rig_disturbance(rig_c c, rig_s s) {
@@ -66,12 +67,14 @@ static inline double rig_disturbance(rig_c c, rig_s s) {
 }
 
 static inline void rig_advance(rig_c c, rig_s s, double dac_v) {
-    double actuator_v = rig_drive(c, s, dac_v), displacement_um = 0;
-    for (int64_t i = 0; i < c->play_count; i++) {
-        double play_v = rig_play(actuator_v, c->thresholds_v[i], s->plays_v[i]);
-        s->plays_v[i] = play_v;
-        displacement_um += c->weights_um_per_v[i] * play_v;
-    }
+    double actuator_v = rig_drive(c, s, dac_v), sums_um[4] = {0};
+    for (unsigned i = 0; i < c->play_count; i += 4)
+        for (unsigned lane = 0; lane < 4; lane++) {
+            double play_v = rig_play(actuator_v, c->thresholds_v[i + lane], s->plays_v[i + lane]);
+            s->plays_v[i + lane] = play_v;
+            sums_um[lane] += c->weights_um_per_v[i + lane] * play_v;
+        }
+    double displacement_um = (sums_um[0] + sums_um[1]) + (sums_um[2] + sums_um[3]);
     double crept_um = displacement_um;
     for (int64_t i = 0; i < c->lag_count; i++) {
         double lag_um = s->lags_um[i];

@@ -1,0 +1,187 @@
+"""The conformance suite of drivers: what the loop relies on, as tests that a backend's own suite inherits.
+
+    from drivers.contract import DriverContract
+
+    class TestMyCard(DriverContract):
+        def driver(self):
+            return MyCard(MyCardOptions(), {"x": Wiring("ai0", "ao0")}, 1000.0)
+
+Then run pytest on it. The outputs are taken through their whole ranges, and beyond: no actuator may hang on them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from drivers.base import ABI_VERSION, Channel, Driver, Facts, Pointers
+
+_FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
+_UNTOUCHED = -123456.789
+_GUARD = 16
+
+
+class Calls:
+    """A driver's pointers, called as the loop calls them."""
+
+    def __init__(self, pointers: Pointers, facts: Facts) -> None:
+        assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; {ABI_VERSION} is needed"
+        assert 0 not in (pointers.read, pointers.write), f"read or write is a null pointer: {pointers}"
+        self._pointers, self._facts = pointers, facts
+        self._read, self._write = _FUNCTION(pointers.read), _FUNCTION(pointers.write)
+
+    def read(self) -> tuple[int, list[float]]:
+        """Status and values: inputs, age in µs, observed. What lies behind them must stay as it was."""
+        count = len(self._facts.inputs) + 1 + len(self._facts.observed)
+        values = (ctypes.c_double * (count + _GUARD))(*[_UNTOUCHED] * (count + _GUARD))
+        status = self._read(self._pointers.context, values)
+        assert values[count:] == [_UNTOUCHED] * _GUARD, f"read wrote more than {count} values: inputs, age, observed"
+        left_out = status >= 0 and _UNTOUCHED in values[:count]
+        assert not left_out, f"read left values out: {count} are needed, got {values[:count]}"
+        return status, values[:count]
+
+    def write(self, volts: Sequence[float]) -> int:
+        """Status of a write of all outputs."""
+        given = (ctypes.c_double * len(volts))(*volts)
+        status = self._write(self._pointers.context, given)
+        assert list(map(str, given)) == list(map(str, map(float, volts))), "write changed the loop's values"
+        return status
+
+
+class DriverContract:
+    """Override `driver`, and `outputs` where what the hardware got can be seen."""
+
+    tolerance_v = 0.01
+    """How far an output may be from what was written: its resolution."""
+
+    def driver(self) -> Driver:
+        """A new driver, not open. Called anew by every test."""
+        raise NotImplementedError
+
+    def outputs(self, driver: Driver) -> Sequence[float] | None:
+        """Volts at the outputs now, in the order of the facts; None where nobody can see them."""
+        return None
+
+    @contextmanager
+    def opened(self) -> Iterator[tuple[Driver, Calls]]:
+        """An open driver and its calls; closed at the end."""
+        driver = self.driver()
+        try:
+            yield driver, Calls(driver.open(), driver.facts)
+        finally:
+            driver.close()
+
+    def test_facts_are_known_before_open(self) -> None:
+        """They make sense, do not change, and cost no touch of the hardware."""
+        driver = self.driver()
+        before, facts = self.outputs(driver), driver.facts
+        for channel in (*facts.inputs, *facts.outputs):
+            ends = channel.minimum_v, channel.maximum_v
+            assert all(map(math.isfinite, ends)), f"{channel}: its range is not finite"
+            assert channel.minimum_v < channel.maximum_v, f"{channel}: its range is empty"
+        for channel in facts.outputs:
+            assert channel.minimum_v <= channel.safe_v <= channel.maximum_v, f"{channel}: safe_v is outside its range"
+        for names in ([c.name for c in facts.inputs], [c.name for c in facts.outputs], facts.observed):
+            assert len(set(names)) == len(names), f"two have the same name: {names}"
+        assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz}; a number above 0 is needed"
+        assert driver.facts == facts, "the facts changed from one look at them to the next"
+        assert self.outputs(driver) == before, "the facts cannot be read without touching the hardware"
+
+    def test_wiring_names_channels(self) -> None:
+        """Every axis has an input and an output that are there."""
+        driver = self.driver()
+        inputs, outputs = ({c.name for c in kind} for kind in (driver.facts.inputs, driver.facts.outputs))
+        for axis, wiring in driver.wiring.items():
+            assert wiring.input in inputs, f"axis {axis}: no input {wiring.input!r}; there are {sorted(inputs)}"
+            assert wiring.output in outputs, f"axis {axis}: no output {wiring.output!r}; there are {sorted(outputs)}"
+
+    def test_close_before_open_is_harmless(self) -> None:
+        """It touches nothing, and the driver can be opened afterwards."""
+        driver = self.driver()
+        before = self.outputs(driver)
+        driver.close()
+        assert self.outputs(driver) == before, "close touched hardware that was never opened"
+        driver.open()
+        driver.close()
+
+    def test_open_gives_pointers(self) -> None:
+        """Integers, of the loop's ABI version, read and write not null."""
+        driver = self.driver()
+        try:
+            pointers = driver.open()
+            Calls(pointers, driver.facts)
+            assert all(isinstance(address, int) for address in pointers), f"addresses are integers: {pointers}"
+        finally:
+            driver.close()
+
+    def test_open_leaves_the_outputs_safe(self) -> None:
+        """Whatever they were before."""
+        with self.opened() as (driver, _):
+            self._require_outputs(driver, [channel.safe_v for channel in driver.facts.outputs], "open")
+
+    def test_read_fills_every_value(self) -> None:
+        """Inputs within their ranges, an age of 0 µs or more, as many observed signals as the facts say; no more."""
+        with self.opened() as (driver, calls):
+            for _ in range(3):
+                calls.write([channel.safe_v for channel in driver.facts.outputs])
+                status, values = calls.read()
+                assert status >= 0, f"read returned {status}"
+                inputs = driver.facts.inputs
+                for channel, value in zip(inputs, values[: len(inputs)], strict=True):
+                    inside = channel.minimum_v <= value <= channel.maximum_v
+                    assert inside, f"{channel}: read gave {value} V, outside its range"
+                age_us, observed = values[len(inputs)], values[len(inputs) + 1 :]
+                assert 0 <= age_us < math.inf, f"the sample's age is {age_us} µs"
+                assert all(map(math.isfinite, observed)), f"observed signals {observed} are not all finite"
+
+    def test_write_accepts_the_whole_range(self) -> None:
+        """From end to end, all outputs at once."""
+        with self.opened() as (driver, calls):
+            for share in (0.0, 0.25, 0.5, 1.0):
+                volts = [_between(channel, share) for channel in driver.facts.outputs]
+                status = calls.write(volts)
+                assert status >= 0, f"write({volts}) returned {status}"
+                self._require_outputs(driver, volts, f"write({volts})")
+
+    def test_nothing_outside_the_range_gets_through(self) -> None:
+        """It is clipped or refused, NaN and infinity too."""
+        with self.opened() as (driver, calls):
+            channels = driver.facts.outputs
+            for excess in (1.0, 1e308, math.inf, -1.0, -1e308, -math.inf, math.nan):
+                calls.write([(c.maximum_v if excess > 0 else c.minimum_v) + excess for c in channels])
+                for channel, volts in zip(channels, self.outputs(driver) or (), strict=False):
+                    inside = channel.minimum_v - self.tolerance_v <= volts <= channel.maximum_v + self.tolerance_v
+                    assert inside, f"{channel}: {volts} V got through to the hardware"
+
+    def test_close_parks_every_output(self) -> None:
+        """At its safe value."""
+        with self.opened() as (driver, calls):
+            calls.write([_between(channel, 0.75) for channel in driver.facts.outputs])
+        self._require_outputs(driver, [channel.safe_v for channel in driver.facts.outputs], "close")
+
+    def test_close_again_and_again(self) -> None:
+        """Without harm."""
+        with self.opened() as (driver, _):
+            driver.close()
+            driver.close()
+
+    def test_open_after_close(self) -> None:
+        """Works as the first time did."""
+        with self.opened() as (driver, calls):
+            calls.write([_between(channel, 0.75) for channel in driver.facts.outputs])
+            driver.close()
+            calls = Calls(driver.open(), driver.facts)
+            assert calls.read()[0] >= 0, "read failed after close and open"
+            assert calls.write([channel.safe_v for channel in driver.facts.outputs]) >= 0, "write failed after open"
+
+    def _require_outputs(self, driver: Driver, wanted: Sequence[float], after: str) -> None:
+        found = self.outputs(driver)
+        if found is not None:
+            far = max(abs(a - b) for a, b in zip(found, wanted, strict=True))
+            assert far <= self.tolerance_v, f"after {after} the outputs are {list(found)}; {list(wanted)} is needed"
+
+
+def _between(channel: Channel, share: float) -> float:
+    return channel.minimum_v + share * (channel.maximum_v - channel.minimum_v)

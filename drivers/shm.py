@@ -1,0 +1,149 @@
+"""Kind `shm`: a board behind shared memory, as `rtloop hil serve` offers it. The board outlives its controller.
+
+Codes are 16 bit over ±10 V. The age of a sample is the time since the board took it: it grows when the board stalls.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from drivers.base import Channel, Driver, Facts, Pointers, Wiring, index_of
+from drivers.errors import DriverError
+from hil import board
+from hil.board import HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, BoardMemory, latest_sample
+from hil.compiled import cfunc
+from hil.monotonic import monotonic_ns
+from hil.options import RigOptions
+from hil.pointers import SIGNATURE, address_pointer, carray
+
+CONTEXT = np.dtype(
+    [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "adc_codes", "copied", "timespec")]
+)
+TRIES = 1000
+NO_SAMPLE = 1
+CONTROLLER_BYTE = 1
+
+
+class ShmOptions(RigOptions):
+    """Where the board's memory is; the rest describes the rig, for `rtloop hil serve`."""
+
+    file: str = "/dev/shm/rtloop-board"
+    board_rate_hz: float | None = Field(default=None, gt=0, le=1e6)
+    """Rate of the board's own clock; the loop's by default."""
+
+
+@cfunc(SIGNATURE)
+def shm_read(context, values):
+    """Volts of the newest sample and its age."""
+    card = carray(context, 1, CONTEXT)[0]
+    words = carray(address_pointer(card.words), board.WORDS, np.uint64)
+    sample_ns = carray(address_pointer(card.sample_ns), 1, np.int64)
+    codes = carray(address_pointer(card.adc_codes), MAX_CHANNELS, np.int64)
+    copied = carray(address_pointer(card.copied), MAX_CHANNELS, np.int64)
+    out = carray(values, card.channels + 1)
+    taken_ns = latest_sample(words, sample_ns, codes, copied, card.channels, TRIES)
+    if taken_ns < 0:
+        out[card.channels] = np.inf
+        return NO_SAMPLE
+    for i in range(card.channels):
+        out[i] = copied[i] * LSB_V
+    out[card.channels] = (monotonic_ns(card.timespec) - taken_ns) * 1e-3
+    return 0
+
+
+@cfunc(SIGNATURE)
+def shm_write(context, values):
+    """Codes nearest to the volts."""
+    card = carray(context, 1, CONTEXT)[0]
+    codes = carray(address_pointer(card.dac_codes), MAX_CHANNELS, np.int64)
+    out = carray(values, card.channels)
+    for i in range(card.channels):
+        code = np.int64(np.rint(out[i] / LSB_V))
+        codes[i] = LOWEST_CODE if code < LOWEST_CODE else (HIGHEST_CODE if code > HIGHEST_CODE else code)
+    return 0
+
+
+class ShmDriver(Driver):
+    """The controller's side of a board."""
+
+    kind = "shm"
+    options_model = ShmOptions
+
+    def __init__(self, options: ShmOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        super().__init__(options, wiring, rate_hz)
+        self._file = options.file
+        self._fd: int | None = None
+        self._memory: BoardMemory | None = None
+        self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
+        if len(wiring) > MAX_CHANNELS:
+            raise ValueError(f"channels: {len(wiring)} axes; a board has at most {MAX_CHANNELS} channels")
+        for axis, (source, sink) in wiring.items():
+            for name, channels in ((source, self.facts.inputs), (sink, self.facts.outputs)):
+                try:
+                    index_of(channels, name)
+                except ValueError as error:
+                    raise ValueError(f"channels.{axis}: {error}") from None
+
+    @property
+    def facts(self) -> Facts:
+        """As many channel pairs as there are axes."""
+        count = len(self.wiring)
+        lowest, highest = LOWEST_CODE * LSB_V, -LOWEST_CODE * LSB_V
+        return Facts(
+            inputs=tuple(Channel(f"adc{i}", lowest, highest) for i in range(count)),
+            outputs=tuple(Channel(f"dac{i}", lowest, highest) for i in range(count)),
+        )
+
+    def open(self) -> Pointers:
+        """Attach to a running board. Raises DriverError where there is none, or another controller has it."""
+        try:
+            self._fd = os.open(self._file, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise DriverError(
+                f"{self._file}: {error.strerror}; start the board with `rtloop hil serve CONFIG`"
+            ) from None
+        try:
+            self._take(self._fd)
+        except DriverError:
+            os.close(self._fd)
+            self._fd = None
+            raise
+        memory = self._memory = BoardMemory(self._fd)
+        copied, timespec = np.zeros(MAX_CHANNELS, np.int64), np.zeros(2, np.int64)
+        context = np.zeros(1, CONTEXT)
+        context["channels"] = len(self.wiring)
+        for name, array in (("words", memory.words), ("sample_ns", memory.sample_ns), ("dac_codes", memory.dac_codes),
+                            ("adc_codes", memory.adc_codes), ("copied", copied), ("timespec", timespec)):  # fmt: skip
+            context[name] = array.ctypes.data
+        self._arrays = context, copied, timespec
+        return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
+
+    def close(self) -> None:
+        """All outputs to 0 V, and the board free for another."""
+        if self._fd is not None and self._memory is not None:
+            self._memory.dac_codes[:] = 0
+            self._memory, self._arrays = None, ()
+            os.close(self._fd)
+            self._fd = None
+
+    def _take(self, fd: int) -> None:
+        """Check that this is a board and that nobody else drives it. Raises DriverError."""
+        if os.fstat(fd).st_size < board.file_bytes():
+            raise DriverError(f"{self._file}: not a board's memory, or its board has not started")
+        facts = BoardMemory(fd).facts
+        if facts["magic"][0] != board.MAGIC:
+            raise DriverError(f"{self._file}: no board is running; start it with `rtloop hil serve CONFIG`")
+        if facts["version"][0] != board.VERSION:
+            raise DriverError(f"{self._file}: board version {facts['version'][0]}, this driver speaks {board.VERSION}")
+        if facts["channels"][0] < len(self.wiring):
+            raise DriverError(f"{self._file}: {facts['channels'][0]} channels, {len(self.wiring)} are needed")
+        try:
+            fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, CONTROLLER_BYTE)
+        except OSError:
+            raise DriverError(f"{self._file}: another controller drives this board") from None

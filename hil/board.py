@@ -1,0 +1,186 @@
+"""The rig as a board of its own: a free-running process with its own clock, behind shared memory that looks like a card.
+
+The controller's side writes DAC codes and reads ADC codes; the board moves the rig at its own rate whether or not
+anybody writes, and holds the last codes like a card does. What it saw at its outputs (lowest, highest, largest step)
+is kept here: evidence that does not come from the process that is judged.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hil.atomics import fence_acquire, fence_release, load_acquire, store_release
+from hil.compiled import jit
+from hil.monotonic import monotonic_ns, sleep_until
+from hil.options import RigOptions
+from hil.rig import advance, build_rig, sample
+
+MAGIC = int.from_bytes(b"rtlboard", "little")
+VERSION = 1
+MAX_CHANNELS = 16
+BITS = 16
+FULL_SCALE_V = 10.0
+LSB_V = 2 * FULL_SCALE_V / 2**BITS
+LOWEST_CODE, HIGHEST_CODE = -(2 ** (BITS - 1)), 2 ** (BITS - 1) - 1
+SLICE_S = 0.02
+BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
+"""First in the file, written once."""
+WORDS, SEQUENCE, FAULT = 8, 0, 1
+"""uint64 words: samples so far (BUSY while one is written), and the fault that a test asks for."""
+NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
+SEEN = np.dtype(
+    [("lowest_v", np.float64), ("highest_v", np.float64), ("largest_step_v", np.float64), ("last_v", np.float64),
+     ("true_position_um", np.float64), ("largest_position_um", np.float64)]
+)  # fmt: skip
+
+
+class BoardMemory:
+    """Arrays over a board's file: `facts`, `words`, `dac_codes`, `adc_codes`, `sample_ns`, `seen`."""
+
+    def __init__(self, fd: int) -> None:
+        self._map = mmap.mmap(fd, file_bytes())
+        offset = 0
+        arrays = {}
+        for name, (dtype, count) in _LAYOUT.items():
+            arrays[name] = np.frombuffer(self._map, dtype, count, offset)
+            offset += _aligned(dtype.itemsize * count)
+        self.facts, self.words, self.sample_ns = arrays["facts"], arrays["words"], arrays["sample_ns"]
+        self.dac_codes, self.adc_codes = arrays["dac_codes"], arrays["adc_codes"]
+        self.seen = arrays["seen"].view(np.recarray)
+        self._arrays = tuple(arrays.values())
+
+    def reset(self) -> None:
+        """As a card is after it was switched on: outputs at 0 V, nothing seen."""
+        for array in self._arrays:
+            array[:] = np.zeros(1, array.dtype)
+
+
+_LAYOUT: dict[str, tuple[np.dtype, int]] = {
+    "facts": (FACTS, 1),
+    "words": (np.dtype(np.uint64), WORDS),
+    "sample_ns": (np.dtype(np.int64), 1),
+    "dac_codes": (np.dtype(np.int64), MAX_CHANNELS),
+    "adc_codes": (np.dtype(np.int64), MAX_CHANNELS),
+    "seen": (SEEN, MAX_CHANNELS),
+}
+
+
+def _aligned(size: int) -> int:
+    return -(-size // 64) * 64
+
+
+def file_bytes() -> int:
+    """Length of a board's file."""
+    return sum(_aligned(dtype.itemsize * count) for dtype, count in _LAYOUT.values())
+
+
+class BoardBusy(OSError):
+    """Another board serves this file."""
+
+
+def serve(path: Path, options: RigOptions, axes: Sequence[str], rate_hz: float, stopped: Callable[[], bool]) -> int:
+    """Be the board at `path` until `stopped`; returns the samples taken. Raises ValueError, OSError, BoardBusy."""
+    if len(axes) > MAX_CHANNELS:
+        raise ValueError(f"{len(axes)} axes; a board has at most {MAX_CHANNELS} channels")
+    coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+    try:
+        _lock(fd, path)
+        os.ftruncate(fd, file_bytes())  # never shorter: a controller may still have it mapped
+        memory = BoardMemory(fd)
+        memory.reset()
+        timespec = np.zeros(2, np.int64)
+        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.dac_codes, memory.adc_codes,
+                     memory.seen, timespec.ctypes.data)  # fmt: skip
+        _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
+        memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
+        memory.facts["magic"] = MAGIC
+        start_ns, index, slice_ticks = time.monotonic_ns(), 0, max(1, round(SLICE_S * rate_hz))
+        while not stopped():
+            index = _run(*arguments, start_ns, 1e9 / rate_hz, index, slice_ticks)
+        memory.facts["magic"] = 0
+        return int(memory.words[SEQUENCE])
+    finally:
+        os.close(fd)
+
+
+def _lock(fd: int, path: Path) -> None:
+    """One board a file; a controller takes a lock of its own, on another byte."""
+    try:
+        fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, 0)
+    except OSError:
+        raise BoardBusy(f"{path}: another board serves this file") from None
+
+
+@jit
+def _run(coefficients, state, words, sample_ns, dac_codes, adc_codes, seen, timespec, start_ns, period_ns, index, count):
+    """`count` periods of the board's fixed grid; periods that a stall swallowed still move the rig. Next index."""
+    for _ in range(count):
+        wake_ns = start_ns + np.int64(index * period_ns)
+        now_ns = monotonic_ns(timespec)
+        while now_ns < wake_ns:
+            now_ns = sleep_until(wake_ns, timespec)
+        fault = load_acquire(words, FAULT)
+        sequence = load_acquire(words, SEQUENCE)
+        store_release(words, SEQUENCE, BUSY)
+        fence_release()
+        for i in range(coefficients.shape[0]):
+            volts = sample(coefficients[i], state[i])
+            if fault != FROZEN_INPUT:
+                adc_codes[i] = np.int64(np.rint(volts / LSB_V))
+            _look(seen[i], state[i], index)
+        if fault != FROZEN_INPUT:
+            sample_ns[0] = now_ns
+        store_release(words, SEQUENCE, sequence + np.uint64(1))
+        for i in range(coefficients.shape[0]):
+            volts = seen[i].last_v if fault == STUCK_OUTPUT else dac_codes[i] * LSB_V
+            _witness(seen[i], volts)
+            advance(coefficients[i], state[i], volts)
+        index += 1
+    return index
+
+
+@jit
+def _look(seen, state, index):
+    """The true position, and the farthest it ever was."""
+    seen.true_position_um = state.true_position_um
+    if abs(state.true_position_um) > seen.largest_position_um:
+        seen.largest_position_um = abs(state.true_position_um)
+
+
+@jit
+def _witness(seen, volts):
+    """What the output did."""
+    step_v = abs(volts - seen.last_v)
+    if step_v > seen.largest_step_v:
+        seen.largest_step_v = step_v
+    if volts < seen.lowest_v:
+        seen.lowest_v = volts
+    if volts > seen.highest_v:
+        seen.highest_v = volts
+    seen.last_v = volts
+
+
+@jit
+def latest_sample(words, sample_ns, adc_codes, out_codes, channels, tries):
+    """Copy the newest sample; returns its time in ns of CLOCK_MONOTONIC, or −1 where none could be had whole."""
+    for _ in range(tries):
+        before = load_acquire(words, SEQUENCE)
+        if before == BUSY:
+            continue
+        for i in range(channels):
+            out_codes[i] = adc_codes[i]
+        taken_ns = sample_ns[0]
+        fence_acquire()
+        if load_acquire(words, SEQUENCE) == before:
+            return taken_ns
+    return np.int64(-1)

@@ -1,0 +1,28 @@
+"""The command line. Nothing below this package sees the whole of a configuration and the terminal at once."""
+
+from __future__ import annotations
+
+import click
+
+from rtloop import __version__
+from rtloop.cli import loop, recordings
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="rtloop")
+def main() -> None:
+    """Close a hard, fast control loop from Python, record every tick, and believe what it did.
+
+    \b
+    Start here:
+      rtloop check deploy/paper.toml              what would run, its margins, its limits
+      rtloop run deploy/paper.toml --duration 10  run it on the simulated rig, and record it
+      rtloop info recordings/FILE.mcap            what a recording holds
+
+    Exit codes: 0 good; 1 fault, trip, loss or difference; 2 usage; 66 input file; 69 hardware or service not
+    available; 73 cannot write; 77 refused by the host; 78 configuration.
+    """
+
+
+for command in (*loop.COMMANDS, *recordings.COMMANDS):
+    main.add_command(command)

@@ -1,0 +1,57 @@
+"""What the commands share: arguments, options, and how an error becomes one message and an exit code."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+OUTPUT = click.Path(path_type=Path)
+CONFIG = click.argument("config", type=OUTPUT)
+FILES = click.argument("files", metavar="FILE...", type=OUTPUT, nargs=-1, required=True)
+JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, everything else on stderr.")
+
+
+def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
+    """Turn the project's errors into one message and the right exit code; never a traceback for a user's mistake."""
+
+    @wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> None:
+        from drivers.errors import DriverError
+        from rtloop.errors import RtloopError, UnavailableError
+
+        try:
+            code = command(*args, **kwargs) or 0
+        except (RtloopError, DriverError) as error:
+            code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
+            click.echo(f"rtloop: {error}", err=True)
+            if kwargs.get("as_json"):
+                click.echo(json.dumps({"error": str(error), "exit_code": code}))
+        sys.exit(code)
+
+    return wrapped
+
+
+class Seconds(click.ParamType):
+    """A finite number of seconds above 0, or from 0 on."""
+
+    name = "seconds"
+
+    def __init__(self, *, zero: bool = False) -> None:
+        self._zero = zero
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """The number; a usage error where it is none that is allowed."""
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not (0 < seconds < math.inf or (self._zero and seconds == 0)):
+            self.fail(f"{value}: a number of seconds {'from' if self._zero else 'above'} 0 is needed", param, ctx)
+        return seconds

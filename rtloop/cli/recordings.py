@@ -1,0 +1,139 @@
+"""Commands on recordings. FILE is a recording, a pattern, or the parts of a rotated one."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds, fails_clearly
+
+TO = click.Choice(["csv", "parquet", "npz"])
+
+
+@click.command()
+@FILES
+@JSON
+@fails_clearly
+def info(files: tuple[Path, ...], as_json: bool) -> int:
+    """Show what a recording holds: completeness, timing, errors, drives. The parts of a rotated one count as one."""
+    from rtloop.recording.summary import summarise
+    from rtloop.report import Counter, print_summary
+
+    with Counter("ticks read", sys.stderr) as counter:
+        summary = summarise(files, counter.show)
+    _show(summary, as_json, print_summary)
+    return 0
+
+
+@click.command()
+@FILES
+@click.option("--config", "other", type=OUTPUT, help="The law of this configuration on the recorded inputs instead.")
+@click.option("--resimulate", is_flag=True, help="The recorded reference in closed loop with the simulated rig.")
+@JSON
+@fails_clearly
+def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_json: bool) -> int:
+    """Execute a recording again and compare every output of every tick in bytes; exit 1 where one differs.
+
+    With --config: what another law would have commanded on the same inputs, from rest. With --resimulate: how it
+    would have followed the recorded reference on the simulated rig of its configuration (without --config: the
+    recorded law and rig). Both end with 0.
+    """
+    from rtloop.recording.load import load
+    from rtloop.recording.replay import replay as replay_recording
+    from rtloop.replaying import replay_on_the_rig, replay_with_other_law
+    from rtloop.report import Counter
+    from rtloop.report_recordings import print_differences, print_replay, print_resimulation
+
+    with Counter("ticks replayed", sys.stderr) as counter:
+        if resimulate:
+            beside = replay_on_the_rig(files, other, counter.show)
+            _show(beside, as_json, print_resimulation)
+            return 0
+        if other is not None:
+            differences = replay_with_other_law(files, other, counter.show)
+            _show(differences, as_json, print_differences)
+            return 0
+        report = replay_recording(load(files), counter.show)
+    _show(report.as_dict(), as_json, lambda _: print_replay(files[0], report))
+    return 0 if report.identical else 1
+
+
+@click.command()
+@FILES
+@click.option("--out", type=OUTPUT, help="The recovered file (of one FILE) [NAME.mcap for NAME.mcap.part].")
+@JSON
+@fails_clearly
+def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
+    """Make a complete file of a recording that was killed, cut off or damaged; the original stays as it is."""
+    from rtloop.recording.parts import find_files
+    from rtloop.recording.recover import recover as recover_recording
+    from rtloop.report import Counter
+    from rtloop.report_recordings import print_recovery
+
+    paths = find_files(files)
+    if len(paths) > 1 and (out is not None or as_json):
+        raise click.UsageError("--out and --json are for one FILE")
+    for path in paths:
+        with Counter("ticks recovered", sys.stderr) as counter:
+            report = recover_recording(path, out, counter.show)
+        _show(report, as_json, print_recovery)
+    return 0
+
+
+@click.command()
+@FILES
+@click.option("--to", type=TO, required=True, help="Format; parquet needs the extra of this name.")
+@click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
+@JSON
+@fails_clearly
+def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) -> int:
+    """Hand a recording on as CSV, Parquet or npz: every number exactly, never over an existing file."""
+    from rtloop.recording.export import export as export_recording
+    from rtloop.report import Counter
+    from rtloop.report_recordings import print_export
+
+    with Counter("ticks exported", sys.stderr) as counter:
+        report = export_recording(files, to, out, counter.show)
+    _show(report, as_json, print_export)
+    return 0
+
+
+@click.command()
+@FILES
+@click.option("--out", type=OUTPUT, help="The picture to write [FILE with another ending].")
+@click.option("--from", "start_s", type=Seconds(zero=True), default=0.0, help="Seconds since the start of the run.")
+@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
+@click.option("--html", is_flag=True, help="One self-contained page to zoom and pan in, instead of a PNG.")
+@JSON
+@fails_clearly
+def plot(
+    files: tuple[Path, ...], out: Path | None, start_s: float, end_s: float | None, html: bool, as_json: bool
+) -> int:
+    """Draw reference and position, error, drive, timing and events."""
+    from rtloop.recording.page import write_page
+    from rtloop.recording.plot import plot as plot_recording
+    from rtloop.report import Counter
+
+    draw = write_page if html else plot_recording
+    with Counter("ticks read", sys.stderr) as counter:
+        end_s = math.inf if end_s is None else end_s
+        picture = draw(files, out, start_s=start_s, end_s=end_s, progress=counter.show)
+    _show({"recording": str(files[0]), "output": str(picture)}, as_json, lambda _: click.echo(picture))
+    return 0
+
+
+def _show(result: dict[str, Any], as_json: bool, for_people: Callable[[dict[str, Any]], None]) -> None:
+    """One JSON object, or words."""
+    if as_json:
+        click.echo(json.dumps(result))
+    else:
+        for_people(result)
+
+
+COMMANDS = (info, replay, recover, export, plot)

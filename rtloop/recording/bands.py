@@ -1,0 +1,95 @@
+"""Signals made small enough to be drawn: the smallest and the largest value of each stretch of ticks.
+
+No peak is lost that way, whatever the size of the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.events import FINAL
+from rtloop.recording.load import Recording
+
+Progress = Callable[[int], None]
+BAD = ("tripped", "driver_failed", "gap")
+
+
+class Band(NamedTuple):
+    """Extremes of one signal over stretches of ticks; equal where every tick is a stretch of its own."""
+
+    time_s: Any
+    low: Any
+    high: Any
+
+    @property
+    def thin(self) -> bool:
+        """Whether both extremes are the same everywhere."""
+        return np.array_equal(self.low, self.high, equal_nan=True)
+
+
+class Mark(NamedTuple):
+    """An event to be drawn; `bad` for what should not have been."""
+
+    time_s: float
+    label: str
+    bad: bool
+
+
+def read_bands(
+    recording: Recording,
+    names: list[str],
+    start_s: float,
+    end_s: float,
+    points: int,
+    progress: Progress | None = None,
+) -> dict[str, Band]:
+    """Bands of the signals between two times; every tick where there are at most `points`, else about so many.
+
+    Raises RecordingError where there is no tick.
+    """
+    count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
+    if count == 0:
+        raise RecordingError(f"{recording.paths[0]}: holds no tick between {start_s:g} s and {end_s:g} s")
+    stretch = max(-(-count // points), 1)
+    times: list[Any] = []
+    lows: list[Any] = []
+    highs: list[Any] = []
+    done = 0
+    for rows in recording.between(["deadline_ns", *names], start_s, end_s):
+        edges = np.arange(0, len(rows), stretch)
+        times.append(rows[edges, 0] * 1e-9)
+        lows.append(np.fmin.reduceat(rows[:, 1:], edges))
+        highs.append(np.fmax.reduceat(rows[:, 1:], edges))
+        done += len(rows)
+        if progress:
+            progress(done)
+    time_s, low, high = np.concatenate(times), np.concatenate(lows), np.concatenate(highs)
+    return {name: Band(time_s, low[:, index], high[:, index]) for index, name in enumerate(names)}
+
+
+def drawn_signals(recording: Recording) -> list[str]:
+    """The signals that a picture shows."""
+    wanted = ("reference_um", "position_um", "error_um", "drive_v")
+    return [*(f"{axis}_{name}" for axis in recording.header["axes"] for name in wanted), "lateness_us", "exec_us"]
+
+
+def marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
+    """The events between two times, without those that end a file."""
+    found = []
+    for event in recording.events:
+        time_s, kind, what = event["time_ns"] * 1e-9, event["kind"], event["what"]
+        if kind not in FINAL and start_s <= time_s <= end_s:
+            label = what.get("mode") or ": ".join(filter(None, [kind, ", ".join(what.get("causes", []))]))
+            found.append(Mark(time_s, label.replace("_", " "), kind in BAD))
+    return found
+
+
+def title(recording: Recording) -> str:
+    """Name, rate and clock of a run."""
+    header = recording.header
+    clock = "paced" if header["paced"] else "virtual time"
+    return f"{header.get('name', recording.paths[0].name)}   ({header['rate_hz']:g} Hz, {clock})"

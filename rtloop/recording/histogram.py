@@ -1,0 +1,70 @@
+"""Counts of measured times, from which quantiles are read, in memory that does not grow with their number."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+NS_PER_US = 1000.0
+CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+
+
+class Histogram:
+    """Counts of times in whole nanoseconds; beyond `LINEAR_NS` in steps of 2⁻¹² of their size."""
+
+    LINEAR_NS = 1 << 20
+    STEPS = 1 << 12
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(self.LINEAR_NS, np.int64)
+        self._large: dict[int, int] = {}
+        self._maximum = -math.inf
+
+    def add(self, values_us: np.ndarray[Any, Any]) -> None:
+        """Count values in µs; NaN is not counted."""
+        if not len(values_us) or np.isnan(values_us.max()):
+            values_us = values_us[np.isfinite(values_us)]
+        if not len(values_us):
+            return
+        self._maximum = max(self._maximum, float(values_us.max()))
+        ns = np.maximum(values_us, 0.0) * NS_PER_US + 0.5
+        large = ns >= self.LINEAR_NS
+        if large.any():
+            self._add_large(ns[large])
+            ns = ns[~large]
+        counts = np.bincount(ns.astype(np.int64))
+        self._counts[: len(counts)] += counts
+
+    def _add_large(self, ns: np.ndarray[Any, Any]) -> None:
+        fraction, exponent = np.frexp(ns)
+        rounded = np.ldexp(np.floor(fraction * 2 * self.STEPS) / (2 * self.STEPS), exponent)
+        for value, count in zip(*np.unique(rounded, return_counts=True), strict=True):
+            self._large[int(value)] = self._large.get(int(value), 0) + int(count)
+
+    def quantiles_us(self, *quantiles: float) -> list[float | None]:
+        """The smallest recorded value that at least this share of all values does not exceed."""
+        large = sorted(self._large.items())
+        values = np.concatenate([np.arange(self.LINEAR_NS), np.array([value for value, _ in large], np.int64)])
+        below = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
+        if below[-1] == 0:
+            return [None] * len(quantiles)
+        ranks = [max(math.ceil(quantile * below[-1]), 1) for quantile in quantiles]
+        return [float(values[np.searchsorted(below, rank)]) / NS_PER_US for rank in ranks]
+
+    def classes(self) -> list[dict[str, Any]]:
+        """Counts below each of CLASSES_US, and None for the rest; empty where nothing was measured."""
+        edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
+        small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]
+        small[-1] += sum(self._large.values())
+        if not sum(small):
+            return []
+        return [{"below_us": edge, "count": count} for edge, count in zip((*CLASSES_US, None), small, strict=True)]
+
+    def report(self) -> dict[str, float] | None:
+        """p50, p99, p999 and max in µs; None where nothing was measured."""
+        p50, p99, p999 = self.quantiles_us(0.5, 0.99, 0.999)
+        if p50 is None or p99 is None or p999 is None:
+            return None
+        return {"p50": p50, "p99": p99, "p999": p999, "max": self._maximum}

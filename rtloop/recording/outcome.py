@@ -1,0 +1,113 @@
+"""What came of a rerun, in numbers: differences signal by signal, and how well the reference was followed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rtloop import signals
+from rtloop.recording.rerun import Rows
+from rtloop.signals import PER_AXIS, TRIP_MASK, Mode
+from rtloop.steps import StepMetrics, step_metrics
+
+JUDGED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
+STEP_ANALYSIS_TICKS = 3_000_000
+"""Steps are judged over at most so many ticks from the beginning: they are kept in memory."""
+
+
+class Differences:
+    """Largest and root mean square difference of what the law computes; ticks where one is not finite are left out."""
+
+    def __init__(self, axes: Sequence[str]) -> None:
+        self._columns = [signals.axis_column(axis, signal) for axis in range(len(axes)) for signal in JUDGED]
+        self._names = [f"{axis}_{PER_AXIS[signal].name}" for axis in axes for signal in JUDGED]
+        size = len(self._columns)
+        self._largest, self._at_tick = np.zeros(size), np.zeros(size, np.int64)
+        self._square_sum, self._count = np.zeros(size), np.zeros(size, np.int64)
+        self._trip: dict[str, Any] | None = None
+
+    def add(self, recorded: Rows, replayed: Rows) -> None:
+        """Count rows of the same ticks."""
+        if not len(recorded):
+            return
+        with np.errstate(invalid="ignore"):
+            difference = np.abs(replayed[:, self._columns] - recorded[:, self._columns])
+        finite = np.isfinite(difference)
+        difference[~finite] = 0.0
+        rows, places = difference.argmax(axis=0), np.arange(len(self._columns))
+        larger = difference[rows, places] > self._largest
+        self._largest[larger] = difference[rows, places][larger]
+        self._at_tick[larger] = recorded[rows[larger], signals.TICK].astype(np.int64)
+        self._square_sum += np.einsum("ij,ij->j", difference, difference)
+        self._count += finite.sum(axis=0)
+        self._trip = self._trip or first_trip(replayed)
+
+    def report(self) -> dict[str, Any]:
+        """{signals: {name: {max, at_tick, rms}}, trip: {tick, causes} or None}."""
+        rms = np.sqrt(self._square_sum / np.maximum(self._count, 1))
+        rows = zip(self._names, self._largest.tolist(), self._at_tick.tolist(), rms.tolist(), strict=True)
+        return {
+            "signals": {name: {"max": largest, "at_tick": tick, "rms": mean} for name, largest, tick, mean in rows},
+            "trip": self._trip,
+        }
+
+
+class Performance:
+    """Tracking error over closed-loop ticks, largest drive and steps of every axis."""
+
+    def __init__(self, axes: Sequence[str], rate_hz: float) -> None:
+        self._axes, self._rate_hz = range(len(axes)), rate_hz
+        self._square_sum, self._count = np.zeros(len(axes)), 0
+        self._drive_v, self._error_um = np.zeros(len(axes)), np.zeros(len(axes))
+        self._traces: list[Rows] = []
+        self._kept = 0
+        self.trip: dict[str, Any] | None = None
+
+    def add(self, rows: Rows) -> None:
+        """Count consecutive ticks."""
+        if not len(rows):
+            return
+        errors, drives = (rows[:, [signals.axis_column(axis, which) for axis in self._axes]]
+                          for which in (signals.ERROR, signals.DRIVE))  # fmt: skip
+        errors = np.nan_to_num(errors[rows[:, signals.MODE] == Mode.CLOSED_LOOP])
+        self._square_sum += np.einsum("ij,ij->j", errors, errors)
+        self._count += len(errors)
+        if len(errors):
+            self._error_um = np.maximum(self._error_um, np.abs(errors).max(axis=0))
+        self._drive_v = np.fmax(self._drive_v, np.abs(drives).max(axis=0))
+        if self._kept < STEP_ANALYSIS_TICKS:
+            wanted = [
+                signals.axis_column(a, which) for a in self._axes for which in (signals.REFERENCE, signals.POSITION)
+            ]
+            self._traces.append(rows[:, wanted].copy())
+            self._kept += len(rows)
+        self.trip = self.trip or first_trip(rows)
+
+    def report(self) -> list[dict[str, Any]]:
+        """By axis: rms_error_um, max_abs_error_um, max_abs_drive_v and, where the reference has steps, its metrics."""
+        traces = np.concatenate(self._traces) if self._traces else np.empty((0, 2 * len(self._axes)))
+        return [
+            {
+                "rms_error_um": math.sqrt(self._square_sum[axis] / self._count) if self._count else None,
+                "max_abs_error_um": float(self._error_um[axis]) if self._count else None,
+                "max_abs_drive_v": float(self._drive_v[axis]),
+                "steps": _as_dict(step_metrics(traces[:, 2 * axis], traces[:, 2 * axis + 1], self._rate_hz)),
+            }
+            for axis in self._axes
+        ]
+
+
+def first_trip(rows: Rows) -> dict[str, Any] | None:
+    """Tick and causes of the first row that is tripped."""
+    tripped = np.flatnonzero(rows[:, signals.FLAGS].astype(np.int64) & TRIP_MASK)
+    if not tripped.size:
+        return None
+    row = rows[tripped[0]]
+    return {"tick": int(row[signals.TICK]), "causes": signals.trip_causes(row[signals.FLAGS])}
+
+
+def _as_dict(metrics: StepMetrics | None) -> dict[str, Any] | None:
+    return metrics and metrics.as_dict()

@@ -1,0 +1,83 @@
+"""One self-contained HTML page of a recording, to zoom and pan in: no network, no other file, light and dark."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from importlib.resources import files as package_files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.recording.bands import Band, Progress, drawn_signals, marks, read_bands, title
+from rtloop.recording.errors import OutputError
+from rtloop.recording.load import Recording, load
+from rtloop.recording.parts import Files, find_files
+
+POINTS = 100_000
+"""About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
+SHAPES = (
+    ("µm", (("reference_um", "reference", 1.0), ("position_um", "position", 1.5))),
+    ("µm", (("error_um", "error", 1.0),)),
+    ("V", (("drive_v", "drive", 1.0),)),
+)
+
+
+def write_page(
+    files: Files,
+    output: Path | str | None = None,
+    *,
+    start_s: float = 0.0,
+    end_s: float = np.inf,
+    progress: Progress | None = None,
+) -> Path:
+    """Write the page, by default beside the recording. Raises RecordingError, OutputError."""
+    recording = load(files)
+    target = find_files(files)[0].with_suffix(".html") if output is None else Path(output)
+    bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
+    time_s = next(iter(bands.values())).time_s
+    data = {
+        "about": _about(recording, len(time_s)),
+        "problems": recording.problems,
+        "time_s": _encoded(time_s, np.float64),
+        "panels": _panels(recording.header["axes"], bands),
+        "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
+    }
+    page = package_files("rtloop.recording").joinpath("page.html").read_text(encoding="utf-8")
+    embedded = json.dumps(data).replace("<", "\\u003c")
+    try:
+        target.write_text(page.replace("TITLE", html.escape(title(recording))).replace("DATA", embedded), "utf-8")
+    except OSError as error:
+        raise OutputError(f"{target}: {error.strerror}") from None
+    return target
+
+
+def _about(recording: Recording, points: int) -> str:
+    host = recording.header.get("host", {})
+    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel")]
+    return " · ".join([*filter(None, parts), f"{points:,} points, each with the extremes of its ticks"])
+
+
+def _panels(axes: list[str], bands: dict[str, Band]) -> list[dict[str, Any]]:
+    panels = [
+        {"unit": unit, "empty": "", "traces": [_trace(bands[f"{axis}_{name}"], f"{axis} {label}", label, width)
+                                               for name, label, width in traces]}
+        for axis in axes
+        for unit, traces in SHAPES
+    ]  # fmt: skip
+    timing = [
+        _trace(bands[f"{name}_us"], label, name, 1.0) for name, label in (("exec", "tick"), ("lateness", "lateness"))
+    ]
+    return [*panels, {"unit": "µs", "empty": "virtual time: nothing was measured", "traces": timing}]
+
+
+def _trace(band: Band, label: str, colour: str, width: float) -> dict[str, Any]:
+    high = None if band.thin else _encoded(band.high, np.float32)
+    return {"label": label, "colour": colour, "width": width, "low": _encoded(band.low, np.float32), "high": high}
+
+
+def _encoded(values: Any, dtype: Any) -> str:
+    """Little-endian bytes in base64."""
+    return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()

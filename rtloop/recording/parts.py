@@ -1,0 +1,74 @@
+"""The files of one run: found by name or pattern, opened together, in the order of the run."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.reader import Reader
+
+Files = Path | str | Sequence[Path | str]
+"""A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""
+
+
+def find_files(given: Files) -> list[Path]:
+    """The files that are meant. Raises RecordingError where a pattern fits none."""
+    items = [given] if isinstance(given, str | Path) else list(given)
+    paths: list[Path] = []
+    for item in items:
+        if glob.has_magic(str(item)) and not Path(item).exists():
+            found = sorted(glob.glob(str(item)))
+            if not found:
+                raise RecordingError(f"{item}: no such file")
+            paths += map(Path, found)
+        else:
+            paths.append(Path(item))
+    if not paths:
+        raise RecordingError("no recording is given")
+    return paths
+
+
+class Parts(ExitStack):
+    """Tolerant readers of the files of one run, in its order, closed together.
+
+    Entering raises RecordingError where the files are not of one run.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        super().__init__()
+        self._paths = paths
+
+    def __enter__(self) -> list[Reader]:  # type: ignore[override]
+        try:
+            readers = [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
+            readers.sort(key=_sequence)
+            _require_one_run(readers)
+            return readers
+        except BaseException:
+            self.close()
+            raise
+
+
+def absent_parts(readers: Sequence[Reader]) -> list[str]:
+    """What is missing between, or in front of, the files of a rotated run. One file alone is a whole recording."""
+    numbers = [_sequence(reader) for reader in readers]
+    if len(numbers) == 1:
+        return []
+    return [f"part {number} of the run is missing" for number in range(1, max(numbers)) if number not in numbers]
+
+
+def _sequence(reader: Reader) -> int:
+    return int(reader.header.get("sequence", 1))
+
+
+def _require_one_run(readers: Sequence[Reader]) -> None:
+    first, numbers = readers[0], [_sequence(reader) for reader in readers]
+    for reader in readers[1:]:
+        if any(reader.header.get(key) != first.header.get(key) for key in ("created_unix_ns", "name", "columns")):
+            raise RecordingError(f"{reader.path}: is not of the same run as {first.path}")
+    for reader, number, next_number in zip(readers[1:], numbers, numbers[1:], strict=False):
+        if number == next_number:
+            raise RecordingError(f"{reader.path}: this part of the run is given twice")

@@ -1,0 +1,33 @@
+"""Where two snapshots of the law differ, in the words of its layout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+
+
+def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str]) -> tuple[str, Any, Any]:
+    """Field and both values where the law's bytes (those of a snapshot behind its tick) first differ."""
+    for name, dtype, start in _values(axes):
+        parts = [data[start : start + dtype.itemsize] for data in (recorded, replayed)]
+        if parts[0] != parts[1]:
+            values = [np.frombuffer(part, dtype.base) for part in parts]
+            pairs = list(zip(*values, strict=True))
+            index = next(i for i, (one, other) in enumerate(pairs) if one.tobytes() != other.tobytes())
+            place = name if len(pairs) == 1 else f"{name}[{index}]"
+            return place, pairs[index][0].item(), pairs[index][1].item()
+    return "law, bytes that belong to no field", None, None
+
+
+def _values(axes: Sequence[str]) -> Iterator[tuple[str, np.dtype[Any], int]]:
+    """Name, type and offset of every field, in the order of a snapshot."""
+    offset = 0
+    tables = [(axis, COEFFICIENTS) for axis in axes] + [(axis, STATE) for axis in axes] + [("loop", LOOP_STATE)]
+    for owner, table in tables:
+        for name, (dtype, start, *_) in (table.fields or {}).items():
+            yield f"law.{owner}.{name}", dtype, offset + start
+        offset += table.itemsize

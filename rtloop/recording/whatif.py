@@ -1,0 +1,126 @@
+"""What another law would have done with a recording: on the recorded inputs, or in closed loop with a simulated rig.
+
+Both start from rest, with the recorded references and commands. The first says what the law would have commanded had
+it seen the same; its outputs do not act back. The second closes the loop. Where ticks are missing from the recording,
+law and rig go on as if nothing had been between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+
+from drivers.base import Driver, Pointers
+from rtloop import signals
+from rtloop.law.law import set_mode
+from rtloop.law.layout import Records, initial_state, split_snapshot
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import Recording
+from rtloop.recording.outcome import Differences, Performance
+from rtloop.recording.replay import check_layout, consecutive, recorded_commands
+from rtloop.recording.rerun import Law, Rerun, Rows, Source, Tape
+from rtloop.signals import Mode
+
+Progress = Callable[[int], None]
+
+
+class Rig:
+    """A simulated rig as a source of inputs: it answers what the law commands, whatever was recorded."""
+
+    def __init__(self, driver: Driver) -> None:
+        self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
+
+    def pointers(self) -> Pointers:
+        """The open driver's."""
+        return self._driver.open()
+
+    def load(self, rows: Rows) -> None:
+        """Nothing: a rig has no need of what was recorded."""
+
+
+def recorded_coefficients(recording: Recording) -> Records:
+    """The coefficients of the first snapshot. Raises RecordingError where there is none that can be used."""
+    check_layout(recording)
+    with closing(recording.snapshots()) as snapshots:
+        first = next(snapshots, None)
+    if first is None:
+        raise RecordingError(f"{recording.paths[0]}: holds no snapshot of the law")
+    return split_snapshot(first.data, len(recording.header["axes"]))[1]
+
+
+def other_law(recording: Recording, coefficients: Records, progress: Progress | None = None) -> dict[str, Any]:
+    """How the outputs of a law with `coefficients` differ from the recorded ones, on the recorded inputs.
+
+    {ticks, signals: {name: {max, at_tick, rms}}, trips: [{tick, causes}]}. Raises RecordingError.
+    """
+    differences = Differences(recording.header["axes"])
+    ticks = 0
+    with closing(_pairs(recording, coefficients, Tape(recording.header))) as pairs:
+        for recorded, replayed in pairs:
+            differences.add(recorded, replayed)
+            ticks += len(replayed)
+            _tell(progress, ticks)
+    return {"ticks": ticks, "problems": recording.problems, **differences.report()}
+
+
+def resimulate(
+    recording: Recording, coefficients: Records, driver: Driver, progress: Progress | None = None
+) -> dict[str, Any]:
+    """How well a law with `coefficients` follows the recorded reference on a simulated rig, beside what was recorded.
+
+    {ticks, axes: [{name, recorded: {…}, resimulated: {…}}]}. Raises RecordingError.
+    """
+    axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
+    before, after = (Performance(axes, rate_hz) for _ in range(2))
+    ticks = 0
+    try:
+        with closing(_pairs(recording, coefficients, Rig(driver))) as pairs:
+            for recorded, replayed in pairs:
+                before.add(recorded)
+                after.add(replayed)
+                ticks += len(replayed)
+                _tell(progress, ticks)
+    finally:
+        driver.close()
+    beside = zip(axes, before.report(), after.report(), strict=True)
+    return {
+        "ticks": ticks,
+        "problems": recording.problems,
+        "trips": {"recorded": before.trip, "resimulated": after.trip},
+        "axes": [{"name": name, "recorded": old, "resimulated": new} for name, old, new in beside],
+    }
+
+
+def _pairs(recording: Recording, coefficients: Records, source: Source) -> Iterator[tuple[Rows, Rows]]:
+    """Recorded rows and what came of executing them, stretch by stretch, up to the end of either."""
+    commands, rerun = recorded_commands(recording), None
+    with closing(recording.blocks()) as blocks:
+        for rows in (rows for block in blocks for rows in consecutive(block)):
+            while len(rows):
+                tick = int(rows[0, signals.TICK])
+                if rerun is None:
+                    law = _at_rest(coefficients, Mode(int(rows[0, signals.MODE])))
+                    rerun = Rerun(recording.header, source, law, commands, tick)
+                count = min(len(rows), rerun.room(tick))
+                replayed = rerun.execute(rows[:count])
+                yield rows[: len(replayed)], replayed
+                if len(replayed) < count:
+                    return
+                rows = rows[count:]
+    if rerun is None:
+        raise RecordingError(f"{recording.paths[0]}: holds no tick")
+
+
+def _at_rest(coefficients: Records, mode: Mode) -> Law:
+    coefficients = coefficients.view(np.recarray)
+    axes, state = initial_state(coefficients)
+    set_mode(axes, state[0], int(mode), True)
+    return Law(coefficients, axes, state)
+
+
+def _tell(progress: Progress | None, ticks: int) -> None:
+    if progress:
+        progress(ticks)

@@ -1,0 +1,70 @@
+"""`rtloop replay`: a recording executed again, as it was or with the law and the rig of another configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace as changed
+from pathlib import Path
+from typing import Any
+
+from drivers.base import Driver
+from drivers.registry import driver_class
+from rtloop import config
+from rtloop.config import Configuration
+from rtloop.errors import ConfigError
+from rtloop.law.layout import Records
+from rtloop.prepare import prepare
+from rtloop.recording.load import Recording, load
+from rtloop.recording.whatif import other_law, recorded_coefficients, resimulate
+
+Progress = Callable[[int], None]
+
+
+def replay_with_other_law(files: Sequence[Path], other: Path, progress: Progress | None = None) -> dict[str, Any]:
+    """Differences between the recorded outputs and those of another configuration's law on the recorded inputs."""
+    recording = load(files)
+    coefficients = _coefficients(config.load(other), recording)
+    return {**_about(recording, other), **other_law(recording, coefficients, progress)}
+
+
+def replay_on_the_rig(files: Sequence[Path], other: Path | None, progress: Progress | None = None) -> dict[str, Any]:
+    """The recorded reference through a law on a simulated rig: those of `other`, or the recorded ones."""
+    recording = load(files)
+    if other is None:
+        path = recording.paths[0]
+        configuration = config.parse(recording.configuration, path.stem, path.parent, f"configuration in {path}")
+        coefficients = recorded_coefficients(recording)
+    else:
+        configuration = config.load(other)
+        coefficients = _coefficients(configuration, recording)
+    driver = _rig(configuration, recording)
+    return {**_about(recording, other), **resimulate(recording, coefficients, driver, progress)}
+
+
+def _about(recording: Recording, other: Path | None) -> dict[str, Any]:
+    return {"recording": str(recording.paths[0]), "config": None if other is None else str(other)}
+
+
+def _coefficients(configuration: Configuration, recording: Recording) -> Records:
+    """The law of a configuration for the recording's axes and rate. Raises ConfigError."""
+    header, faults = recording.header, []
+    names = [axis.name for axis in configuration.axes]
+    if names != header["axes"]:
+        faults.append(f"axis: {', '.join(names)}; the recording has {', '.join(header['axes'])}")
+    if configuration.loop.rate_hz != header["rate_hz"]:
+        faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g}; the recording has {header['rate_hz']:g}")
+    if faults:
+        raise ConfigError(configuration.name, faults)
+    return prepare(changed(configuration, schedule=())).plan.coefficients
+
+
+def _rig(configuration: Configuration, recording: Recording) -> Driver:
+    """The simulated rig of a configuration. Raises ConfigError where its driver is another one."""
+    if configuration.driver_kind != "sim":
+        fault = f"driver.kind: {configuration.driver_kind!r}; a new simulation needs the simulated rig, 'sim'"
+        raise ConfigError(configuration.name, [fault])
+    try:
+        kind = driver_class(configuration.driver_kind)
+        return kind(configuration.driver_options, configuration.wiring, recording.header["rate_hz"])
+    except ValueError as error:
+        raise ConfigError(configuration.name, [f"driver.{error}"]) from None

@@ -1,0 +1,55 @@
+"""A small driver in plain Python: two outputs looped back to two inputs, on hardware that can be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.base import Channel, Driver, Facts, Wiring
+from drivers.contract import DriverContract
+from drivers.python import PythonDriver
+
+WIRING = {"x": Wiring("ai0", "ao0")}
+
+
+class LoopBack(PythonDriver):
+    """`volts` is the hardware."""
+
+    kind = "loopback"
+
+    def __init__(self) -> None:
+        super().__init__(self.options_model(), WIRING, 1000.0)
+        self.volts = [0.7, 0.7]  # as somebody left it
+
+    @property
+    def facts(self) -> Facts:
+        outputs = Channel("ao0", -5.0, 5.0), Channel("ao1", 0.0, 10.0, safe_v=2.0)
+        return Facts((Channel("ai0"), Channel("ai1")), outputs, ("x_temperature",), max_rate_hz=2000.0)
+
+    def start(self) -> None:
+        self.volts = [0.0, 2.0]
+
+    def stop(self) -> None:
+        """Nothing to let go."""
+
+    def read(self) -> Sequence[float]:
+        return self.volts
+
+    def observe(self) -> Sequence[float]:
+        return (21.5,)
+
+    def write(self, volts: Sequence[float]) -> None:
+        self.volts = list(volts)
+
+
+class LoopBackContract(DriverContract):
+    """The suite on LoopBack, whose outputs can be seen."""
+
+    tolerance_v = 0.0
+    kind: type[LoopBack] = LoopBack
+
+    def driver(self) -> Driver:
+        return self.kind()
+
+    def outputs(self, driver: Driver) -> Sequence[float] | None:
+        assert isinstance(driver, LoopBack)
+        return driver.volts

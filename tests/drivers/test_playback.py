@@ -1,0 +1,64 @@
+"""The tape hands back what was recorded, bit for bit, and ends the run at its end."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+
+from drivers.playback import TIMING_COLUMNS, Playback
+
+FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
+VALUES = 5
+GUARD = 777.0
+
+
+def rows(count: int, seed: int) -> np.ndarray:
+    """Times, status, values; with all that doubles can be."""
+    tape = np.random.default_rng(seed).normal(0, 1e3, (count, TIMING_COLUMNS + 1 + VALUES))
+    tape[:, TIMING_COLUMNS] = np.arange(count) - 3
+    tape[0, -3:] = np.nan, -0.0, np.inf
+    return tape
+
+
+class Reader:
+    def __init__(self, tape: Playback) -> None:
+        self.pointers = tape.pointers()
+        self.timing, self.values = (ctypes.c_double * 5)(*[GUARD] * 5), (ctypes.c_double * 6)(*[GUARD] * 6)
+
+    def tick(self) -> np.ndarray | None:
+        """One row as the loop meets it: wait, read, write; None where the tape ends the run."""
+        context = self.pointers.context
+        if FUNCTION(self.pointers.wait)(context, self.timing) != 0:
+            return None
+        status = FUNCTION(self.pointers.read)(context, self.values)
+        assert FUNCTION(self.pointers.write)(context, self.values) == 0
+        assert self.timing[TIMING_COLUMNS] == self.values[VALUES] == GUARD
+        return np.array([*self.timing[:TIMING_COLUMNS], status, *self.values[:VALUES]])
+
+
+def test_every_row_once_and_then_the_end():
+    tape, recorded = Playback(), rows(7, 1)
+    tape.load(recorded)
+    reader = Reader(tape)
+    played = [reader.tick() for _ in range(7)]
+    assert np.array(played).tobytes() == recorded.tobytes()
+    assert reader.tick() is None
+    assert reader.tick() is None
+
+
+def test_stretch_after_stretch():
+    tape = Playback()
+    reader = Reader(tape)
+    assert reader.tick() is None
+    for seed in range(3):
+        recorded = rows(4, seed)
+        tape.load(recorded[:, :])
+        assert np.array([reader.tick() for _ in range(4)]).tobytes() == recorded.tobytes()
+
+
+def test_any_layout_in_memory():
+    tape, recorded = Playback(), rows(6, 2)
+    tape.load(np.asfortranarray(recorded)[::2])
+    reader = Reader(tape)
+    assert np.array([reader.tick() for _ in range(3)]).tobytes() == recorded[::2].tobytes()

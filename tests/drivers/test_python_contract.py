@@ -1,0 +1,82 @@
+"""A driver in plain Python keeps the contract; one that breaks any promise of it does not pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+
+from drivers.contract import Calls
+from drivers.errors import DriverError
+from rtloop.engine.plan import require_facts
+from tests.drivers.bench_driver import LoopBack, LoopBackContract
+from tests.drivers.mutants import MUTANTS, ForgetsAnInput
+
+
+class TestLoopBack(LoopBackContract):
+    pass
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda kind: kind.__name__)
+def test_a_broken_promise_turns_the_suite_red(mutant):
+    suite = type("Suite", (LoopBackContract,), {"kind": mutant})
+    failed = []
+    for name in dir(suite):
+        if name.startswith("test_"):
+            try:
+                getattr(suite(), name)()
+            except (AssertionError, DriverError, ValueError):
+                failed.append(name)
+    assert failed
+
+
+def test_an_exception_in_read_is_a_failed_driver_and_is_kept():
+    driver = LoopBack()
+    calls = Calls(driver.open(), driver.facts)
+    driver.volts = ["not a number", 0.0]  # type: ignore[list-item]
+    assert calls.read()[0] == -1
+    assert isinstance(driver.error, TypeError)
+
+
+@pytest.mark.parametrize("volts", [[5.1, 2.0], [0.0, -0.1], [math.nan, 2.0], [0.0, math.inf]])
+def test_an_output_outside_its_range_is_refused_and_said(volts):
+    driver = LoopBack()
+    calls = Calls(driver.open(), driver.facts)
+    assert calls.write([1.0, 3.0]) == 0
+    assert calls.write(volts) == -1
+    assert driver.volts == [1.0, 3.0]
+    assert "is outside" in str(driver.error)
+
+
+def test_a_wrong_number_of_inputs_is_refused_and_said():
+    driver = ForgetsAnInput()
+    calls = Calls(driver.open(), driver.facts)
+    assert calls.read()[0] == -1
+    assert str(driver.error) == "driver 'loopback': read gave 3 numbers; its facts say 4"
+
+
+def test_outputs_that_cannot_be_parked_are_told():
+    class Broken(LoopBack):
+        stopped = False
+
+        def write(self, volts: Sequence[float]) -> None:
+            raise OSError("no such device")
+
+        def stop(self) -> None:
+            self.stopped = True
+
+    driver = Broken()
+    driver.open()
+    with pytest.raises(DriverError, match="'loopback': its outputs could not be made safe: no such device"):
+        driver.close()
+    assert driver.stopped
+    driver.close()
+
+
+def test_rates_and_virtual_time_that_do_not_suit():
+    with pytest.raises(ValueError, match=r"loop\.rate_hz: 2001 is above the 2000 Hz of driver 'loopback'"):
+        require_facts(LoopBack(), 2001.0, True)
+    with pytest.raises(ValueError, match="driver 'loopback' moves real hardware: it cannot run unpaced"):
+        require_facts(LoopBack(), 1000.0, False)
+    assert require_facts(LoopBack(), 2000.0, True) == LoopBack().facts

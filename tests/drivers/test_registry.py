@@ -1,0 +1,113 @@
+"""Kinds by name: the built-in ones, and those that third parties register as entry points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DriverError, MissingExtra
+from drivers.registry import driver_class, kinds
+from drivers.sim import SimDriver
+from rtloop.config import parse
+from rtloop.errors import ConfigError
+from rtloop.prepare import prepare
+from tests.engine.harness import AXIS, text
+
+ENTRY_POINTS = """[rtloop.drivers]
+acme = acme_card:AcmeDriver
+sim = acme_card:AcmeDriver
+absent = acme_absent:Driver
+nameless = acme_card:Nothing
+"""
+MODULE = """
+from drivers.base import Channel, Facts, Options
+from drivers.python import PythonDriver
+
+
+class AcmeOptions(Options):
+    port: int = 1
+
+
+class AcmeDriver(PythonDriver):
+    kind = "acme"
+    options_model = AcmeOptions
+
+    @property
+    def facts(self):
+        return Facts((Channel("in0"),), (Channel("out0", -5.0, 5.0),), max_rate_hz=2000.0, real=False)
+
+    def start(self): ...
+    def stop(self): ...
+    def read(self): return (0.0,)
+    def write(self, volts): ...
+"""
+
+
+@pytest.fixture
+def acme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installed distribution, as far as Python can see."""
+    (tmp_path / "acme_card.py").write_text(MODULE)
+    info = tmp_path / "acme_card-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-card\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def acme_text(rate_hz: float = 1000, drive_v: float = 5.0, options: str = "port = 3") -> str:
+    head = text(mode="raw", rate_hz=rate_hz).replace('"sim"', '"acme"').replace("adc0", "in0").replace("dac0", "out0")
+    head = head.replace("seed = 1", options).replace("latency_ticks = 0", "")
+    return f"{head}{AXIS}[axis.limits]\ndrive_v = {drive_v}\n"
+
+
+def test_built_in():
+    assert driver_class("sim") is SimDriver
+
+
+def test_unknown_kinds_list_those_there_are():
+    with pytest.raises(ValueError, match=r"'comedy' is not a known driver; there are .*sim"):
+        driver_class("comedy")
+
+
+@pytest.mark.usefixtures("acme")
+def test_an_entry_point_is_found_but_cannot_replace_a_built_in():
+    assert list(kinds()) == sorted(kinds())
+    assert driver_class("acme").__module__ == "acme_card"
+    assert driver_class("sim") is SimDriver
+
+
+@pytest.mark.usefixtures("acme")
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("absent", "driver 'absent', acme_absent:Driver: cannot be imported: No module named 'acme_absent'"),
+        ("nameless", "driver 'nameless', acme_card:Nothing: cannot be imported: .*no attribute 'Nothing'"),
+    ],
+)
+def test_an_entry_point_that_is_broken_says_how(kind, message):
+    with pytest.raises(MissingExtra, match=message):
+        driver_class(kind)
+    assert issubclass(MissingExtra, DriverError)
+
+
+@pytest.mark.usefixtures("acme")
+def test_a_configuration_reaches_it():
+    prepared = prepare(parse(acme_text(), "acme", Path(), "acme.toml"))
+    assert prepared.plan.driver_options == {"port": 3}
+    assert prepared.plan.driver().kind == "acme"
+
+
+@pytest.mark.usefixtures("acme")
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"rate_hz": 2500}, "loop.rate_hz: 2500 is above the 2000 Hz of driver 'acme'"),
+        ({"drive_v": 7.5}, "axis.x.limits.drive_v: 7.5 is outside the driver's ±5.0 V"),
+        ({"options": "prot = 3"}, "driver.prot: unknown key; did you mean port?"),
+    ],
+)
+def test_its_facts_are_checked_with_the_configuration(changes, fault):
+    with pytest.raises(ConfigError) as caught:
+        prepare(parse(acme_text(**changes), "acme", Path(), "acme.toml"))
+    assert caught.value.faults == [fault]

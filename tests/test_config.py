@@ -1,0 +1,136 @@
+"""Every mistake in a configuration gives one line: the key, its value, what is allowed; all of them at once."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from rtloop.config import InputFileError, load, parse
+from rtloop.errors import ConfigError
+from rtloop.signals import Mode
+from tests.paper_configuration import CONTROLLER, PAPER, RATE, REFERENCE, TEXT, UNSTABLE, built, entry, faults
+
+
+def test_the_papers_configuration_is_good():
+    prepared = built()
+    assert prepared.warnings == ()
+    assert (prepared.plan.mode, prepared.plan.axes) == (Mode.CLOSED_LOOP, ("x",))
+
+
+@pytest.mark.parametrize("name", ["absent.toml", "."])
+def test_a_file_that_cannot_be_read(tmp_path, name):
+    with pytest.raises(InputFileError, match=re.escape(str(tmp_path / name)) + ": (No such file|Is a directory)") as e:
+        load(tmp_path / name)
+    assert e.value.exit_code == 66
+
+
+def test_a_file_that_is_not_text(tmp_path):
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"[loop]\n\xff\xfe")
+    with pytest.raises(InputFileError, match="not a text file in UTF-8 \\(byte 7\\)"):
+        load(path)
+
+
+def test_a_file_that_is_not_toml(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text("[loop]\nrate_hz = \n")
+    with pytest.raises(ConfigError, match=r"broken\.toml: 1 fault\n  not valid TOML: .*line 2, column 11"):
+        load(path)
+
+
+ONE_FAULT = [
+    # loop
+    ((RATE, ""), "loop.rate_hz: missing; it is needed"),
+    ((RATE, "rate_hz = 0\n"), "loop.rate_hz: 0: Input should be greater than 0"),
+    ((RATE, "rate_hz = nan\n"), "loop.rate_hz: nan: Input should be a finite number"),
+    ((RATE, 'rate_hz = "fast"\n'), "loop.rate_hz: 'fast': Input should be a valid number"),
+    ((RATE, "rate_hz = true\n"), "loop.rate_hz: True: Input should be a valid number"),
+    ((RATE, "rate_hz = 2e6\n"), "loop.rate_hz: 2000000.0: Input should be less than or equal to 1000000"),
+    ((RATE, RATE + "priorty = 3\n"), "loop.priorty: unknown key; did you mean priority\\?"),
+    ((RATE, RATE + "xyzzy = 3\n"), "loop.xyzzy: unknown key"),
+    ((RATE, RATE + 'mode = "on"\n'), "loop.mode: 'on': Input should be 'off', 'raw', 'feedforward' or 'closed_loop'"),
+    (("[recording]", "[recrding]"), "recrding: unknown key; did you mean recording\\?"),
+    # driver
+    (('kind = "sim"', 'kind = "comedy"'), r"driver.kind: 'comedy' is not a known driver; there are .*\bsim\b.*"),
+    (('kind = "sim"', ""), "driver.kind: missing; the name of a driver is needed"),
+    (("latency_ticks = 0 ", "latency_ticks = 99 "), "driver.latency_ticks: 99: Input should be less than .* 16"),
+    (('input = "adc0"', 'input = "adc7"'), "driver.channels.x: input 'adc7' with output 'dac0'; .*"),
+    (("[driver.channels.x]", "[driver.channels.x]\nscale = 1"), "driver.channels.x.scale: unknown key"),
+    (("um_per_v = 10.0\n# off", "um_per_v = 0.0\n# off"), "driver.channels.x: um_per_v: 0; any other .*"),
+    # axis
+    (("[[axis]]", "[axis]"), r"axis: one table; a list of tables, each headed \[\[axis\]\], is needed"),
+    (('name = "x"', 'name = "X 1"'), "axis.X 1.name: 'X 1': String should match pattern .*"),
+    (("[1.0, 7.9e6]", "[1.0, 5.0, 7.9e6], [1.0, 3.0]"), "axis.x.controller: improper: 7 zeros but 5 poles; .*"),
+    (("gain = 0.016", "gain = nan"), "axis.x.controller.gain: nan: Input should be a finite number"),
+    (("gain = 0.016", ""), "axis.x.controller: gain: needed in form 'factors'"),
+    (("gain = 0.016", "gain = 0.016\nd = 1.0"), "axis.x.controller: d: not part of form 'factors', which takes .*"),
+    (("[0.095, 0.38,", "[0.095, inf,"), "axis.x.feedforward.thresholds_v.1: inf: Input should be a finite number"),
+    (("2.55, 0.57,", "2.55, -57,"), "axis.x.feedforward: weights: .* every partial sum must be above 0, or .*"),
+    (("prewarp_hz = 595.5", "prewarp_hz = 6e3"), "axis.x.controller: prewarp_hz: 6000.0; between 0 and .* 5000 Hz, .*"),
+    (('method = "tustin" ', 'method = "euler" '), "axis.x.controller.method: 'euler': Input should be 'matched', .*"),
+    (("drive_v = 10.0 ", "drive_v = 12.0 "), re.escape("axis.x.limits.drive_v: 12.0 is outside the driver's ±10.0 V")),
+    (("drive_v = 10.0 ", "drive_v = -1.0 "), "axis.x.limits.drive_v: -1.0: Input should be greater than 0"),
+    (("sensor_min_v = -9.99", "sensor_min_v = 9.99"), "axis.x.interlocks.sensor_min_v: 9.99 must be below .* 9.99"),
+    (UNSTABLE, "axis.x.controller: the loop is unstable on axis.x.model at 10000 Hz .*; allow_unstable = true .*"),
+    ((CONTROLLER, ""), "axis.x.controller: missing; mode closed_loop needs it"),
+    # reference
+    (("dwell_s = 0.2", "dwell_s = 1e-9"), "axis.x.reference.dwell_s: 1e-09 is less than a period of 0.0001 s"),
+    (('kind = "steps"', 'kind = "stairs"'), "axis.x.reference.kind: 'stairs': allowed are 'hold', 'steps', .*"),
+    (('kind = "steps"', ""), "axis.x.reference.kind: missing; it is needed"),
+    ((REFERENCE, 'kind = "table"\nfile = "absent.csv"\n\n'), "axis.x.reference.file: .*absent.csv: No such file .*"),
+    ((REFERENCE, 'kind = "input"\nchannel = "knob"\nper_v = 1.0\n\n'), "axis.x.reference.*'knob' is not a .* adc0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "message"), ONE_FAULT, ids=lambda value: str(value)[:60])
+def test_one_mistake_one_line(change, message):
+    (found,) = faults(change)
+    assert re.fullmatch(message, found), found
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ('at_tick = -1\nmode = "off"', "schedule.0.at_tick: -1: Input should be greater than or equal to 0"),
+        ('at_tick = 1\nmode = "of"', "schedule.0.mode: 'of': Input should be 'off', .*"),
+        ("at_tick = 1", "schedule.0: 0 changes; exactly one of mode, reference, reset_trip is allowed in an entry"),
+        ('at_tick = 1\nmode = "off"\nreset_trip = true', "schedule.0: 2 changes; exactly one of .*"),
+        ('at_tick = 1\naxis = "x"\nmode = "off"', "schedule.0: axis 'x': allowed with a reference only; .*"),
+        ('at_tick = 1\naxis = "z"\nreference = {kind = "hold"}', "schedule.axis: 'z' is not an axis; there are x"),
+        ('at_tick = 1\nreference = {kind = "table", file = "no.npy"}', "schedule, at_tick 1: file: .*no.npy: No .*"),
+    ],
+)  # fmt: skip
+def test_one_mistake_in_the_schedule(lines, message):
+    (found,) = faults(more=entry(lines))
+    assert re.fullmatch(message, found), found
+
+
+def test_all_mistakes_at_once():
+    found = faults(
+        (RATE, "rate_hz = -1\nspin = 3\n"),
+        ('kind = "sim"', 'kind = "comedy"'),
+        ("drive_v = 10.0 ", "drive_v = 0.0 "),
+        ("dwell_s = 0.2", 'dwell_s = "long"'),
+        more=entry("at_tick = 1"),
+    )
+    keys = [fault.split(":")[0] for fault in found]
+    assert sorted(keys) == sorted(
+        ["loop.rate_hz", "loop.spin", "driver.kind", "axis.x.limits.drive_v", "axis.x.reference.dwell_s", "schedule.0"]
+    )
+
+
+def test_the_message_counts_and_lists():
+    with pytest.raises(
+        ConfigError, match=r"^paper\.toml: 2 faults\n  loop\.rate_hz: missing.*\n  loop\.x: unknown key$"
+    ):
+        parse(TEXT.replace(RATE, "x = 1\n"), "paper", PAPER.parent, "paper.toml")
+
+
+def test_axes_and_channels_that_do_not_belong_together():
+    assert faults(("[driver.channels.x]", "[driver.channels.z]")) == [
+        "driver.channels.x: missing; the axis needs input, output, um_per_v",
+        "driver.channels.z: there is no axis of this name",
+    ]
+    again = '[[axis]]\nname = "x"\nfeedforward = { thresholds_v = [0.0], weights_um_per_v = [1.0] }\n'
+    assert faults(more=again) == ["axis.x: named twice"]

@@ -1,0 +1,63 @@
+"""What only shows when the parts of a configuration are put together."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from drivers.sim import SimDriver
+from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
+
+
+def test_mistakes_that_only_fitting_shows_at_once():
+    found = faults(
+        ("drive_v = 10.0 ", "drive_v = 12.0 "), ("dwell_s = 0.2", "dwell_s = 1e-9"), UNSTABLE, duration_s=1e-9
+    )
+    assert [fault.split(":")[0] for fault in found] == [
+        "axis.x.controller",
+        "axis.x.limits.drive_v",
+        "axis.x.reference.dwell_s",
+        "--duration",
+    ]
+
+
+def test_an_unstable_loop_may_be_asked_for():
+    prepared = built((UNSTABLE[0], "gain = 0.16\nallow_unstable = true"))
+    assert len([warning for warning in prepared.warnings if "the loop is unstable" in warning]) == 1
+
+
+def test_plain_tustin_is_warned_of():
+    warnings = built(("prewarp_hz = 595.5\n", "\n")).warnings
+    assert re.search(r"axis\.x\.controller: tustin at 10000 Hz moves the notch at 595\.5 Hz to 588\.7 Hz", warnings[0])
+
+
+def test_without_a_model_nothing_is_promised():
+    model = TEXT[TEXT.index("[axis.model]") : TEXT.index("# delay_ticks")]
+    assert built((model, "")).warnings == ("axis.x.model: missing; stability and margins are not checked",)
+
+
+def test_an_anti_windup_too_slow_for_an_unstable_controller():
+    """A pole at 3000 rad/s grows by 1.35 a tick: followed slowly, it would run away while limited."""
+    unstable = 'form = "transfer_function"\nnumerator = [1.0]\ndenominator = [1.0, -3000.0]\ntracking_s = {}\n\n'
+    model = TEXT[TEXT.index("[axis.model]") : TEXT.index("# delay_ticks")]
+    for tracking_s, good in (("0.01", False), ("0.0", True)):
+        changes = [(CONTROLLER, f"[axis.controller]\n{unstable.format(tracking_s)}"), (model, "")]
+        if good:
+            built(*changes)
+        else:
+            (found,) = faults(*changes)
+            assert re.fullmatch(r"axis\.x\.controller\.tracking_s: 0\.01 s leaves its states unstable .* needed", found)
+
+
+@pytest.mark.parametrize("duration_s", [0.0, 1e-9, -1.0, float("nan"), float("inf")])
+def test_durations_without_a_tick(duration_s):
+    (found,) = faults(duration_s=duration_s)
+    assert found == f"--duration: {duration_s} s is no tick at 10000 Hz; at least one period is needed"
+
+
+def test_real_hardware_is_not_run_unpaced(monkeypatch):
+    facts = SimDriver.facts.fget
+    monkeypatch.setattr(SimDriver, "facts", property(lambda driver: replace(facts(driver), real=True)))
+    assert faults(paced=False) == ["driver 'sim' moves real hardware: it cannot run unpaced, in virtual time"]
