@@ -1,4 +1,4 @@
-"""The rig as a board of its own: a free-running process with its own clock, behind shared memory that looks like a card.
+"""The rig as a board of its own: a free-running process with its own clock behind memory that looks like a card.
 
 The controller's side writes DAC codes and reads ADC codes; the board moves the rig at its own rate whether or not
 anybody writes, and holds the last codes like a card does. What it saw at its outputs (lowest, highest, largest step)
@@ -122,7 +122,9 @@ def _lock(fd: int, path: Path) -> None:
 
 
 @jit
-def _run(coefficients, state, words, sample_ns, dac_codes, adc_codes, seen, timespec, start_ns, period_ns, index, count):
+def _run(
+    coefficients, state, words, sample_ns, dac_codes, adc_codes, seen, timespec, start_ns, period_ns, index, count
+):
     """`count` periods of the board's fixed grid; periods that a stall swallowed still move the rig. Next index."""
     for _ in range(count):
         wake_ns = start_ns + np.int64(index * period_ns)

@@ -20,6 +20,7 @@ from drivers.registry import driver_class
 from hil.options import Options
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.options import AxisOptions, ReferenceOptions
+from rtloop.service.options import ServiceOptions
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -82,6 +83,8 @@ class RecordingOptions(Options):
     rotate_mib: float | None = Field(default=None, gt=0)
     rotate_s: float | None = Field(default=None, gt=0)
     min_free_mib: float = Field(default=64.0, ge=0)
+    message_index: bool = True
+    """16 bytes a tick, without which viewers that are not in Python refuse the file."""
 
 
 class _Sections(Options):
@@ -89,6 +92,7 @@ class _Sections(Options):
     axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
     schedule: Annotated[tuple[ScheduleOptions, ...], Field(strict=False)] = ()
     recording: RecordingOptions = RecordingOptions()
+    service: ServiceOptions = ServiceOptions()
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,7 @@ class Configuration:
     axes: tuple[AxisOptions, ...]
     schedule: tuple[ScheduleOptions, ...]
     recording: RecordingOptions
+    service: ServiceOptions
     driver_kind: str
     driver_options: Options
     channels: Mapping[str, ChannelOptions]
@@ -147,7 +152,17 @@ def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
     if faults or sections is None or options is None:
         raise ConfigError(source, faults)
     return Configuration(
-        name, folder, text, sections.loop, sections.axis, sections.schedule, sections.recording, kind, options, channels
+        name=name,
+        folder=folder,
+        text=text,
+        loop=sections.loop,
+        axes=sections.axis,
+        schedule=sections.schedule,
+        recording=sections.recording,
+        service=sections.service,
+        driver_kind=kind,
+        driver_options=options,
+        channels=channels,
     )
 
 
@@ -177,11 +192,15 @@ def _validated(adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[st
     try:
         return adapter.validate_python(raw)
     except ValidationError as error:
-        known = _keys(adapter.json_schema())
-        details = error.errors(include_url=False)
-        details = [detail for detail in details if not (detail["type"] == "too_short" and detail["input"])]
-        faults += [_fault(detail, prefix, raw, known) for detail in details]
+        faults += describe(error, prefix, raw, _keys(adapter.json_schema()))
         return None
+
+
+def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
+    """One line for each fault of `raw`, which stands at the key `prefix`."""
+    details = error.errors(include_url=False)
+    details = [detail for detail in details if not (detail["type"] == "too_short" and detail["input"])]
+    return [_fault(detail, prefix, raw, known_keys or set()) for detail in details]
 
 
 def _keys(schema: Any) -> set[str]:

@@ -7,6 +7,8 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivers.base import Driver
 from drivers.registry import driver_class
 from rtloop import config
@@ -55,7 +57,7 @@ def _coefficients(configuration: Configuration, recording: Recording) -> Records
         faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g}; the recording has {header['rate_hz']:g}")
     if faults:
         raise ConfigError(configuration.name, faults)
-    return prepare(changed(configuration, schedule=())).plan.coefficients
+    return prepare(changed(configuration, schedule=())).plan.coefficients.view(np.recarray)
 
 
 def _rig(configuration: Configuration, recording: Recording) -> Driver:

@@ -111,6 +111,10 @@ def print_summary(summary: dict[str, Any]) -> None:
         table.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
     else:
         table.add_row("clock", "virtual", "unpaced: nothing was timed")
+    if len(summary["parts"]) > 1:
+        table.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
+    for problem in summary["problems"]:
+        table.add_row("[red]problem[/]", "", problem)
     for trip in summary["trips"]:
         table.add_row("[red]trip[/]", f"tick {trip['tick']}", ", ".join(trip["causes"]))
     console.print(table)

@@ -1,4 +1,4 @@
-"""What the terminal shows of a recording: verdict of a replay, another law beside it, what was recovered or exported."""
+"""What the terminal shows of a recording: verdict of a replay, another law beside it, what was recovered."""
 
 from __future__ import annotations
 

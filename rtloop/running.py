@@ -15,8 +15,10 @@ import click
 from rtloop.config import load
 from rtloop.errors import LoopFault, OutputError
 from rtloop.prepare import Prepared, prepare
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
-from rtloop.report import RunView, print_run
+from rtloop.report import Counter, RunView, print_run
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 
 PROGRESS_PERIOD_S = 0.1
@@ -28,14 +30,19 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
         for warning in prepared.warnings:
             click.echo(f"warning: {warning}", err=True)
-        supervisor = Supervisor(processes, prepared, recording_path(prepared, out))
+        path = recording_path(prepared, out)
+        recover_leftovers(path.parent)
+        supervisor = Supervisor(processes, prepared, path)
         with _stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
             result = supervisor.run(_every(PROGRESS_PERIOD_S, view.show))
-    summary = run_summary(prepared, result) | {"startup_s": supervisor.startup_s}
+    summary = run_summary(prepared, result)
+    summary["startup_s"] = supervisor.startup_s
     if as_json:
         click.echo(json.dumps(summary))
     else:
         print_run(prepared, summary)
+    for note in summary["notes"]:
+        click.echo(f"note: {note}", err=True)
     if summary["error"]:
         click.echo(f"rtloop: {summary['error']}", err=True)
     return result.exit_code or (LoopFault.exit_code if summary["trips"] else 0)
@@ -43,8 +50,10 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
 
 def run_summary(prepared: Prepared, result: RunResult) -> dict[str, Any]:
     """The recording's summary with what the run adds to it."""
-    summary = summarise(result.recording) if result.recording.exists() else {}
-    summary["recording"] = str(result.recording)
+    summary = summarise(result.recordings) if result.recordings else {}
+    summary["recording"] = str(result.recordings[0]) if result.recordings else None
+    summary["recordings"] = [str(path) for path in result.recordings]
+    summary["notes"] = list(result.notes)
     summary["outcome"] = result.outcome
     summary["error"] = result.error
     summary["recorder"] = result.recorder
@@ -66,6 +75,18 @@ def recording_path(prepared: Prepared, out: Path | None) -> Path:
         if not path.exists() and not path.with_name(path.name + ".part").exists():
             return path
     raise OutputError(f"{folder}: no free name for {stem}.mcap")
+
+
+def recover_leftovers(folder: Path) -> None:
+    """Complete what killed runs left in `folder`, and say so; what cannot be is said too and stays."""
+    for part in leftovers(folder):
+        try:
+            with Counter("ticks recovered", sys.stderr) as counter:
+                report = recover(part, progress=counter.show)
+        except RecordingError as error:
+            click.echo(f"warning: {error}", err=True)
+            continue
+        click.echo(f"{report['output']}: {report['ticks']:,} ticks recovered from {part.name}, which is kept", err=True)
 
 
 @contextmanager

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 
 class Signal(NamedTuple):
+    """A column of the record."""
+
     name: str
     unit: str
     meaning: str

@@ -87,7 +87,7 @@ class Assembly:
     def _share(self, plan: Plan, block: SharedBlock) -> None:
         """What lies in the shared block, the schedule and the generators."""
         loop = self.loop
-        for name in ("words", "last_drive_v", "commands", "table"):
+        for name in ("words", "last_drive_v", "commands", "table", "staged"):
             self._point(name, block[name])
         for name in ("ticks", "events", "snapshots"):
             for part in ("head", "marks", "slots"):

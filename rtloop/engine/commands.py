@@ -10,18 +10,20 @@ import numpy as np
 
 from hil.atomics import load_acquire, store_release
 from hil.compiled import jit, seldom
-from rtloop.engine.context import axes_of, event_ring, generators_of, messages, state_of, words_of
+from rtloop.engine.context import axes_of, event_ring, generators_of, messages, octets, state_of, words_of
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
 from rtloop.law.law import reset_trip, set_mode
+from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.reference import GENERATOR_PARAMETERS
 
 COMMANDS_PER_TICK = 4
 HEAD, TAIL, STOP_WORD = int(Word.COMMANDS_HEAD), int(Word.COMMANDS_TAIL), int(Word.STOP)
-SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, REFUSED = (
-    int(kind) for kind in (Kind.SET_MODE, Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.STOP, Kind.REFUSED)
+SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, LOAD_LAW, REFUSED = (
+    int(kind) for kind in (Kind.SET_MODE, Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.STOP, Kind.LOAD_LAW, Kind.REFUSED)
 )
+COEFFICIENT_BYTES = COEFFICIENTS.itemsize
 
 
 class QueueFull(RuntimeError):
@@ -64,13 +66,16 @@ def _apply(loop, command):
     state = state_of(loop)
     if command.kind == SET_MODE:
         if state.trip != 0 or loop.stopping != 0:
-            publish_event(loop, REFUSED, command.axis, command.origin, float(command.kind), command.values[0])
+            values = (float(command.kind), command.values[0])
+            publish_event(loop, REFUSED, command.axis, command.origin, command.identity, values)
             return
         set_mode(axes_of(loop), state, np.int64(command.values[0]), loop.tick == 0)
     elif command.kind == SET_REFERENCE:
         _set_reference(loop, command)
     elif command.kind == RESET_TRIP:
         reset_trip(state)
+    elif command.kind == LOAD_LAW:
+        _load_law(loop, command.axis, command.values[0] != 0.0)
     elif command.kind == STOP:
         store_release(words_of(loop), STOP_WORD, ONE)  # the loop reports it when it stops
         return
@@ -99,8 +104,20 @@ def _set_reference(loop, command):
                 generators[a].parameters[i] = command.values[1 + i]
 
 
+@jit
+def _load_law(loop, axis, another):
+    """Take the staged coefficients of an axis; another controller continues from the command in force."""
+    offset = axis * COEFFICIENT_BYTES
+    size = (loop.axis_count) * COEFFICIENT_BYTES
+    staged, active = octets(loop.staged, size), octets(loop.coefficients, size)
+    active[offset : offset + COEFFICIENT_BYTES] = staged[offset : offset + COEFFICIENT_BYTES]
+    if another:
+        axes_of(loop)[axis].entering = 1
+    loop.next_snapshot = loop.tick
+
+
 @seldom
-def publish_event(loop, kind, axis, origin, first, second):
+def publish_event(loop, kind, axis, origin, identity, values):
     """An event of this tick with two values."""
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
@@ -108,10 +125,10 @@ def publish_event(loop, kind, axis, origin, first, second):
     event.kind = kind
     event.axis = axis
     event.origin = origin
-    event.identity = 0
+    event.identity = identity
     for i in range(MESSAGE_VALUES):
         event.values[i] = 0.0
-    event.values[0] = first
-    event.values[1] = second
+    event.values[0] = values[0]
+    event.values[1] = values[1]
     publish(ring, position)
     loop.events += 1

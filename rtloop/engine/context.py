@@ -24,7 +24,7 @@ _ADDRESSES = (
     # law
     *("coefficients", "axes", "law_state", "generators", "table", "adc_v", "references", "input_index", "output_index"),
     # shared block
-    *("words", "last_drive_v", "commands", "schedule"),
+    *("words", "last_drive_v", "commands", "schedule", "staged"),
     *(f"{ring}_{part}" for ring in ("ticks", "events", "snapshots") for part in ("head", "marks", "slots")),
 )
 # of 32 bits and unsigned: sums of them are never negative, so that no index needs a check of its sign

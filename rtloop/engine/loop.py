@@ -82,15 +82,15 @@ def run_ticks(loop, until_tick):
 
 @jit
 def _prepare(loop):
-    """What a tick does before its deadline: state snapshot, schedule and commands, stop request."""
-    if loop.tick >= loop.next_snapshot:
-        _publish_snapshot(loop)
-        loop.next_snapshot = loop.tick + loop.snapshot_ticks
+    """What a tick does before its deadline: schedule and commands, stop request, snapshot of the law."""
     apply_commands(loop)
     if loop.stopping == 0 and load_acquire(words_of(loop), STOP_WORD) != 0:
         loop.stopping = 1
-        publish_event(loop, STOP_KIND, ALL_AXES, SUPERVISOR, 0.0, 0.0)
+        publish_event(loop, STOP_KIND, ALL_AXES, SUPERVISOR, 0, (0.0, 0.0))
         set_mode(axes_of(loop), state_of(loop), OFF, False)
+    if loop.tick >= loop.next_snapshot:
+        _publish_snapshot(loop)
+        loop.next_snapshot = loop.tick + loop.snapshot_ticks
 
 
 @jit
@@ -189,20 +189,20 @@ def _report(loop, status, written, missed):
     """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
     new_trip = state_of(loop).new_trip
     if new_trip != 0:
-        publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, float(new_trip), 0.0)
+        publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, (float(new_trip), 0.0))
     if loop.failed == 0 and (status < 0 or written < 0):
         loop.failed = WRITE_FAILED if written < 0 else READ_FAILED
         failing, verb = (written, 1.0) if written < 0 else (status, 0.0)
-        publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, float(failing), verb)
+        publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), verb))
     if missed > 0.0:
         if loop.tick >= loop.next_late_event:
-            publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, missed, 0.0)
+            publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))
         loop.next_late_event = loop.tick + np.int64(1.0 / loop.period_s)
 
 
 @seldom
 def _publish_snapshot(loop):
-    """Tick, coefficients and state as bytes, as they are before the commands of this tick."""
+    """Tick, coefficients and state as bytes, as they are after the commands of this tick."""
     ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)
     row = ring.slots[claim(ring, position)]
     for i in range(8):

@@ -26,7 +26,7 @@ RING_SECONDS = 6.0
 # numbers of slots are powers of two: the rings rely on it
 MIN_RING_TICKS = 4096
 EVENT_SLOTS = 4096
-SNAPSHOT_SLOTS = 16
+SNAPSHOT_SLOTS = 64
 COMMAND_SLOTS = 256
 
 
@@ -143,6 +143,7 @@ def _specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ..
         "words": (word, (64,)),
         "last_drive_v": (real, (sizes.axes,)),
         "table": (real, (max(sizes.table_samples, 1),)),
+        "staged": (np.dtype(np.uint8), (sizes.snapshot_bytes,)),
         "commands": (MESSAGE, (COMMAND_SLOTS,)),
     }
     slots: Sequence[tuple[str, np.dtype[Any], tuple[int, ...]]] = (

@@ -35,6 +35,8 @@ class Kind(IntEnum):
     RESET_TRIP = 3
     STOP = 4
     """Ramp down, then end."""
+    LOAD_LAW = 5
+    """Take the staged coefficients of the axis; values[0]: 1 where the controller is another one."""
     REFUSED = 100
     """values[0]: kind of the command; values[1]: its first value."""
     TRIPPED = 101

@@ -46,6 +46,8 @@ class Plan:
     table: npt.NDArray[np.float64]
     schedule: npt.NDArray[Any]
     observed: tuple[str, ...]
+    spare_samples: int = 0
+    """Room behind `table` for waveforms that come while the loop runs."""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -56,7 +58,8 @@ class Plan:
     def sizes(self) -> Sizes:
         """Sizes of the shared block."""
         axes = len(self.axes)
-        return Sizes(len(self.columns), axes, self.pacing.rate_hz, snapshot_bytes(axes), self.table.size)
+        samples = self.table.size + self.spare_samples
+        return Sizes(len(self.columns), axes, self.pacing.rate_hz, snapshot_bytes(axes), samples)
 
     def driver(self) -> Driver:
         """The driver, not open. Raises ValueError or DriverError."""

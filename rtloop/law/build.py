@@ -11,7 +11,7 @@ import numpy.typing as npt
 from drivers.base import Channel
 from rtloop.design.discretise import DiscreteController
 from rtloop.design.realisation import blocks, row_bands
-from rtloop.law.layout import COEFFICIENTS, LANES, MAX_ORDER, Records, records
+from rtloop.law.layout import BLOCK, COEFFICIENTS, LANES, MAX_ORDER, Records, records
 from rtloop.law.options import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
 
 
@@ -71,31 +71,32 @@ def _controller(controller: DiscreteController | None) -> Mapping[str, object]:
     if order > MAX_ORDER:
         raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
     places = _places(controller.a)
-    vectors = {
-        "b": controller.b,
-        "c": controller.c,
-        "tracking": controller.antiwindup,
-        "steady_state": controller.steady_state_gain,
-    }
-    fields: dict[str, object] = {"d": controller.d}
-    for name, values in vectors.items():
-        fields[name] = np.zeros(MAX_ORDER)
-        fields[name][places] = values
+
+    def placed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        vector = np.zeros(MAX_ORDER)
+        vector[places] = values
+        return vector
+
     a = np.zeros((MAX_ORDER, MAX_ORDER))
     a[np.ix_(places, places)] = controller.a
     states = np.arange(MAX_ORDER)
     partners = states ^ LANES
-    fields |= {"own": a[states, states], "partner": a[states, partners]}
+    own, partner = a[states, states], a[states, partners]
     a[states, states] = a[states, partners] = 0.0
     bands = row_bands(a)
-    in_use = -(-(int(places.max(initial=-1)) + 1) // (2 * LANES)) * 2 * LANES
     return {
-        **fields,
-        "order": in_use,
+        "order": -(-(int(places.max(initial=-1)) + 1) // BLOCK) * BLOCK,
+        "own": own,
+        "partner": partner,
         "coupling": a,
         "coupled": bool(a.any()),
         "row_start": bands[:, 0],
         "row_stop": bands[:, 1],
+        "b": placed(controller.b),
+        "c": placed(controller.c),
+        "d": controller.d,
+        "tracking": placed(controller.antiwindup),
+        "steady_state": placed(controller.steady_state_gain),
     }
 
 
@@ -111,7 +112,7 @@ def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     places = np.zeros(a.shape[0], np.int64)
     for number, pair in enumerate(pairs):
         for half, state in enumerate(pair):
-            places[state] = number // LANES * 2 * LANES + number % LANES + half * LANES
+            places[state] = number // LANES * BLOCK + number % LANES + half * LANES
     return places
 
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from hil.compiled import inlined, jit, seldom
 from rtloop.law.hysteresis import total
-from rtloop.law.layout import LANES
-
-BLOCK = 2 * LANES
-"""States in a block: four, and then the partners of these four."""
+from rtloop.law.layout import BLOCK, LANES
 
 
 @jit

@@ -15,6 +15,8 @@ import numpy.typing as npt
 LANES = 4
 """Play operators and pairs of controller states are computed four at a time. What is in use is padded to a multiple
 of this with zero weights, so that no kernel needs a remainder; counts have 8 bits, so that no index can be negative."""
+BLOCK = 2 * LANES
+"""Controller states in a block: four, and then the partners of these four."""
 MAX_PLAYS = 64
 MAX_ORDER = 24
 MAX_TAPS = 128
@@ -60,6 +62,7 @@ COEFFICIENTS = _whole_lines(
         ("coupled", np.uint8),
         ("row_start", np.uint8, (MAX_ORDER,)),
         ("row_stop", np.uint8, (MAX_ORDER,)),
+        ("unused", np.uint8, (5,)),  # no byte of a record may lie between its fields: copies would leave it undefined
         ("d", np.float64),
         ("tracking_share", np.float64),
         ("dead_band_v", np.float64),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,14 +75,14 @@ class Recording:
                 self._signals[name] = signal
         return [self._signals[name] for name in names]
 
-    def blocks(self, names: Sequence[str] | None = None) -> Iterator[Rows]:
+    def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
         """Arrays (n, names) of consecutive ticks, for what does not fit into memory."""
         with Parts(self.paths) as readers:
             for reader in readers:
                 yield from reader.blocks(names)
             self._note_problems(readers)
 
-    def between(self, names: Sequence[str], start_s: float, end_s: float) -> Iterator[Rows]:
+    def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
         """Arrays (n, names) of the ticks that were due between two times; chunks outside are not read."""
         with Parts(self.paths) as readers:
             for reader in readers:
@@ -95,7 +95,7 @@ class Recording:
                         yield rows[inside, 1:]
             self._note_problems(readers)
 
-    def snapshots(self) -> Iterator[Snapshot]:
+    def snapshots(self) -> Generator[Snapshot]:
         """The recorded states of the law, in order."""
         with Parts(self.paths) as readers:
             for reader in readers:

@@ -30,7 +30,8 @@ from rtloop.signals import DEADLINE
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
-AHEAD = 64
+AHEAD = 16
+"""Chunks that are decompressed beyond the one that is asked for."""
 
 
 class Snapshot(NamedTuple):
@@ -127,6 +128,10 @@ class Reader:
                 self._report("a snapshot of the law is damaged")
                 continue
             yield Snapshot(int.from_bytes(data[:8], "little"), data)
+
+    def check_snapshots(self) -> None:
+        """Read all snapshots for what is wrong with them."""
+        deque(self.snapshots(), maxlen=0)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Each chunk in the order of the file: either its ticks or its messages of the slow topics."""

@@ -31,6 +31,12 @@ def output_of(path: Path) -> Path:
     return path.with_suffix("") if path.suffix == ".part" else path.with_name(f"{path.stem}-recovered.mcap")
 
 
+def leftovers(folder: Path) -> list[Path]:
+    """Unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
+    parts = sorted(folder.glob("*.mcap.part"))
+    return [part for part in parts if not output_of(part).exists() and not _grows(part)]
+
+
 class Recovery:
     """Copies what `reader` still finds into `writer`, and keeps account."""
 
@@ -92,12 +98,13 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
     """
     path = Path(path)
     output = output_of(path) if output is None else Path(output)
-    _refuse_growing(path)
+    if _grows(path):
+        raise RecordingError(f"{path}: is being written by a recorder right now")
     with Reader(path, tolerant=True) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         output.with_name(output.name + UNFINISHED).unlink(missing_ok=True)
         log_time = header["created_unix_ns"] if header["paced"] else 0
-        writer = Writer(output, header, log_time, suffix=UNFINISHED)
+        writer = Writer(output, header, log_time, message_index=True, suffix=UNFINISHED)
         try:
             writer.start_unix_ns = reader.start_unix_ns
             recovery = Recovery(reader, writer)
@@ -119,15 +126,16 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
         }
 
 
-def _refuse_growing(path: Path) -> None:
-    """The recorder holds a lock on the file that it writes."""
+def _grows(path: Path) -> bool:
+    """Whether a recorder holds its lock on the file."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
-        return  # the reader says it better
+        return False  # the reader says it better
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise RecordingError(f"{path}: is being written by a recorder right now") from None
+        return True
     finally:
         os.close(fd)
+    return False

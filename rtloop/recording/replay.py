@@ -7,7 +7,7 @@ replay goes on from the next snapshot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,7 +27,7 @@ from rtloop.signals import Flag
 
 MEASURED = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
 """Columns that a clock made and that no output depends on; so is the flag OVERRUN."""
-REPLAYED = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
+LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
 Progress = Callable[[int], None]
 
 
@@ -77,10 +77,10 @@ def check_layout(recording: Recording) -> None:
         )
 
 
-def recorded_commands(recording: Recording) -> np.ndarray[Any, Any]:
+def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
     """The commands that took effect, as a schedule; those for references are not needed, whose samples are inputs."""
     commands = [message_of(event, recording.header["axes"]) for event in recording.events]
-    parts = [command for command in commands if command is not None and command["kind"][0] in REPLAYED]
+    parts = [command for command in commands if command is not None and command["kind"][0] in kinds]
     return np.concatenate([np.zeros(0, MESSAGE), *parts])
 
 
@@ -92,7 +92,7 @@ def consecutive(rows: Rows) -> list[Rows]:
 class _Replay:
     def __init__(self, recording: Recording, snapshots: Iterator[Snapshot], progress: Progress | None) -> None:
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
-        self._commands = recorded_commands(recording)
+        self._commands = recorded_commands(recording, (*LAW_COMMANDS, Kind.LOAD_LAW))
         self._next: Snapshot | None = next(snapshots, None)
         self._rerun: Rerun | None = None
         self._report = ReplayReport(problems=recording.problems)
@@ -122,9 +122,7 @@ class _Replay:
         """Replay consecutive rows, in stretches that end where a snapshot lies."""
         while len(rows) and not self._report.first_difference:
             tick = int(rows[0, signals.TICK])
-            self._meet_snapshot(tick)
-            if self._report.first_difference:
-                return
+            snapshot = self._meet_snapshot(tick)
             until = tick + len(rows) if self._next is None else self._next.tick
             count = min(len(rows), until - tick)
             if self._rerun is None:
@@ -132,22 +130,29 @@ class _Replay:
             else:
                 count = min(count, self._rerun.room(tick))
                 self._compare(self._rerun, rows[:count])
+                if snapshot is not None:
+                    self._compare_snapshot(self._rerun, snapshot)
             rows = rows[count:]
 
-    def _meet_snapshot(self, tick: int) -> None:
-        """At a snapshot compare the law's state with it, or start from it."""
+    def _meet_snapshot(self, tick: int) -> Snapshot | None:
+        """At a snapshot start from it, or return it to be compared with one of the rerun's own."""
         while self._next is not None and self._next.tick < tick:
             self._next = next(self._snapshots, None)
         if self._next is None or self._next.tick != tick:
-            return
+            return None
         snapshot, self._next = self._next, next(self._snapshots, None)
         if self._rerun is None:
             self._start(snapshot)
-            return
+            return None
+        self._rerun.expect_snapshot(snapshot.data)
+        return snapshot
+
+    def _compare_snapshot(self, rerun: Rerun, snapshot: Snapshot) -> None:
+        """Coefficients and state after the commands of a tick; a tick whose outputs differ was reported already."""
+        replayed, recorded = rerun.snapshot()[8:], snapshot.data[8:]
         self._report.snapshots += 1
-        replayed, recorded = self._rerun.law_bytes(), snapshot.data[8:]
-        if replayed != recorded:
-            self._differs(tick, *first_difference(recorded, replayed, self._recording.header["axes"]))
+        if replayed != recorded and not self._report.first_difference:
+            self._differs(snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"]))
 
     def _start(self, snapshot: Snapshot) -> None:
         header = self._recording.header
@@ -155,7 +160,8 @@ class _Replay:
             _, *law = split_snapshot(snapshot.data, len(header["axes"]))
         except ValueError as error:
             raise RecordingError(f"{self._recording.paths[0]}: {error}") from None
-        self._rerun = Rerun(header, Tape(header), Law(*law), self._commands, snapshot.tick)
+        still_to_come = self._commands[self._commands["tick"] > snapshot.tick]
+        self._rerun = Rerun(header, Tape(header), Law(*law), still_to_come, snapshot.tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
         replayed = rerun.execute(recorded)
@@ -181,6 +187,9 @@ def _same(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
     """Which values are equal in bytes; what was measured counts as equal."""
     same = recorded.view(np.uint64) == replayed.view(np.uint64)
     same[:, MEASURED] = True
-    flags = [table[:, signals.FLAGS].astype(np.int64) | int(Flag.OVERRUN) for table in (recorded, replayed)]
-    same[:, signals.FLAGS] = flags[0] == flags[1]
+    flags = recorded[:, signals.FLAGS]
+    with np.errstate(invalid="ignore"):
+        measured = flags.astype(np.int64) & int(Flag.OVERRUN)
+    expected = (replayed[:, signals.FLAGS].astype(np.int64) & ~int(Flag.OVERRUN) | measured).astype(np.float64)
+    same[:, signals.FLAGS] = flags.view(np.uint64) == expected.view(np.uint64)
     return same

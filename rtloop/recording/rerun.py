@@ -1,4 +1,4 @@
-"""The compiled loop on recorded references and commands, with recorded inputs or another source in place of hardware."""
+"""The compiled loop on recorded references and commands, with recorded inputs or another source for hardware."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from rtloop.signals import Flag, Mode
 SLICE_TICKS = 2048
 SMALLEST_RING_HZ = 1.0
 """A ring of the least size: it holds a slice, and stays in the processor's cache."""
-UNLIMITED_SLACK = 1 << 62
+UNLIMITED_SLACK = NEVER = 1 << 62
+TICK_BYTES = 8
 Law = LawArrays
 Rows = np.ndarray[Any, Any]
 
@@ -72,13 +73,13 @@ class Tape:
 
 
 class Rerun:
-    """The loop with the law `law`, about to execute `first_tick`, under the commands of a recording."""
+    """The loop with the law `law`, about to execute `first_tick`, under commands that are still to come."""
 
     def __init__(
         self, header: Mapping[str, Any], source: Source, law: Law, commands: np.ndarray[Any, Any], first_tick: int
     ) -> None:
         self._law, self._source = law, source
-        plan = _plan(header, source, law, commands[commands["tick"] >= first_tick])
+        plan = _plan(header, source, law, commands)
         self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
         self._slots = self._block["ticks_slots"]
         self._context = clock_context(header["rate_hz"])
@@ -86,7 +87,7 @@ class Rerun:
         head, words = self._block.ring("ticks").head, self._block.words
         clock = unpaced_clock(self._context, head, words, Word.RECORDER_CURSOR, UNLIMITED_SLACK)
         self._assembly = Assembly(plan, self._block, source.facts, source.pointers(), clock, law)
-        self._assembly.loop.next_snapshot = np.iinfo(np.int64).max
+        self._assembly.loop.next_snapshot = self._assembly.loop.snapshot_ticks = NEVER
 
     def room(self, tick: int) -> int:
         """Ticks from `tick` on that one call can execute."""
@@ -105,9 +106,16 @@ class Rerun:
         start = first % len(self._slots)
         return self._slots[start : start + int(self._assembly.loop.tick) - first]
 
-    def law_bytes(self) -> bytes:
-        """Coefficients and state as a snapshot holds them."""
-        return b"".join(part.tobytes() for part in self._law)
+    def expect_snapshot(self, recorded: bytes) -> None:
+        """Take a snapshot in the next tick to be executed, and have its recorded coefficients at hand to be loaded."""
+        size = self._law.coefficients.nbytes
+        self._block["staged"][:size] = np.frombuffer(recorded, np.uint8, size, TICK_BYTES)
+        self._assembly.loop.next_snapshot = 0
+
+    def snapshot(self) -> bytes:
+        """The newest snapshot that was taken."""
+        ring = self._block.ring("snapshots")
+        return ring.slots[(int(ring.head[0]) - 1) % len(ring.marks)].tobytes()
 
     def _load_references(self, rows: Rows, first_tick: int) -> None:
         """Recorded references, as a table that starts with these rows; commands cannot change them."""

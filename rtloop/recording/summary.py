@@ -77,6 +77,8 @@ def summarise(path: Files, progress: Progress | None = None) -> dict[str, Any]:
     """
     with Parts(find_files(path)) as readers:
         totals = _sum_up(readers, progress)
+        for reader in readers:
+            reader.check_snapshots()
         return _report(readers, totals)
 
 

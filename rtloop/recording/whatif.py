@@ -7,7 +7,7 @@ law and rig go on as if nothing had been between.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from typing import Any
 
@@ -20,7 +20,7 @@ from rtloop.law.layout import Records, initial_state, split_snapshot
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.recording.outcome import Differences, Performance
-from rtloop.recording.replay import check_layout, consecutive, recorded_commands
+from rtloop.recording.replay import LAW_COMMANDS, check_layout, consecutive, recorded_commands
 from rtloop.recording.rerun import Law, Rerun, Rows, Source, Tape
 from rtloop.signals import Mode
 
@@ -94,16 +94,16 @@ def resimulate(
     }
 
 
-def _pairs(recording: Recording, coefficients: Records, source: Source) -> Iterator[tuple[Rows, Rows]]:
+def _pairs(recording: Recording, coefficients: Records, source: Source) -> Generator[tuple[Rows, Rows]]:
     """Recorded rows and what came of executing them, stretch by stretch, up to the end of either."""
-    commands, rerun = recorded_commands(recording), None
+    commands, rerun = recorded_commands(recording, LAW_COMMANDS), None
     with closing(recording.blocks()) as blocks:
         for rows in (rows for block in blocks for rows in consecutive(block)):
             while len(rows):
                 tick = int(rows[0, signals.TICK])
                 if rerun is None:
                     law = _at_rest(coefficients, Mode(int(rows[0, signals.MODE])))
-                    rerun = Rerun(recording.header, source, law, commands, tick)
+                    rerun = Rerun(recording.header, source, law, commands[commands["tick"] >= tick], tick)
                 count = min(len(rows), rerun.room(tick))
                 replayed = rerun.execute(rows[:count])
                 yield rows[: len(replayed)], replayed

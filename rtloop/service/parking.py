@@ -3,17 +3,63 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.base import Driver, Wiring, index_of
 from drivers.errors import DriverError
+from rtloop.config import load
+from rtloop.engine.memory import SharedBlock
+from rtloop.prepare import prepare
+from rtloop.service.paths import block_path
 
 _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 RAMP_PERIOD_S = 0.001
+BUSY_TIMEOUT_S, BUSY_POLL_S = 3.0, 0.05
+
+
+def park_configuration(config: Path) -> str:
+    """Park the outputs of a configuration in place of a service that died; what was done, in words.
+
+    The last drive comes from the service's shared block. Where there is none, nobody knows it, and the outputs go to
+    their safe values at once. Raises ConfigError, DriverError.
+    """
+    configuration = load(config)
+    plan = prepare(configuration).plan
+    slew = float(np.min(plan.coefficients["trip_slew_v_per_tick"])) * plan.pacing.rate_hz
+    last_v = _last_drive(block_path(configuration), len(plan.axes))
+    deadline_s = time.monotonic() + BUSY_TIMEOUT_S
+    while True:
+        driver = plan.driver()
+        try:
+            park(driver, plan.wiring, plan.axes, [0.0] * len(plan.axes) if last_v is None else last_v, slew)
+        except DriverError:
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(BUSY_POLL_S)  # a loop without its supervisor still ramps down by itself
+            continue
+        start = "an unknown drive" if last_v is None else ", ".join(f"{value:.3f} V" for value in last_v)
+        return f"{configuration.name}: parked from {start}"
+
+
+def _last_drive(path: Path, axes: int) -> list[float] | None:
+    """The last drive in a service's shared block; None where there is no such block."""
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        last_v = SharedBlock.attach(fd, lambda: True)["last_drive_v"].tolist()
+    except EOFError:
+        return None
+    finally:
+        os.close(fd)
+    return last_v if len(last_v) == axes else None
 
 
 def ramp(

@@ -6,12 +6,12 @@ older than its limit.
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import threading
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,32 +25,38 @@ from rtloop.prepare import Prepared
 from rtloop.service.child import Child
 from rtloop.service.header import recording_header
 from rtloop.service.parking import park
+from rtloop.service.recording import RecorderKeeper
+from rtloop.service.stall import StallWatch
 
 HEARTBEAT_PERIOD_S = 0.02
-POLL_S = 0.02
+POLL_S = 0.005
+LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
 START_TIMEOUT_S = 120.0
+ATTENDED_STALL_S = 2.0
+"""Somebody watches a run: a host that stalls one processor for half a second is no reason to end it."""
 START_TIME_FIELD = 19
 """Of /proc/PID/stat, counted after the process's name."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class RunResult:
     """How a run ended. `outcome`: done, stopped, driver_failed, heartbeat_lost, failed or killed."""
 
-    recording: Path
+    recordings: list[Path]
     outcome: str
     recorder: dict[str, Any]
-    realtime: dict[str, Any] = field(default_factory=dict)
-    error: str | None = None
-    exit_code: int = 0
+    notes: list[str]
+    error: str | None
+    exit_code: int
 
 
 class Processes:
     """Loop and recorder, started before there is anything for them to do: they import while a plan is prepared."""
 
-    def __init__(self) -> None:
-        self.fd = SharedBlock.reserve()
+    def __init__(self, block: Path | None = None) -> None:
+        """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
+        self.fd = SharedBlock.reserve() if block is None else _new_file(block)
         self.loop = Child("rtloop.engine.process", self.fd)
         self.recorder = Child("rtloop.recording.recorder", self.fd)
 
@@ -66,135 +72,154 @@ class Processes:
 
 
 class Supervisor:
-    """Runs a plan once in `processes`, recording to `recording` (without its `.part`)."""
+    """Runs a plan once in `processes`, recording to `recording` (without its `.part`).
 
-    def __init__(self, processes: Processes, prepared: Prepared, recording: Path) -> None:
+    `start`, then `poll` every few milliseconds until it returns a result, then `close`.
+    """
+
+    def __init__(
+        self, processes: Processes, prepared: Prepared, recording: Path, stall_s: float = ATTENDED_STALL_S
+    ) -> None:
         self.prepared = prepared
-        self.recording = recording
         self.block = SharedBlock.create(prepared.plan.sizes, processes.fd)
-        self._loop, self._recorder = processes.loop, processes.recorder
         self.realtime: dict[str, Any] = {}
         self.startup_s: float | None = None
-        self._done = threading.Event()
+        self._loop = processes.loop
+        self.recorder = RecorderKeeper(processes.recorder, self.block, recording, prepared.configuration.recording)
+        self._stall = StallWatch(stall_s, LONGEST_STEP_S)
+        self._stalled = False
         self._reports: dict[str, dict[str, Any]] = {}
+        self._done = threading.Event()
+        self._beat = threading.Thread(target=self._beating, daemon=True)
+        self._beat.start()
 
     def stop(self) -> None:
         """Ask the loop to ramp down and end."""
         self.block.words[Word.STOP] = 1
 
+    @property
+    def ticks(self) -> int:
+        """Ticks executed so far."""
+        return int(self.block["ticks_head"][0])
+
     def latest(self) -> np.ndarray[Any, Any] | None:
         """The newest record (columns,), or None before the first."""
-        ring = self.block.ring("ticks")
-        head = int(ring.head[0])
-        row = np.empty((1, ring.slots.shape[1]))
-        copied, _, _ = drain(ring, np.uint64(max(head - 1, 0)), row)
-        return row[0] if copied else None
+        rows = self.newest(1)
+        return rows[-1] if len(rows) else None
 
-    def run(self, on_progress: Any = None) -> RunResult:
+    def newest(self, count: int) -> np.ndarray[Any, Any]:
+        """Up to `count` newest records (n, columns), oldest first."""
+        ring = self.block.ring("ticks")
+        rows = np.empty((count, ring.slots.shape[1]))
+        copied, _, _ = drain(ring, np.uint64(max(self.ticks - count, 0)), rows)
+        return rows[:copied]
+
+    def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
         """Start, watch and end everything. Raises RtloopError for what prevented the run."""
-        beat = threading.Thread(target=self._beat, daemon=True)
-        beat.start()
-        loop, recorder = self._loop, self._recorder
         try:
-            loop.send(pickle.dumps(self.prepared.plan))
-            self._await_ready(loop, recorder)
-            self._start_recorder(recorder)
-            self.block.words[Word.GO] = 1
-            self.startup_s = seconds_since_start()
-            while loop.exit_code is None:
-                self._collect("loop", loop)
+            self.start()
+            while (result := self.poll()) is None:
                 if on_progress is not None:
                     on_progress(self)
                 time.sleep(POLL_S)
-            return self._finish(loop, recorder)
+            return result
         finally:
-            self.stop()
-            if loop.wait(END_TIMEOUT_S) is None:
-                loop.end()
-            self._done.set()
-            beat.join()
+            self.close()
 
-    def _beat(self) -> None:
+    def start(self) -> None:
+        """Give both processes their orders and let the loop go. Raises RtloopError for what prevents it."""
+        self._loop.send(pickle.dumps(self.prepared.plan))
+        self._await_ready()
+        self.recorder.start(recording_header(self.prepared, self.realtime))
+        self.block.words[Word.GO] = 1
+        self.startup_s = seconds_since_start()
+
+    def poll(self) -> RunResult | None:
+        """Watch loop and recorder; the result once the run has ended."""
+        self._collect()
+        if self._loop.exit_code is None and not self._loop_stalled():
+            self.recorder.poll()
+            return None
+        return self._finish()
+
+    def close(self) -> None:
+        """End what still runs."""
+        self.stop()
+        if self._loop.wait(END_TIMEOUT_S) is None:
+            self._loop.end()
+        self._done.set()
+        self._beat.join()
+        self.recorder.close()
+
+    def _beating(self) -> None:
         while not self._done.is_set():
             self.block.words[Word.HEARTBEAT_NS] = time.monotonic_ns()
             self._done.wait(HEARTBEAT_PERIOD_S)
 
-    def _collect(self, name: str, child: Child) -> None:
-        for report in child.reports():
-            self._reports[f"{name} {report.get('report', 'totals')}"] = report
+    def _collect(self) -> None:
+        for report in self._loop.reports():
+            self._reports[report["report"]] = report
 
-    def _await_ready(self, loop: Child, recorder: Child) -> None:
+    def _loop_stalled(self) -> bool:
+        """Whether ticks stand still although they are paced; the loop's process is then killed."""
+        running = self.block.words[Word.LOOP_STATE] == ProcessState.RUNNING
+        if not (
+            running and self.prepared.plan.pacing.paced and self.ticks and not self.block.words[Word.FINISHED_TICKS]
+        ):
+            return False
+        if not self._stall.stalled(self.ticks):
+            return False
+        self._stalled = True
+        self._loop.end()
+        return True
+
+    def _await_ready(self) -> None:
         """Wait until both processes are ready. Raises what the loop's process reports instead."""
         deadline = time.monotonic() + START_TIMEOUT_S
         while True:
-            self._collect("loop", loop)
-            words = self.block.words
-            if "loop ready" in self._reports and words[Word.RECORDER_STATE] >= ProcessState.READY:
-                self.realtime = self._reports["loop ready"]["realtime"]
+            self._collect()
+            if "ready" in self._reports and self.recorder.state >= ProcessState.READY:
+                self.realtime = self._reports["ready"]["realtime"]
                 return
-            for name, child in (("loop", loop), ("recorder", recorder)):
-                if child.exit_code is not None:
-                    child.wait(1.0)
-                    self._collect(name, child)
-                    self._raise_failure(name, child.exit_code)
+            if self._loop.exit_code is not None:
+                self._loop.wait(1.0)
+                self._collect()
+                self._raise_failure(self._loop.exit_code)
+            if self.recorder.exit_code is not None:
+                raise LoopFault(f"the recorder's process ended with {self.recorder.exit_code} before the run began")
             if time.monotonic() > deadline:
                 raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
             time.sleep(0.002)
 
-    def _raise_failure(self, name: str, exit_code: int) -> None:
-        failed = self._reports.get(f"{name} failed")
+    def _raise_failure(self, exit_code: int) -> None:
+        failed = self._reports.get("failed")
         if failed is None:
-            raise LoopFault(f"the {name}'s process ended with {exit_code} before the run began")
+            raise LoopFault(f"the loop's process ended with {exit_code} before the run began")
         error = RtloopError(failed["message"])
         error.exit_code = failed["exit_code"]
         raise error
 
-    def _start_recorder(self, recorder: Child) -> None:
-        """Hand over path and header, and wait until the file is open. Raises OutputError."""
-        options = self.prepared.configuration.recording
-        order = {
-            "path": str(self.recording),
-            "header": recording_header(self.prepared, self.realtime),
-            "options": {
-                "rotate_bytes": options.rotate_mib and round(options.rotate_mib * 2**20),
-                "rotate_s": options.rotate_s,
-                "min_free_bytes": round(options.min_free_mib * 2**20),
-            },
-        }
-        recorder.send(json.dumps(order).encode() + b"\n")
-        while self.block.words[Word.RECORDER_STATE] == ProcessState.READY:
-            if recorder.exit_code is not None:
-                break
-            time.sleep(0.002)
-        if self.block.words[Word.RECORDER_STATE] != ProcessState.RUNNING:
-            recorder.wait(END_TIMEOUT_S)
-            self._collect("recorder", recorder)
-            reason = self._reports.get("recorder totals", {}).get("error", "it ended")
-            raise OutputError(f"{self.recording}: cannot record: {reason}")
-
-    def _finish(self, loop: Child, recorder: Child) -> RunResult:
+    def _finish(self) -> RunResult:
         """Park if the loop died, let the recorder finish, and say how it went."""
         words = self.block.words
-        error = None
+        code, error = self._loop.exit_code or 0, None
         if words[Word.LOOP_STATE] not in (ProcessState.FINISHED, ProcessState.FAILED):
-            error = f"the loop's process died ({_ending(loop.exit_code)}); {self._park()}"
+            died = "stood still and was killed" if self._stalled else f"died ({_ending(code)})"
+            error = f"the loop's process {died}; {self._park()}"
             words[Word.LOOP_STATE] = ProcessState.FAILED
-        recorder.wait(END_TIMEOUT_S)
-        self._collect("loop", loop)
-        self._collect("recorder", recorder)
-        totals = self._reports.get("recorder totals", {"complete": False, "error": "the recorder died"})
-        finished = self._reports.get("loop finished", {})
-        failed = self._reports.get("loop failed", {})
+        totals = self.recorder.finish()
+        self._loop.wait(1.0)
+        self._collect()
+        finished, failed = self._reports.get("finished", {}), self._reports.get("failed", {})
         outcome = finished.get("outcome", "failed" if failed else "killed")
         error = error or finished.get("driver_error") or failed.get("message")
         if error is None and outcome == "heartbeat_lost":
             error = "the loop lost its heartbeat and parked by itself"
         error = error or totals.get("error")
-        code = loop.exit_code if loop.exit_code and loop.exit_code > 0 else 0
-        if code == 0 and (outcome not in ("done", "stopped") or not totals.get("complete")):
+        if code <= 0 and (outcome not in ("done", "stopped") or not totals.get("complete")):
             code = LoopFault.exit_code
-        path = Path(totals.get("path") or self.recording)
-        return RunResult(path, outcome, totals, self.realtime, error, code)
+        paths = [Path(path) for path in totals["paths"]]
+        return RunResult(paths, outcome, totals, self.recorder.notes, error, max(code, 0))
 
     def _park(self) -> str:
         """Ramp the outputs down in the loop's place; what came of it in words."""
@@ -205,6 +230,16 @@ class Supervisor:
         except DriverError as error:
             return f"its outputs could not be parked: {error}"
         return "its outputs were parked in its place"
+
+
+def _new_file(path: Path) -> int:
+    """An empty file in place of an old one, which a process that still has it mapped keeps. Raises OutputError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot make the shared block: {error.strerror}") from None
 
 
 def seconds_since_start() -> float:

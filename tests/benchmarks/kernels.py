@@ -11,12 +11,13 @@ from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import Records, initial_state
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
-from tests.benchmarks.measure import alternately
-from tests.benchmarks.scenario import NativeLoop, PythonLoop, paper_plan, tripping_plan
+from tests.benchmarks.measure import Spread, alternately, seconds
+from tests.benchmarks.scenario import NativeLoop, PythonLoop, paper_plan, plan_of_axes, tripping_plan
 
 CHECKED_TICKS = 200_000
 CHUNK = 50_000
 TIMED_TICKS = 400_000
+AXES_TICKS, AXES_REPEATS = 100_000, 12
 WANTED = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.RAMPING | Flag.TRIP_POSITION
 
 
@@ -121,6 +122,20 @@ def loop() -> dict[str, Any]:
     period_ns = 1e9 / plan.pacing.rate_hz
     result = _compared(pair, TIMED_TICKS)
     return result | {"times_real_time": period_ns / result["ns_per_tick"]["median"]}
+
+
+def axes() -> dict[str, Any]:
+    """ns a tick of the unpaced loop with 1, 2, 4 and 8 axes, and what a further axis costs."""
+    counts = 1, 2, 4, 8
+    loops = {count: PythonLoop(plan_of_axes(count)) for count in counts}
+    taken: dict[int, list[float]] = {count: [] for count in counts}
+    for repeat in range(1, AXES_REPEATS + 1):
+        for count, loop in loops.items():
+            until = repeat * AXES_TICKS
+            taken[count].append(seconds(lambda loop=loop, until=until: loop.run(until)) * 1e9 / AXES_TICKS)
+    spreads = {count: Spread.of(values[1:]) for count, values in taken.items()}
+    named = {f"ns_per_tick_{count}": spread._asdict() for count, spread in spreads.items()}
+    return named | {"ns_per_further_axis": (spreads[8].minimum - spreads[1].minimum) / 7}
 
 
 def _compared(pair: Any, ticks: int) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.base import Wiring
 from hil.rig import build_rig
 from rtloop.config import load
 from rtloop.engine.assembly import Assembly, LawArrays, law_at_rest
@@ -36,6 +37,19 @@ def tripping_plan(after_ticks: int) -> Plan:
     generators["parameters"][0, :4] = 0, steps.size + 1, dwell_ticks, 0
     coefficients["position_limit_um"], coefficients["drive_max_v"] = 30.0, 8.0
     return replace(plan, generators=generators, coefficients=coefficients, table=np.append(steps, 40.0))
+
+
+def plan_of_axes(count: int) -> Plan:
+    """The paper's axis `count` times, each on a plant of its own."""
+    plan, names = paper_plan(), tuple(f"x{i}" for i in range(count))
+    return replace(
+        plan,
+        axes=names,
+        wiring={name: Wiring(f"adc{i}", f"dac{i}") for i, name in enumerate(names)},
+        coefficients=np.repeat(plan.coefficients, count),
+        generators=np.repeat(plan.generators, count),
+        observed=tuple(f"{name}_{signal}" for name in names for signal in ("true_position_um", "hysteresis_um")),
+    )
 
 
 class PythonLoop:

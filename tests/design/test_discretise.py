@@ -125,7 +125,8 @@ def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
         x = controller.steady_state_gain
         assert a @ x + b == pytest.approx(x, rel=1e-9, abs=1e-12)
     for row, (first, end) in zip(a, controller.row_bands, strict=True):
-        assert np.all(row[:first] == 0) and np.all(row[end:] == 0)
+        assert np.all(row[:first] == 0)
+        assert np.all(row[end:] == 0)
 
 
 @pytest.mark.parametrize(("method", "theirs"), [("tustin", "bilinear"), ("zoh", "zoh"), ("foh", "foh")])
@@ -143,7 +144,8 @@ def test_modal_blocks_and_bands_of_the_paper() -> None:
     controller = discretise(PAPER_C, T, "matched")
     assert controller.form == "modal"
     assert controller.row_bands.tolist() == [[0, 1], [1, 2], [2, 3], [3, 5], [3, 5]]
-    assert controller.a[3, 3] == controller.a[4, 4] and controller.a[3, 4] == -controller.a[4, 3]
+    assert controller.a[3, 3] == controller.a[4, 4]
+    assert controller.a[3, 4] == -controller.a[4, 3]
 
 
 def test_states_are_of_comparable_size() -> None:
@@ -157,8 +159,11 @@ def test_states_are_of_comparable_size() -> None:
 def test_static_controller_has_no_states() -> None:
     for transfer in (Transfer.from_zpk([], [], 2.5), Transfer.from_zpk([], [-1], 0.0)):
         controller = discretise(transfer, T, "matched")
-        assert controller.order == 0 and controller.a.shape == (0, 0) and controller.row_bands.shape == (0, 2)
-        assert controller.antiwindup.size == 0 and controller.steady_state_gain.size == 0
+        assert controller.order == 0
+        assert controller.a.shape == (0, 0)
+        assert controller.row_bands.shape == (0, 2)
+        assert controller.antiwindup.size == 0
+        assert controller.steady_state_gain.size == 0
         assert controller.d == controller.dc_gain == transfer.gain * (not transfer.order)
         assert np.all(controller.response([1, 10]) == controller.d)
 
@@ -166,7 +171,8 @@ def test_static_controller_has_no_states() -> None:
 def test_integrating_state_takes_the_correction_and_has_no_steady_state() -> None:
     controller = discretise(DISTINCT["integrator"], T, "tustin")
     integrating = np.flatnonzero(np.diag(controller.a) == 1)
-    assert integrating.size == 1 and math.isinf(controller.dc_gain)
+    assert integrating.size == 1
+    assert math.isinf(controller.dc_gain)
     assert np.all(controller.steady_state_gain[integrating] == 0)
     assert (controller.c * controller.antiwindup)[integrating] == pytest.approx(1, abs=1e-6)
 

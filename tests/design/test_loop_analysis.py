@@ -81,7 +81,9 @@ def test_sensitivity_peak_as_it_runs(method, prewarp_hz, none, one) -> None:
 
 def test_static_values_survive_sampling() -> None:
     analysis = analyse_discrete(discretise(PAPER_C, T, "matched"), PAPER_D, 1)
-    assert analysis.stable and analysis.max_abs_pole < 1 and math.isnan(analysis.max_re_pole)
+    assert analysis.stable
+    assert analysis.max_abs_pole < 1
+    assert math.isnan(analysis.max_re_pole)
     assert analysis.static_error_percent == pytest.approx(0.166384, abs=1e-5)
     assert analysis.sensitivity_1hz == pytest.approx(0.0105855, abs=1e-6)
 
@@ -109,7 +111,8 @@ def test_discrete_step_equals_a_simulation_tick_by_tick() -> None:
 def test_integral_control_of_a_lag() -> None:
     """L = K/(s(τs + 1)), Kτ = 1: ζ = 0.5, overshoot exp(−πζ/√(1 − ζ²)), max|S| in closed form, no gain margin."""
     analysis = analyse_continuous(Transfer.from_factors(100, [], [[1, 0]]), Transfer.from_factors(1, [], [[0.01, 1]]))
-    assert analysis.static_error_percent == 0 and math.isinf(analysis.gain_margin)
+    assert analysis.static_error_percent == 0
+    assert math.isinf(analysis.gain_margin)
     assert analysis.overshoot_percent == pytest.approx(100 * math.exp(-math.pi / math.sqrt(3)), abs=1e-3)
     assert analysis.phase_margin_deg == pytest.approx(51.827, abs=1e-3)  # 90° − atan(√((√5 − 1)/2))
     u = np.linspace(0.01, 9, 900_001)
@@ -130,14 +133,17 @@ def test_gain_margin_at_half_the_sampling_rate() -> None:
     """x⁺ = x + k T e is stable for k T < 2, and reaches −1 at z = −1."""
     integrator = Transfer.from_factors(1, [], [[1, 0]])
     analysis = analyse_discrete(discretise(Transfer.from_zpk([], [], 500.0), 1e-3), integrator)
-    assert analysis.gain_margin == pytest.approx(4.0) and analysis.gain_margin_hz == pytest.approx(500)
+    assert analysis.gain_margin == pytest.approx(4.0)
+    assert analysis.gain_margin_hz == pytest.approx(500)
     assert analysis.max_abs_pole == pytest.approx(0.5)
 
 
 def test_unstable_loop_is_reported_not_raised() -> None:
     analysis = analyse_continuous(PAPER_C, with_resonance_shifted(PAPER_D, 5.0))
-    assert not analysis.stable and analysis.max_re_pole > 0
-    assert math.isnan(analysis.settling_time_s) and math.isnan(analysis.peak_command)
+    assert not analysis.stable
+    assert analysis.max_re_pole > 0
+    assert math.isnan(analysis.settling_time_s)
+    assert math.isnan(analysis.peak_command)
     assert json.loads(json.dumps(analysis.as_dict(), allow_nan=False))["settling_time_s"] is None
     assert resonance_shift_tolerated(PAPER_C, with_resonance_shifted(PAPER_D, 5.0)) == (0.0, 0.0)
 
@@ -146,7 +152,8 @@ def test_undamped_plant_can_be_looked_at() -> None:
     """An undamped resonance lies on the axis itself, where the plant has no response."""
     plant = Transfer.from_factors(1e6, [], [[1, 0, 1e6]])
     analysis = analyse_continuous(Transfer.from_factors(0.2, [[1, 0]], [[1, 500]]), plant)
-    assert analysis.stable and math.isfinite(analysis.max_sensitivity)
+    assert analysis.stable
+    assert math.isfinite(analysis.max_sensitivity)
 
 
 def test_shifted_resonance_keeps_damping_and_static_gain() -> None:

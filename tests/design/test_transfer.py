@@ -21,14 +21,18 @@ def test_paper_d_eq_5() -> None:
     response = np.abs(PAPER_D.response(2j * np.pi * hz))
     assert response.max() == pytest.approx(6.8454, abs=1e-3)
     assert hz[response.argmax()] == pytest.approx(595.44, abs=0.05)
-    assert PAPER_D.order == 8 and PAPER_D.is_stable and PAPER_D.is_strictly_proper
+    assert PAPER_D.order == 8
+    assert PAPER_D.is_stable
+    assert PAPER_D.is_strictly_proper
 
 
 def test_paper_c_eq_20() -> None:
     """Recomputed from the printed factors of eq (20)."""
     assert PAPER_C.dc_gain == pytest.approx(593.569162, abs=1e-5)
     assert PAPER_C.high_frequency_gain == pytest.approx(0.016, abs=1e-12)
-    assert PAPER_C.order == 5 and PAPER_C.is_stable and not PAPER_C.is_strictly_proper
+    assert PAPER_C.order == 5
+    assert PAPER_C.is_stable
+    assert not PAPER_C.is_strictly_proper
 
 
 def test_four_forms_of_one_transfer_function() -> None:
@@ -63,8 +67,10 @@ def test_state_space_of_a_stiff_system_comes_back(transfer: Transfer) -> None:
 def test_zeros_at_infinity_of_a_state_space_are_left_out() -> None:
     """Three integrators in a row have no finite zero, and gain 6."""
     triple = Transfer.from_state_space(np.eye(3, k=1), [0, 0, 2], [3, 0, 0], 0)
-    assert triple.zeros.size == 0 and triple.gain == pytest.approx(6)
-    assert np.all(triple.poles == 0) and math.isinf(triple.dc_gain)
+    assert triple.zeros.size == 0
+    assert triple.gain == pytest.approx(6)
+    assert np.all(triple.poles == 0)
+    assert math.isinf(triple.dc_gain)
     assert Transfer.from_state_space([[-1.0]], [1.0], [0.0], [0.0]).response(1j) == 0
     assert Transfer.from_state_space([], [], [], 2.5).dc_gain == 2.5
 

@@ -120,15 +120,23 @@ def test_a_killed_loop_is_parked_and_said(tmp_path: Path) -> None:
     assert len(rtloop.load(summary["recording"])) == summary["ticks_logged"] > 0
 
 
-def test_a_killed_recorder_does_not_end_the_loop_and_is_said(tmp_path: Path) -> None:
-    process = start("run", PAPER, "--out", tmp_path, "--duration", "4", "--json")
+def test_a_killed_recorder_is_replaced_and_nothing_is_lost(tmp_path: Path) -> None:
+    process = start("run", PAPER, "--out", tmp_path, "--duration", "6", "--json")
     recorder = children(process)["recording.recorder"]
     wait_for_ticks(tmp_path)
     os.kill(recorder, signal.SIGKILL)
     code, summary, err = finish(process)
-    assert code == 1
+    assert code == 0
     assert summary["outcome"] == "done"
-    assert "recorder" in err
+    assert "recorder died" in err
+    assert "was replaced" in err
+    assert len(summary["recordings"]) == 2
+    recording = rtloop.load(summary["recordings"])
+    assert np.array_equal(recording["tick"], np.arange(60_000))
+    again = [sys.executable, "-m", "rtloop", "replay", *summary["recordings"], "--json"]
+    verdict = json.loads(subprocess.run(again, env=ENVIRONMENT, capture_output=True, text=True, check=False).stdout)
+    assert verdict["identical"] is True
+    assert verdict["ticks"] == 60_000
 
 
 def test_a_loop_without_its_supervisor_parks_and_ends(tmp_path: Path) -> None:

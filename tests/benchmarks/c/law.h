@@ -22,7 +22,6 @@ static inline double play(double value, double threshold, double last) {
     double raised = low > last ? low : last;
     return high < raised ? high : raised;
 }
-
 static inline double total(const double *sums) { return (sums[0] + sums[1]) + (sums[2] + sums[3]); }
 
 static inline double inverse_drive(law_c c, law_s s, double command_um) {
@@ -116,7 +115,6 @@ static inline bool usable(double value) { return -1e9 < value && value < 1e9; }
 static inline double clip(double value, double low, double high) {
     return value < low ? low : value > high ? high : value;
 }
-
 static inline double toward(double value, double target, double step) {
     return clip(target, value - step, value + step);
 }
@@ -194,10 +192,8 @@ static inline void evaluate(
 
 static inline void update(law_c c, law_s s, loop_s loop, int64_t axes) {
     for (int64_t a = 0; a < axes; a++) {
-        s[a].applied_command_um = follow_drive(&c[a], &s[a], s[a].drive_v);
+        double applied_um = s[a].applied_command_um = follow_drive(&c[a], &s[a], s[a].drive_v);
         if (loop->mode == CLOSED_LOOP)
-            controller_update(
-                &c[a], &s[a], s[a].error_um, c[a].tracking_share * (s[a].applied_command_um - s[a].command_um)
-            );
+            controller_update(&c[a], &s[a], s[a].error_um, c[a].tracking_share * (applied_um - s[a].command_um));
     }
 }

@@ -1,0 +1,220 @@
+"""Commands of the daemon: serve it, talk to it, park after it, and be the board that it drives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
+
+
+@click.command()
+@CONFIG
+@fails_clearly
+def serve(config: Path) -> int:
+    """Run the loop of CONFIG as a daemon, with control API and systemd notification, until told to stop."""
+    from rtloop.service.daemon import serve as serve_configuration
+
+    return serve_configuration(config)
+
+
+@click.command()
+@CONFIG
+@fails_clearly
+def park(config: Path) -> int:
+    """Bring every output of CONFIG to its safe value, ramping from the last known drive."""
+    from rtloop.service.parking import park_configuration
+
+    click.echo(park_configuration(config), err=True)
+    return 0
+
+
+@click.group()
+def hil() -> None:
+    """The simulated rig as a process of its own."""
+
+
+@hil.command("serve")
+@CONFIG
+@fails_clearly
+def hil_serve(config: Path) -> int:
+    """Be the board of CONFIG, whose driver is of kind shm: a rig with its own clock that outlives its controllers."""
+    from rtloop.board import serve_board
+
+    return serve_board(config)
+
+
+@click.group()
+@click.option("--name", help="Name of the service: that of its configuration file [the only one running].")
+@click.option("--socket", "socket_path", type=OUTPUT, help="Path of its control socket.")
+@click.pass_context
+def ctl(context: click.Context, name: str | None, socket_path: Path | None) -> None:
+    """Talk to a running service. Answers are JSON."""
+    context.obj = (name, socket_path)
+
+
+def _client(context: click.Context) -> Any:
+    from rtloop.errors import UnavailableError
+    from rtloop.service.client import Client
+    from rtloop.service.paths import runtime_folder
+
+    name, path = context.obj
+    if path is None:
+        folder = runtime_folder()
+        found = sorted(folder.glob("*.sock")) if name is None else [folder / f"{name}.sock"]
+        if len(found) != 1:
+            there = ", ".join(item.stem for item in found) or "none"
+            raise UnavailableError(f"{folder}: services running: {there}; --name or --socket says which")
+        path = found[0]
+    return Client(path)
+
+
+def _post(name: str, help_text: str) -> None:
+    @ctl.command(name, help=help_text)
+    @click.pass_context
+    @fails_clearly
+    def command(context: click.Context) -> int:
+        click.echo(json.dumps(_client(context).post(f"/{name}")))
+        return 0
+
+
+for _name, _help in (
+    ("arm", "Allow the outputs to be driven."),
+    ("start", "Set the configured mode."),
+    ("stop", "Ramp the outputs to safe and stay there."),
+    ("reset", "Forget latched trips; the outputs stay off."),
+    ("reload", "Read the configuration again."),
+):
+    _post(_name, _help)
+
+
+@ctl.command()
+@click.pass_context
+@fails_clearly
+def status(context: click.Context) -> int:
+    """State, rate, lateness, faults and the newest signals."""
+    click.echo(json.dumps(_client(context).get("/status"), indent=2))
+    return 0
+
+
+@ctl.command()
+@click.pass_context
+@fails_clearly
+def metrics(context: click.Context) -> int:
+    """Metrics in Prometheus' text format."""
+    click.echo(_client(context).get("/metrics"), nl=False)
+    return 0
+
+
+@ctl.command()
+@click.option("--count", type=click.IntRange(1), help="End after so many lines.")
+@click.pass_context
+@fails_clearly
+def watch(context: click.Context, count: int | None) -> int:
+    """Newest signals, a line of JSON 20 times a second."""
+    for number, line in enumerate(_client(context).watch(), start=1):
+        click.echo(json.dumps(line))
+        if number == count:
+            break
+    return 0
+
+
+@ctl.command()
+@click.argument("mode", type=click.Choice(["off", "raw", "feedforward", "closed_loop"]))
+@click.pass_context
+@fails_clearly
+def mode(context: click.Context, mode: str) -> int:
+    """Change the mode of all axes, bumplessly."""
+    click.echo(json.dumps(_client(context).post("/mode", {"mode": mode})))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("value", type=float)
+@click.pass_context
+@fails_clearly
+def setpoint(context: click.Context, axis: str, value: float) -> int:
+    """Hold the reference of AXIS at VALUE, in µm (V in raw mode)."""
+    click.echo(json.dumps(_client(context).post("/setpoint", {"axis": axis, "value": value})))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("reference")
+@click.pass_context
+@fails_clearly
+def reference(context: click.Context, axis: str, reference: str) -> int:
+    """Change the reference of AXIS, as in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'."""
+    body = {"axis": axis, "reference": _inline_table(reference)}
+    click.echo(json.dumps(_client(context).post("/reference", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("file", type=click.File())
+@click.option("--hold-ticks", default=1, show_default=True, type=click.IntRange(1))
+@click.option("--repeat", is_flag=True)
+@click.pass_context
+@fails_clearly
+def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repeat: bool) -> int:
+    """Play the numbers in FILE (one a line) on AXIS."""
+    from rtloop.errors import RtloopError
+
+    try:
+        samples = [float(line) for line in file if line.strip()]
+    except ValueError as error:
+        raise RtloopError(f"{file.name}: {error}") from None
+    body = {"axis": axis, "samples": samples, "hold_ticks": hold_ticks, "repeat": repeat}
+    click.echo(json.dumps(_client(context).post("/waveform", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("section", type=click.Choice(["controller", "limits", "interlocks", "prefilter", "model"]))
+@click.argument("values")
+@click.pass_context
+@fails_clearly
+def tune(context: click.Context, axis: str, section: str, values: str) -> int:
+    """Change keys of [axis.SECTION] of AXIS: 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'."""
+    body = {"axis": axis, "section": section, "values": _inline_table(values)}
+    click.echo(json.dumps(_client(context).post("/tune", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("config", type=OUTPUT)
+@click.pass_context
+@fails_clearly
+def controller(context: click.Context, axis: str, config: Path) -> int:
+    """Swap in the [axis.controller] of AXIS from another configuration file."""
+    from rtloop.config import load
+
+    axes = {one.name: one for one in load(config).axes}
+    if axis not in axes or axes[axis].controller is None:
+        raise click.UsageError(f"{config}: no controller for axis {axis!r}; axes: {', '.join(axes)}")
+    section = axes[axis].controller
+    assert section is not None
+    body = {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
+    click.echo(json.dumps(_client(context).post("/controller", body)))
+    return 0
+
+
+def _inline_table(text: str) -> dict[str, Any]:
+    """TOML's inline table without its braces. Raises a usage error."""
+    import tomllib
+
+    try:
+        return tomllib.loads(f"table = {{ {text} }}")["table"]
+    except tomllib.TOMLDecodeError as error:
+        raise click.UsageError(f"{text!r}: not `key = value, …`: {error}") from None
+
+
+COMMANDS = (serve, park, hil, ctl)

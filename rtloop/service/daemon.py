@@ -1,0 +1,101 @@
+"""`rtloop serve`: the service with its control socket, signals and journal."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from rtloop.errors import UnavailableError
+from rtloop.service.api import application
+from rtloop.service.paths import socket_path
+from rtloop.service.service import Service
+
+LIMIT_CONCURRENCY = 64
+END_TIMEOUT_S = 5.0
+
+
+def serve(config: Path) -> int:
+    """Serve a configuration until SIGTERM or SIGINT; SIGHUP reloads. The exit code. Raises RtloopError."""
+    _log_to_stderr()
+    service = Service(config)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: service.end())
+    signal.signal(signal.SIGHUP, lambda *_: service.reload())
+    with _listening(service):
+        return service.run()
+
+
+@contextlib.contextmanager
+def _listening(service: Service) -> Iterator[None]:
+    """The API on its socket, in a thread of its own, for as long as the service runs."""
+    path = socket_path(service.configuration)
+    listener = _bind(path, int(service.configuration.service.socket_mode, 8))
+    settings = uvicorn.Config(
+        application(service), log_level="warning", lifespan="off", limit_concurrency=LIMIT_CONCURRENCY, log_config=None
+    )
+    server = uvicorn.Server(settings)
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listener])), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.should_exit = server.force_exit = True
+        thread.join(END_TIMEOUT_S)
+        listener.close()
+        path.unlink(missing_ok=True)
+
+
+def _bind(path: Path, mode: int) -> socket.socket:
+    """A listening socket with exactly these permissions. Raises UnavailableError where another service listens."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as probe:
+            probe.connect(str(path))
+        raise UnavailableError(f"{path}: another service listens there")
+    except (FileNotFoundError, ConnectionRefusedError):
+        pass
+    except OSError as error:
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None
+    previous = os.umask(0o777 & ~mode)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        listener.bind(str(path))
+        os.chmod(path, mode)
+    except OSError as error:
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None
+    finally:
+        os.umask(previous)
+    listener.listen(128)
+    return listener
+
+
+class _JournalFormatter(logging.Formatter):
+    """Lines with the priority that the journal reads from `<n>` (sd-daemon(3))."""
+
+    PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+
+    def format(self, record: logging.LogRecord) -> str:
+        """`<priority>message`."""
+        priority = next((number for level, number in self.PRIORITIES if record.levelno >= level), 7)
+        return f"<{priority}>{super().format(record)}"
+
+
+def _log_to_stderr() -> None:
+    handler: logging.StreamHandler[Any] = logging.StreamHandler(sys.stderr)
+    under_systemd = "JOURNAL_STREAM" in os.environ
+    handler.setFormatter(
+        _JournalFormatter("%(message)s") if under_systemd else logging.Formatter("%(asctime)s %(message)s")
+    )
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

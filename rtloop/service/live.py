@@ -1,0 +1,174 @@
+"""Changes to a law that runs: built and verified beside the loop, staged in shared memory, swapped at one tick."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from rtloop.config import Configuration, describe
+from rtloop.engine.memory import SharedBlock
+from rtloop.engine.messages import Kind
+from rtloop.errors import ConfigError
+from rtloop.law.layout import COEFFICIENTS
+from rtloop.law.options import AxisOptions, ReferenceOptions
+from rtloop.law.reference import Generator
+from rtloop.law.safety import USABLE_MAGNITUDE
+from rtloop.prepare import Prepared, prepare
+from rtloop.references import TableOfSamples, generator_values
+from rtloop.service.desk import Desk, Refused
+
+FIXED = ("loop", "driver_kind", "driver_options", "channels")
+"""Parts of a configuration that only a restart can change."""
+
+
+class LiveLaw:
+    """The law as it runs now, and the ways to change it. Thread-safe."""
+
+    def __init__(self, prepared: Prepared, block: SharedBlock, desk: Desk) -> None:
+        self.prepared = prepared
+        self._block, self._desk = block, desk
+        self._lock = threading.Lock()
+        self._first_spare = prepared.plan.table.size
+        self._places = [0] * len(prepared.plan.axes)
+
+    def axis_number(self, name: str) -> int:
+        """Raises Refused for a name that is no axis."""
+        if name not in self.prepared.plan.axes:
+            raise Refused(f"axis {name!r}: there are {', '.join(self.prepared.plan.axes)}")
+        return self.prepared.plan.axes.index(name)
+
+    def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
+        """Change keys of [axis.SECTION]; returns the tick. Raises ConfigError, Refused."""
+        with self._lock:
+            number = self.axis_number(axis)
+            options = self.prepared.configuration.axes[number]
+            if section not in ("controller", "limits", "interlocks", "prefilter", "model"):
+                raise Refused(f"section {section!r}: controller, limits, interlocks, prefilter and model may change")
+            merged = options.model_dump(exclude_unset=True)
+            merged[section] = {**(merged.get(section) or {}), **changes}
+            return self._swap(number, _validated_axis(merged))
+
+    def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
+        """Swap [axis.controller] as a whole; returns the tick. Raises ConfigError, Refused."""
+        with self._lock:
+            number = self.axis_number(axis)
+            merged = self.prepared.configuration.axes[number].model_dump(exclude_unset=True)
+            merged["controller"] = dict(controller)
+            return self._swap(number, _validated_axis(merged))
+
+    def set_reference(self, axis: str, reference: Mapping[str, Any]) -> int:
+        """Change the generator of an axis; returns the tick. Raises ConfigError, Refused."""
+        try:
+            options = TypeAdapter(ReferenceOptions).validate_python(dict(reference))
+        except ValidationError as error:
+            raise ConfigError("reference", describe(error, "reference", reference)) from None
+        table = TableOfSamples()
+        configuration = self.prepared.configuration
+        try:
+            values = list(
+                generator_values(
+                    options, configuration.loop.rate_hz, self.prepared.facts.inputs, configuration.folder, table
+                )
+            )
+        except ValueError as error:
+            raise ConfigError("reference", [f"reference.{error}"]) from None
+        with self._lock:
+            number = self.axis_number(axis)
+            self._check_reach(number, values, table.samples)
+            if table.samples.size:
+                values[1] = self._store(number, table.samples)
+            return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
+
+    def set_waveform(self, axis: str, samples: list[float], hold_ticks: int, repeat: bool) -> int:
+        """Play samples, `hold_ticks` ticks each; returns the tick. Raises Refused."""
+        data = np.asarray(samples, float)
+        if data.size == 0 or not np.all(np.abs(data) < USABLE_MAGNITUDE):
+            raise Refused(f"waveform: {data.size} samples; at least one, and finite numbers only, are needed")
+        with self._lock:
+            number = self.axis_number(axis)
+            values = [Generator.TABLE, 0, data.size, hold_ticks, float(repeat)]
+            self._check_reach(number, values, data)
+            values[1] = self._store(number, data)
+            return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
+
+    def replace_all(self, prepared: Prepared) -> list[str]:
+        """Take over another configuration; what changed. Raises Refused where that needs a restart."""
+        with self._lock:
+            old, new = self.prepared.configuration, prepared.configuration
+            fixed = [part for part in FIXED if getattr(old, part) != getattr(new, part)]
+            if fixed or prepared.plan.axes != self.prepared.plan.axes:
+                raise Refused(f"{', '.join(fixed) or 'axes'}: changed, which needs a restart")
+            changed = []
+            for number, (before, after) in enumerate(zip(old.axes, new.axes, strict=True)):
+                if before.feedforward != after.feedforward:
+                    raise Refused(f"axis.{after.name}.feedforward: changed, which needs a restart")
+                if before != after:
+                    self._stage(number, prepared)
+                    changed.append(f"axis.{after.name}")
+            self.prepared = prepared
+            return changed
+
+    def _swap(self, number: int, axis: AxisOptions) -> int:
+        """Build the configuration with another axis, verify it, swap its coefficients."""
+        configuration = self.prepared.configuration
+        if axis.feedforward != configuration.axes[number].feedforward:
+            raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
+        prepared = prepare(_with_axis(configuration, number, axis))
+        tick = self._stage(number, prepared)
+        self.prepared = prepared
+        return tick
+
+    def _stage(self, number: int, prepared: Prepared) -> int:
+        """Copy coefficients to where the loop takes them from, and have it take them."""
+        before, after = self.prepared.configuration.axes[number], prepared.configuration.axes[number]
+        coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1]
+        size = COEFFICIENTS.itemsize
+        self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
+        another = before.controller != after.controller
+        return self._desk.submit(Kind.LOAD_LAW, axis=number, values=[float(another)])
+
+    def _check_reach(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> None:
+        """Raise Refused for a reference that lies beyond what the axis may be commanded."""
+        limit = self.prepared.configuration.axes[number].limits.command_um
+        kind = Generator(int(values[0]))
+        if kind is Generator.TABLE:
+            reach = float(np.max(np.abs(samples)))
+        elif kind is Generator.HOLD:
+            reach = abs(values[1])
+        elif kind is Generator.CHIRP:
+            reach = abs(values[1]) + abs(values[5])
+        elif kind is Generator.INPUT:
+            return
+        else:
+            reach = abs(values[1]) + abs(values[3])
+        if not reach <= limit:
+            raise Refused(f"reference: reaches {reach:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+
+    def _store(self, number: int, samples: np.ndarray[Any, Any]) -> int:
+        """Index of `samples` in the shared table, in the one of the axis's two places that does not play now."""
+        table, fixed, axes = self._block["table"], self._first_spare, len(self.prepared.plan.axes)
+        room = (table.size - fixed) // (2 * axes)
+        if samples.size > room:
+            raise Refused(f"waveform: {samples.size} samples; at most {room} are allowed")
+        self._places[number] = 1 - self._places[number]
+        first = fixed + (2 * number + self._places[number]) * room
+        table[first : first + samples.size] = samples
+        return first
+
+
+def _validated_axis(raw: Mapping[str, Any]) -> AxisOptions:
+    try:
+        return AxisOptions.model_validate(raw)
+    except ValidationError as error:
+        raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
+
+
+def _with_axis(configuration: Configuration, number: int, axis: AxisOptions) -> Configuration:
+    axes = list(configuration.axes)
+    axes[number] = axis
+    return replace(configuration, axes=tuple(axes))

@@ -1,0 +1,37 @@
+"""Prometheus metrics, made when they are asked for."""
+
+from __future__ import annotations
+
+from prometheus_client import CollectorRegistry, Gauge, generate_latest
+
+from rtloop.service.service import Service, State
+from rtloop.service.status import newest_signals, timing
+
+
+def metrics_text(service: Service) -> str:
+    """All metrics of a service, in Prometheus' text format."""
+    registry = CollectorRegistry()
+    state = Gauge("rtloop_state", "1 for the state in force", ["state"], registry=registry)
+    for one in State:
+        state.labels(one.value).set(float(service.state is one))
+    supervisor, measured = service.supervisor, timing(service)
+    Gauge("rtloop_ticks", "Ticks executed by the present loop", registry=registry).set(
+        0 if supervisor is None else supervisor.ticks
+    )
+    Gauge("rtloop_restarts", "Loops that ended before the present one", registry=registry).set(len(service.results))
+    if measured:
+        Gauge("rtloop_rate_hz", "Rate over the last ticks", registry=registry).set(measured["rate_hz"])
+        Gauge("rtloop_overruns", "Overruns in the last ticks", registry=registry).set(measured["overruns"])
+        Gauge("rtloop_periods_missed", "Periods missed in the last ticks", registry=registry).set(
+            measured["periods_missed"]
+        )
+        lateness = Gauge("rtloop_lateness_us", "Lateness over the last ticks", ["quantile"], registry=registry)
+        for quantile, value in measured["lateness_us"].items():
+            lateness.labels(quantile).set(value)
+    axes = newest_signals(service).get("axes", {})
+    signal = Gauge("rtloop_signal", "Newest value of a signal", ["axis", "signal"], registry=registry)
+    for axis, values in axes.items():
+        for name, value in values.items():
+            if value is not None:
+                signal.labels(axis, name).set(value)
+    return generate_latest(registry).decode()

@@ -1,0 +1,37 @@
+"""What systemd is told: READY, STATUS, WATCHDOG, STOPPING, by one datagram each (sd_notify(3)). Nothing without it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+
+
+class Notifier:
+    """Talks to the service manager that started this process, if one did."""
+
+    def __init__(self) -> None:
+        address = os.environ.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        watchdog_us = os.environ.get("WATCHDOG_USEC", "")
+        ours = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self.watchdog_s = int(watchdog_us) / 1e6 if watchdog_us.isdigit() and ours else None
+        self._next_s = 0.0
+
+    def send(self, **fields: str | int) -> None:
+        """`send(READY=1, STATUS="…")`."""
+        if not self._address:
+            return
+        message = "\n".join(f"{name}={value}" for name, value in fields.items())
+        # a manager that went away is no reason to stop the loop
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel, contextlib.suppress(OSError):
+            channel.sendto(message.encode(), self._address)
+
+    def due(self, period_s: float) -> bool:
+        """True once a period, for what is told again and again."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return False
+        self._next_s = now_s + period_s
+        return True

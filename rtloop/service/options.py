@@ -1,0 +1,41 @@
+"""What a user may say about the service."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from hil.options import Options
+
+
+class DepolariseOptions(Options):
+    """A sine of falling amplitude before the first command, which wipes out the actuator's memory."""
+
+    amplitude_v: float = Field(gt=0)
+    frequency_hz: float = Field(default=10.0, gt=0)
+    cycles: int = Field(default=20, ge=2, le=1000)
+
+
+class ServiceOptions(Options):
+    """`rtloop serve`."""
+
+    socket: str | None = None
+    """Path of the control socket; RUNTIME_DIRECTORY/NAME.sock, or /run/user or /tmp, by default."""
+    socket_mode: Annotated[str, Field(pattern=r"^0[0-7]{3}$")] = "0660"
+    stall_ms: float = Field(default=50.0, ge=10.0)
+    """Ticks that stand still for so long, while the supervisor was awake, get the loop killed and parked."""
+    arm: bool = False
+    """Start with the outputs off, and drive only after `arm` and `start`."""
+    restarts: int = Field(default=3, ge=0)
+    """How often in `restart_window_s` a loop that died is started again, outputs off."""
+    restart_window_s: float = Field(default=60.0, gt=0)
+    tare_s: float = Field(default=0.0, ge=0, le=60.0)
+    """Mean of the sensor over so long, outputs at safe, becomes position 0."""
+    depolarise: DepolariseOptions | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if int(self.socket_mode, 8) & 0o007:
+            raise ValueError(f"socket_mode: {self.socket_mode}; nothing for others is allowed, such as 0660")
+        return self

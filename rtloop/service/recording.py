@@ -1,0 +1,134 @@
+"""The recorder as the supervisor keeps it: started, watched, replaced when it dies, its files put in order."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from rtloop.config import RecordingOptions
+from rtloop.engine.memory import ProcessState, SharedBlock, Word
+from rtloop.errors import OutputError, RtloopError
+from rtloop.recording.recover import recover
+from rtloop.service.child import Child
+from rtloop.service.stall import StallWatch
+
+MODULE = "rtloop.recording.recorder"
+STALL_S = 1.5
+LONGEST_STEP_S = 0.1
+END_TIMEOUT_S = 30.0
+MAX_REPLACEMENTS = 10
+
+
+class RecorderKeeper:
+    """Keeps one recorder running on `block`, writing the file or files of `path`.
+
+    A recorder that died or stands still is replaced; the next one goes on where the last one's file ends, so nothing
+    is lost while the ring still holds it.
+    """
+
+    def __init__(self, child: Child, block: SharedBlock, path: Path, options: RecordingOptions) -> None:
+        self._child, self._block, self._path, self._options = child, block, path, options
+        self._header: dict[str, Any] = {}
+        self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
+        self._ordered = False
+        self.replacements = 0
+        self.notes: list[str] = []
+
+    @property
+    def state(self) -> int:
+        """Of the present recorder, a ProcessState."""
+        return int(self._block.words[Word.RECORDER_STATE])
+
+    @property
+    def exit_code(self) -> int | None:
+        """Of the present recorder's process."""
+        return self._child.exit_code
+
+    def start(self, header: dict[str, Any]) -> None:
+        """Hand over the header and wait until the file is open. Raises OutputError."""
+        self._header = header
+        self._order()
+        while self.state == ProcessState.READY and self.exit_code is None:
+            time.sleep(0.002)
+        if self.state != ProcessState.RUNNING:
+            self._child.wait(END_TIMEOUT_S)
+            raise OutputError(f"{self._path}: cannot record: {self._totals().get('error') or 'the recorder ended'}")
+
+    def poll(self) -> None:
+        """Replace a recorder that died or stands still; give a new one its orders."""
+        if not self._ordered:
+            if self.state == ProcessState.READY:
+                self._order()
+            return
+        words = self._block.words
+        behind = int(self._block["ticks_head"][0]) != int(words[Word.RECORDER_CURSOR])
+        stuck = self._watch.stalled(int(words[Word.RECORDER_CURSOR])) and behind
+        if (self.exit_code is not None or stuck) and self.replacements < MAX_REPLACEMENTS:
+            reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
+            self._child.end()
+            self.notes.append(f"the recorder {reason} and was replaced")
+            self.replacements += 1
+            words[Word.RECORDER_STATE] = ProcessState.STARTING
+            self._child, self._ordered = Child(MODULE, self._block.fd), False
+            self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
+
+    def finish(self) -> dict[str, Any]:
+        """Wait for the end, repair what dead recorders left; the totals, with all `paths`."""
+        deadline = time.monotonic() + END_TIMEOUT_S
+        while not self._ordered and time.monotonic() < deadline and self.exit_code is None:
+            self.poll()
+            time.sleep(0.01)
+        if self._child.wait(END_TIMEOUT_S) is None:
+            self._child.end()
+            self.notes.append("the recorder did not end and was killed")
+        totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._totals()
+        for part in self._files(".mcap.part"):
+            self._repair(part)
+        totals["paths"] = [str(path) for path in self._files(".mcap")]
+        return totals
+
+    def _files(self, suffix: str) -> list[Path]:
+        """This run's files, in their order."""
+        folder, stem = self._path.parent, self._path.stem
+        return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
+
+    def close(self) -> None:
+        """End it, whatever it is doing."""
+        self._child.end()
+
+    def _repair(self, part: Path) -> None:
+        try:
+            report = recover(part)
+        except RtloopError as error:
+            self.notes.append(str(error))
+            return
+        part.unlink()
+        self.notes.append(f"{report['output']}: recovered, {report['ticks']} ticks")
+
+    def _totals(self) -> dict[str, Any]:
+        reports = self._child.reports()
+        return reports[-1] if reports else {}
+
+    def _order(self) -> None:
+        options = {
+            "rotate_bytes": self._options.rotate_mib and round(self._options.rotate_mib * 2**20),
+            "rotate_s": self._options.rotate_s,
+            "min_free_bytes": round(self._options.min_free_mib * 2**20),
+            "message_index": self._options.message_index,
+            "sequence": self._next_sequence(),
+        }
+        order = {"path": str(self._path), "header": self._header, "options": options}
+        self._child.send(json.dumps(order).encode() + b"\n")
+        self._ordered = True
+
+    def _next_sequence(self) -> int:
+        """1 for the first recorder, then the number after all files of this run."""
+        if self.replacements == 0:
+            return 1
+        prefix = f"{self._path.stem}-"
+        numbered = [
+            path for path in (*self._files(".mcap"), *self._files(".mcap.part")) if path.name.startswith(prefix)
+        ]
+        return max((int(path.name.removeprefix(prefix).split(".")[0]) for path in numbered), default=1) + 1

@@ -1,0 +1,254 @@
+"""The daemon: one loop after the other, watched, told to systemd, and commanded through the control API.
+
+    stopped ──arm──► armed ──start──► running ──stop──► ramping ──► armed (or stopped, where arming is required)
+                                         │ trip, or the loop's process died (parked in its place, started again)
+                                         ▼
+                                      tripped ──reset──► armed (or stopped)
+
+The state is not stored: it is read off the newest record, the latched faults and `armed`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import DriverError
+from rtloop import signals
+from rtloop.config import Configuration, load
+from rtloop.engine.memory import Word
+from rtloop.engine.messages import MESSAGE, Kind
+from rtloop.errors import LoopFault, RtloopError
+from rtloop.prepare import Prepared, prepare
+from rtloop.running import recording_path
+from rtloop.service.desk import Desk, Refused
+from rtloop.service.live import LiveLaw
+from rtloop.service.notify import Notifier
+from rtloop.service.paths import block_path
+from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.signals import Flag, Mode
+
+POLL_S = 0.005
+STATUS_PERIOD_S = 1.0
+READY_TICKS = 10
+RESTART_PAUSE_S = 0.2
+SPARE_SAMPLES = 1 << 20
+log = logging.getLogger("rtloop")
+
+
+class State(StrEnum):
+    """What the service is doing."""
+
+    STARTING = "starting"
+    STOPPED = "stopped"
+    ARMED = "armed"
+    RUNNING = "running"
+    RAMPING = "ramping"
+    TRIPPED = "tripped"
+
+
+class Service:
+    """Serves one configuration until `end`. Methods named like API calls may come from any thread."""
+
+    def __init__(self, config: Path) -> None:
+        self.config = config
+        self.configuration: Configuration = load(config)
+        self.notifier = Notifier()
+        self.faults: list[str] = []
+        self.armed = not self.configuration.service.arm
+        self.results: list[RunResult] = []
+        self.supervisor: Supervisor | None = None
+        self.live: LiveLaw | None = None
+        self._desk: Desk | None = None
+        self._ending, self._reload = threading.Event(), threading.Event()
+        self._deaths_s: list[float] = []
+        self._ready = False
+
+    # what signals and the API ask for
+
+    def end(self) -> None:
+        """Ramp down, finish the recording, return from `run`."""
+        self._ending.set()
+
+    def reload(self) -> None:
+        """Read the configuration again, soon."""
+        self._reload.set()
+
+    @property
+    def state(self) -> State:
+        """Derived from what is there."""
+        row = None if self.supervisor is None else self.supervisor.latest()
+        if row is None:
+            return State.TRIPPED if self.faults else State.STARTING
+        if self.faults or int(row[signals.FLAGS]) & signals.TRIP_MASK:
+            return State.TRIPPED
+        if row[signals.MODE] != Mode.OFF:
+            return State.RUNNING
+        if int(row[signals.FLAGS]) & Flag.RAMPING:
+            return State.RAMPING
+        return State.ARMED if self.armed else State.STOPPED
+
+    @property
+    def desk(self) -> Desk:
+        """Where commands for the running loop go. Raises Refused where none runs."""
+        if self._desk is None or self.supervisor is None or self.supervisor.latest() is None:
+            raise Refused(f"no loop is running: the service is {self.state}")
+        return self._desk
+
+    def arm(self) -> None:
+        """Allow `start`. Raises Refused while tripped."""
+        if self.state is State.TRIPPED:
+            raise Refused("arm: tripped; reset first")
+        self.armed = True
+
+    def start(self) -> int:
+        """Set the configured mode; returns the tick. Raises Refused unless armed."""
+        return self.set_mode(self.configuration.loop.mode)
+
+    def set_mode(self, mode: str) -> int:
+        """Change the mode bumplessly; returns the tick. Raises Refused."""
+        wanted = Mode[mode.upper()]
+        if wanted is not Mode.OFF and self.state is State.TRIPPED:
+            raise Refused(f"mode {mode}: tripped; reset first")
+        if wanted is not Mode.OFF and not self.armed:
+            raise Refused(f"mode {mode}: not armed")
+        return self.desk.submit(Kind.SET_MODE, values=[float(wanted)])
+
+    def stop(self) -> int:
+        """Ramp the outputs to safe and stay there; returns the tick. Raises Refused."""
+        tick = self.set_mode("off")
+        self.armed = not self.configuration.service.arm
+        return tick
+
+    def reset(self) -> int:
+        """Forget latched trips and faults; outputs stay off. Raises Refused."""
+        tick = self.desk.submit(Kind.RESET_TRIP)
+        self.faults.clear()
+        self.armed = not self.configuration.service.arm
+        return tick
+
+    # the daemon
+
+    def run(self) -> int:
+        """Serve until told to end, or until the loop died too often; the exit code."""
+        resting = self.configuration.service.arm
+        while not self._ending.is_set():
+            try:
+                result = self._episode(resting)
+            except (RtloopError, DriverError) as error:
+                if not self._may_restart(str(error)):
+                    raise
+                continue
+            self.results.append(result)
+            if self._ending.is_set():
+                return 0 if result.exit_code == 0 else result.exit_code
+            if not self._may_restart(result.error or f"the loop ended: {result.outcome}"):
+                raise LoopFault(f"the loop died too often: {'; '.join(self.faults)}")
+            resting = True
+        return 0
+
+    def _episode(self, resting: bool) -> RunResult:
+        """One loop from its start to its end; `resting` starts with the outputs off and without a schedule."""
+        with Processes(block_path(self.configuration)) as processes:
+            prepared = prepare(self.configuration)
+            if resting:
+                plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
+                prepared = replace(prepared, plan=plan)
+            prepared = replace(prepared, plan=replace(prepared.plan, spare_samples=SPARE_SAMPLES))
+            stall_s = self.configuration.service.stall_ms / 1000
+            supervisor = Supervisor(processes, prepared, recording_path(prepared, None), stall_s)
+            try:
+                supervisor.start()
+                self._desk = Desk(supervisor.block)
+                self.live = LiveLaw(prepared, supervisor.block, self._desk)
+                self.supervisor = supervisor
+                return self._watch(supervisor)
+            finally:
+                self.supervisor = self._desk = self.live = None
+                supervisor.close()
+
+    def _watch(self, supervisor: Supervisor) -> RunResult:
+        said: State | None = None
+        while (result := supervisor.poll()) is None:
+            if self._ending.is_set():
+                self.notifier.send(STOPPING=1, STATUS="ramping down")
+                supervisor.stop()
+            if self._reload.is_set():
+                self._reload.clear()
+                self._apply_reload()
+            self._tell(supervisor)
+            state = self.state
+            if state is not said:
+                row = supervisor.latest()
+                causes = [] if row is None else signals.trip_causes(row[signals.FLAGS])
+                level = logging.ERROR if state is State.TRIPPED else logging.INFO
+                log.log(
+                    level, "%s%s", state, f": {', '.join([*causes, *self.faults])}" if state is State.TRIPPED else ""
+                )
+                said = state
+            time.sleep(POLL_S)
+        for note in result.notes:
+            log.warning("%s", note)
+        if result.error:
+            log.error("%s", result.error)
+        return result
+
+    def _tell(self, supervisor: Supervisor) -> None:
+        """READY after ticks really ran; WATCHDOG only while they advance; STATUS now and then."""
+        if not self._ready and supervisor.ticks >= READY_TICKS:
+            self._ready = True
+            self.notifier.send(READY=1)
+        if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4)):
+            return
+        if supervisor.ticks > self._told_ticks or supervisor.block.words[Word.STOP]:
+            self.notifier.send(WATCHDOG=1)
+        self._told_ticks = supervisor.ticks
+        rows = supervisor.newest(int(min(supervisor.prepared.plan.pacing.rate_hz, 20000)))
+        if len(rows) > 1:
+            span_s = (rows[-1, signals.DEADLINE] - rows[0, signals.DEADLINE]) / 1e9
+            worst_us = float(np.max(rows[:, signals.LATENESS]))
+            self.notifier.send(
+                STATUS=f"{self.state}, {(len(rows) - 1) / span_s:.0f} Hz, worst lateness {worst_us:.0f} µs"
+            )
+
+    _told_ticks = 0
+
+    def _may_restart(self, reason: str) -> bool:
+        """Latch the reason; False where this happened too often."""
+        self.faults.append(reason)
+        log.error("%s", reason)
+        options, now_s = self.configuration.service, time.monotonic()
+        self._deaths_s = [moment for moment in self._deaths_s if now_s - moment < options.restart_window_s] + [now_s]
+        if len(self._deaths_s) > options.restarts:
+            return False
+        self._told_ticks = 0
+        time.sleep(RESTART_PAUSE_S)
+        return True
+
+    def _apply_reload(self) -> None:
+        """Take over what may change under way; a configuration that is invalid or needs a restart changes nothing."""
+        self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
+        try:
+            self.reload_now()
+        except (RtloopError, DriverError) as error:
+            log.error("reload refused, the old configuration stays: %s", error)
+        self.notifier.send(READY=1)
+
+    def reload_now(self) -> dict[str, Any]:
+        """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""
+        configuration = load(self.config)
+        prepared: Prepared = prepare(configuration)
+        if self.live is None:
+            self.configuration = configuration
+            return {"changed": []}
+        changed = self.live.replace_all(prepared)
+        self.configuration = configuration
+        log.info("reloaded: %s", ", ".join(changed) or "nothing changed")
+        return {"changed": changed}

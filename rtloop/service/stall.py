@@ -1,0 +1,29 @@
+"""Has something stopped, or did the whole machine? A counter watched with the time that the watcher was awake."""
+
+from __future__ import annotations
+
+import time
+
+
+class StallWatch:
+    """Watches a counter that ought to advance.
+
+    Time counts only as far as the watcher was awake itself: a stall of the host, which stops everybody, passes in one
+    long interval that counts as `longest_step_s`.
+    """
+
+    def __init__(self, limit_s: float, longest_step_s: float) -> None:
+        self._limit_s, self._longest_step_s = limit_s, longest_step_s
+        self._counter: int | None = None
+        self._last_s = time.monotonic()
+        self.stalled_s = 0.0
+
+    def stalled(self, counter: int) -> bool:
+        """Call often; True once the counter stood still for the limit."""
+        now_s = time.monotonic()
+        step_s, self._last_s = now_s - self._last_s, now_s
+        if counter != self._counter:
+            self._counter, self.stalled_s = counter, 0.0
+        else:
+            self.stalled_s += min(step_s, self._longest_step_s)
+        return self.stalled_s >= self._limit_s

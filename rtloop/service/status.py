@@ -1,0 +1,71 @@
+"""What the service says of itself, read off the newest records."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rtloop import signals
+from rtloop.service.service import Service
+from rtloop.signals import Flag, Mode
+
+WINDOW_TICKS = 10_000
+
+
+def status(service: Service) -> dict[str, Any]:
+    """State, timing over the last ticks, faults, and the newest signals."""
+    supervisor = service.supervisor
+    report: dict[str, Any] = {
+        "name": service.configuration.name,
+        "state": service.state.value,
+        "armed": service.armed,
+        "faults": list(service.faults),
+        "ticks": 0 if supervisor is None else supervisor.ticks,
+        "realtime": {} if supervisor is None else supervisor.realtime,
+        "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
+        "restarts": len(service.results),
+    }
+    return report | timing(service) | newest_signals(service)
+
+
+def timing(service: Service) -> dict[str, Any]:
+    """Rate, lateness, overruns and missed periods over the last WINDOW_TICKS; empty before there are any."""
+    rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
+    if rows is None or len(rows) < 2:
+        return {}
+    span_s = (rows[-1, signals.DEADLINE] - rows[0, signals.DEADLINE]) / 1e9
+    late = rows[:, signals.LATENESS]
+    flags = rows[:, signals.FLAGS].astype(np.int64)
+    return {
+        "rate_hz": (len(rows) - 1) / span_s,
+        "lateness_us": {"p50": float(np.median(late)), "p99": float(np.quantile(late, 0.99)), "max": float(late.max())},
+        "overruns": int(np.count_nonzero(flags & Flag.OVERRUN)),
+        "periods_missed": int(rows[:, signals.PERIODS_MISSED].sum()),
+    }
+
+
+def newest_signals(service: Service) -> dict[str, Any]:
+    """Tick, mode, trip causes and the signals of each axis; empty before the first tick."""
+    supervisor = service.supervisor
+    row = None if supervisor is None else supervisor.latest()
+    if supervisor is None or row is None:
+        return {}
+    axes = {
+        axis: {
+            signal.name: _number(row[signals.axis_column(number, column)])
+            for column, signal in enumerate(signals.PER_AXIS)
+        }
+        for number, axis in enumerate(supervisor.prepared.plan.axes)
+    }
+    return {
+        "tick": int(row[signals.TICK]),
+        "mode": Mode(int(row[signals.MODE])).name.lower(),
+        "trip": signals.trip_causes(row[signals.FLAGS]),
+        "axes": axes,
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,68 @@
+"""A run of the command line that is killed, all its processes at once, and what it leaves."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from rtloop.engine.memory import SharedBlock, Word
+from rtloop.recording.load import load
+from rtloop.recording.recover import recover
+from rtloop.recording.replay import replay
+from tests.service.test_run import PAPER, TIMEOUT_S, children, start
+
+
+class Killed(NamedTuple):
+    """Ticks: executed, taken by the recorder, and columns of a record; the unfinished file."""
+
+    part: Path
+    executed: int
+    taken: int
+
+
+def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
+    """Run the paper's loop until `after_s` after its file was opened, then SIGKILL supervisor, recorder and loop."""
+    process = start("run", PAPER, "--out", folder, *options)
+    pids = children(process)
+    deadline = time.monotonic() + TIMEOUT_S
+    while not (parts := list(folder.glob("*.mcap.part"))):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    block = _block_of(pids["recording.recorder"])
+    time.sleep(after_s)
+    for pid in (process.pid, pids["recording.recorder"], pids["engine.process"]):
+        os.kill(pid, signal.SIGKILL)
+    process.communicate()
+    while any(_alive(pid) for pid in pids.values()):
+        time.sleep(0.002)
+    return Killed(parts[0], int(block["ticks_head"][0]), int(block.words[Word.RECORDER_CURSOR]))
+
+
+def recovered_ticks(killed: Killed) -> int:
+    """Ticks in the recovered file, which is replayed; 0 where nothing had been written yet."""
+    report = recover(killed.part)
+    assert report["gaps"] == []
+    if report["ticks"]:
+        verdict = replay(load(report["output"]))
+        assert verdict.identical, verdict
+        assert verdict.ticks == report["ticks"]
+    return report["ticks"]
+
+
+def _block_of(pid: int) -> SharedBlock:
+    """The shared block of a process, kept beyond its end."""
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        if "memfd:rtloop" in os.readlink(link):
+            return SharedBlock(os.open(link, os.O_RDWR))
+    raise AssertionError("the recorder has no shared block")
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
