@@ -2,7 +2,7 @@
 
 numba decides whether a cached function is still valid by looking at the file that defines it, and only that one: a
 loop that calls an edited law would keep running the old law. The cache therefore lives in a folder named by a
-digest of every source file of the project, of the compiler's version and of the processor.
+digest of every source file that kernels may come from, of the compiler's version and of the processor.
 
 The options keep results equal in bits from one machine to the next: no `fastmath`, no contraction, IEEE division.
 """
@@ -25,14 +25,16 @@ import numba.extending
 from numba import config as numba_config
 
 SOURCE_ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("hil", "drivers", "rtloop")
+KERNELS = ("hil", "drivers", "rtloop/law", "rtloop/engine", "rtloop/signals.py")
+"""Where compiled code, and what it is made from, may stand."""
 
 
 def source_digest() -> str:
-    """Hexadecimal digest of all sources, the compiler's version and the processor."""
+    """Hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
     digest = hashlib.sha256()
-    for package in PACKAGES:
-        for path in sorted((SOURCE_ROOT / package).rglob("*.py")):
+    for place in KERNELS:
+        found = SOURCE_ROOT / place
+        for path in sorted(found.rglob("*.py")) if found.is_dir() else [found]:
             digest.update(path.relative_to(SOURCE_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     for fact in (numba.__version__, llvmlite.__version__, platform.python_version(), cpu_identity()):
         digest.update(fact.encode() + b"\0")

@@ -23,9 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.atomics import load_acquire, store_release
-from hil.compiled import jit
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
+from rtloop.engine.words import load_word, store_word
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.rings import RingReader
 from rtloop.recording.session import Options, Session
@@ -34,18 +33,6 @@ POLL_S = 0.1
 UNPACED_POLL_S = 0.0002
 ABANDONED_S = 5.0
 """With the supervisor gone and no new tick for this long, the loop is taken as gone too."""
-
-
-@jit
-def load_word(words, index):
-    """One control word."""
-    return load_acquire(words, index)
-
-
-@jit
-def store_word(words, index, value):
-    """Set one control word."""
-    store_release(words, index, value)
 
 
 class Recorder:
