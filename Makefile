@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench check clean
+.PHONY: run test bench soak-recordings check clean
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -18,6 +18,10 @@ test: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks
+
+# Killed runs, damaged files, other processors, an hour at 10 kHz: about half an hour, 2 GB in the temporary folder.
+soak-recordings: $(READY)
+	$(BIN)/python -m tests.soak.recordings
 
 check: $(READY)
 	$(BIN)/rtloop check deploy/paper.toml

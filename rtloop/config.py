@@ -38,6 +38,8 @@ class LoopOptions(Options):
     cpu: int | None = Field(default=None, ge=0)
     require_realtime: bool = False
     """Refuse to start where SCHED_FIFO or locked memory is not granted."""
+    enable_input: str | None = None
+    """Input channel of an enable or emergency-stop switch; its threshold is [axis.interlocks] enable_min_v."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """The loop parks by itself when its supervisor was silent for so long."""
 

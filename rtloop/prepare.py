@@ -74,6 +74,9 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     facts = driver and findings.attempt("", lambda: require_facts(driver, rate_hz, paced))
     if facts is None:
         raise ConfigError(configuration.name, findings.faults)
+    if configuration.loop.enable_input is not None:
+        enable_input = configuration.loop.enable_input
+        findings.attempt("loop.enable_input: ", lambda: index_of(facts.inputs, enable_input))
     checks, coefficients = [], []
     for axis in configuration.axes:
         check = _check(axis, 1.0 / rate_hz, findings)
@@ -101,6 +104,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         table=table.samples,
         schedule=schedule,
         observed=facts.observed,
+        enable_input=configuration.loop.enable_input,
     )
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
 
@@ -181,7 +185,13 @@ def _coefficients(
     return findings.attempt(
         f"axis.{axis.name}.",
         lambda: axis_coefficients(
-            axis, discrete, channel.um_per_v, channel.offset, output, 1.0 / configuration.loop.rate_hz
+            axis,
+            discrete,
+            channel.um_per_v,
+            channel.offset,
+            output,
+            1.0 / configuration.loop.rate_hz,
+            enable=configuration.loop.enable_input is not None,
         ),
     )
 

@@ -56,29 +56,6 @@ class RunView:
         self._status.update("   ".join(parts))
 
 
-class Counter:
-    """A number that grows, on a terminal."""
-
-    def __init__(self, label: str, stream: IO[str]) -> None:
-        console = Console(file=stream, highlight=False)
-        self._label = label
-        self._status = console.status(label) if console.is_terminal else None
-
-    def __enter__(self) -> Counter:
-        if self._status:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._status:
-            self._status.stop()
-
-    def show(self, count: int) -> None:
-        """The number so far."""
-        if self._status:
-            self._status.update(f"{count:,} {self._label}")
-
-
 def _elapsed(time_s: float, ticks: int | None, rate_hz: float) -> str:
     return f"{time_s:8.1f} s" if ticks is None else f"{time_s:8.1f} of {ticks / rate_hz:g} s"
 

@@ -15,10 +15,11 @@ import click
 from rtloop.config import load
 from rtloop.errors import LoopFault, OutputError
 from rtloop.prepare import Prepared, prepare
+from rtloop.progress import Counter
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
-from rtloop.report import Counter, RunView, print_run
+from rtloop.report import RunView, print_run
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 
 PROGRESS_PERIOD_S = 0.1

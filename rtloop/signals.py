@@ -32,6 +32,7 @@ COMMON = (
     Signal("mode", "1", "Mode in force during the tick"),
     Signal("driver_status", "1", "what the driver's read returned: 0 good, > 0 degraded, < 0 failed"),
     Signal("sample_age_us", "µs", "age of the sample as the driver knows it; 0 where it was taken by the read"),
+    Signal("enable_v", "V", "enable input; 0 where none is wired"),
 )
 PER_AXIS = (
     Signal("adc_v", "V", "raw input"),
@@ -55,6 +56,7 @@ PER_AXIS = (
     MODE,
     DRIVER_STATUS,
     SAMPLE_AGE,
+    ENABLE,
 ) = range(len(COMMON))
 ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE = range(len(PER_AXIS))
 COMMON_COUNT = len(COMMON)
@@ -85,6 +87,11 @@ class Flag(IntFlag):
     TRIP_DRIVER = 1 << 11
     TRIP_HEARTBEAT = 1 << 12
     TRIP_STALE = 1 << 13
+    TRIP_FROZEN = 1 << 14
+    TRIP_TRACKING = 1 << 15
+    TRIP_OSCILLATION = 1 << 16
+    TRIP_LATE = 1 << 17
+    TRIP_ENABLE = 1 << 18
 
 
 TRIP_MASK = ~0xFF & 0xFFFFFFFF

@@ -91,7 +91,7 @@ def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
     """The loop of C(s) and D(s). Raises ValueError for a plant with direct feedthrough."""
     _check(plant)
     roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
-    return Loop(_realised(controller), _realised(plant), (controller * plant).dc_gain, roots)
+    return Loop(realised(controller), realised(plant), (controller * plant).dc_gain, roots)
 
 
 def discrete_loop(controller: DiscreteController, plant: Transfer, delay_ticks: int = 0) -> Loop:
@@ -114,7 +114,8 @@ def _rates(images: Complex, period_s: float) -> Complex:
     return (np.log(images[np.abs(images) > 1e-9].astype(complex)) / period_s).astype(complex)
 
 
-def _realised(transfer: Transfer) -> System:
+def realised(transfer: Transfer) -> System:
+    """A real, well-conditioned state space of a transfer function in s."""
     points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
     return realise(transfer.zeros, transfer.poles, transfer.gain, points)[0]
 

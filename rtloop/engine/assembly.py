@@ -13,7 +13,7 @@ from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.plan import Plan
 from rtloop.law.law import set_mode
-from rtloop.law.layout import Records, copied, initial_state
+from rtloop.law.layout import CONDITIONS, Records, copied, initial_state
 
 SNAPSHOT_SECONDS = 1.0
 UNLIMITED = np.iinfo(np.int64).max
@@ -77,6 +77,8 @@ class Assembly:
         self._point("inputs", np.zeros(len(facts.inputs) + 1 + len(facts.observed)))
         self._point("outputs", np.array([channel.safe_v for channel in facts.outputs]))
         self._point("timing", np.zeros(4))
+        self._point("conditions", np.zeros(1, CONDITIONS))
+        loop.enable_index = -1 if plan.enable_input is None else index_of(facts.inputs, plan.enable_input)
         self._point("adc_v", np.zeros(len(axes)))
         self._point("references", np.zeros(len(axes)))
         inputs = [index_of(facts.inputs, plan.wiring[axis].input) for axis in axes]

@@ -12,7 +12,7 @@ from hil.compiled import jit
 from hil.pointers import address_pointer, carray
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
 from rtloop.law.reference import GENERATOR
 
 WORDS = 64
@@ -23,6 +23,7 @@ _ADDRESSES = (
     *("inputs", "outputs", "timing"),
     # law
     *("coefficients", "axes", "law_state", "generators", "table", "adc_v", "references", "input_index", "output_index"),
+    "conditions",
     # shared block
     *("words", "last_drive_v", "commands", "schedule", "staged"),
     *(f"{ring}_{part}" for ring in ("ticks", "events", "snapshots") for part in ("head", "marks", "slots")),
@@ -33,6 +34,7 @@ _COUNTS = (
     *("ticks_capacity", "events_capacity", "snapshots_capacity", "column_count", "snapshot_bytes"),
 )
 _SETTINGS = (
+    ("enable_index", np.int64),
     ("period_s", np.float64),
     ("period_us", np.float64),
     ("heartbeat_timeout_ns", np.float64),
@@ -68,6 +70,12 @@ def axes_of(loop):
 def state_of(loop):
     """State common to all axes."""
     return carray(address_pointer(loop.law_state), 1, LOOP_STATE)[0]
+
+
+@jit
+def conditions_of(loop):
+    """What the tick is judged by beside its inputs."""
+    return carray(address_pointer(loop.conditions), 1, CONDITIONS)[0]
 
 
 @jit

@@ -19,6 +19,7 @@ from rtloop.engine.commands import apply_commands, publish_event
 from rtloop.engine.context import (
     axes_of,
     coefficients_of,
+    conditions_of,
     floats,
     generators_of,
     integers,
@@ -101,7 +102,8 @@ def _tick(loop):
     status = call(loop.read, loop.driver_context, loop.inputs)
     read_ns = _now(loop)
 
-    _evaluate(loop, status, now_ns)
+    lateness_us = (wake_ns - deadline_ns) * US_PER_NS
+    _evaluate(loop, status, now_ns, lateness_us)
     law_ns = _now(loop)
 
     written = call(loop.write, loop.driver_context, loop.outputs)
@@ -117,7 +119,7 @@ def _tick(loop):
     _fill_signals(loop, row)
     row[0] = float(loop.tick)
     row[1] = deadline_ns
-    row[2] = (wake_ns - deadline_ns) * US_PER_NS
+    row[2] = lateness_us
     row[3] = (read_ns - wake_ns) * US_PER_NS
     row[4] = (law_ns - read_ns) * US_PER_NS
     row[5] = (write_ns - law_ns) * US_PER_NS
@@ -125,7 +127,7 @@ def _tick(loop):
     row[9] = float(state.mode)
     row[10] = float(status)
     row[6] = (_now(loop) - wake_ns) * US_PER_NS
-    overrun = row[2] + row[6] > loop.period_us
+    overrun = lateness_us + row[6] > loop.period_us
     row[8] = float(state.tick_flags | (OVERRUN if overrun else 0))
     publish(ring, position)
 
@@ -140,7 +142,7 @@ def _now(loop):
 
 
 @jit
-def _evaluate(loop, status, now_ns):
+def _evaluate(loop, status, now_ns, lateness_us):
     """References, interlocks and law; the drives go to the driver's outputs and to the shared block."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs, last_drive_v = floats(loop.outputs, loop.output_count), floats(loop.last_drive_v, loop.axis_count)
@@ -155,9 +157,13 @@ def _evaluate(loop, status, now_ns):
         adc_v[a] = inputs[input_index[a]]
         references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
     heartbeat_ns = float(load_acquire(words_of(loop), HEARTBEAT_WORD))
-    heartbeat_lost = now_ns - heartbeat_ns > loop.heartbeat_timeout_ns
-    age_us = inputs[loop.input_count]
-    evaluate(coefficients_of(loop), axes, state_of(loop), adc_v, references, status, age_us, heartbeat_lost)
+    conditions = conditions_of(loop)
+    conditions.driver_status = status
+    conditions.heartbeat_lost = 1 if now_ns - heartbeat_ns > loop.heartbeat_timeout_ns else 0
+    conditions.sample_age_us = inputs[loop.input_count]
+    conditions.lateness_us = lateness_us
+    conditions.enable_v = inputs[loop.enable_index] if loop.enable_index >= 0 else 0.0
+    evaluate(coefficients_of(loop), axes, state_of(loop), adc_v, references, conditions)
     for a in range(loop.axis_count):
         outputs[output_index[a]] = axes[a].drive_v
         last_drive_v[a] = axes[a].drive_v
@@ -170,6 +176,7 @@ def _fill_signals(loop, row):
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
     axes = axes_of(loop)
     row[11] = inputs[loop.input_count]
+    row[12] = conditions_of(loop).enable_v
     for a in range(loop.axis_count):
         column = COMMON_COUNT + a * PER_AXIS_COUNT
         row[column] = adc_v[a]

@@ -46,6 +46,7 @@ class Plan:
     table: npt.NDArray[np.float64]
     schedule: npt.NDArray[Any]
     observed: tuple[str, ...]
+    enable_input: str | None = None
     spare_samples: int = 0
     """Room behind `table` for waveforms that come while the loop runs."""
 

@@ -22,8 +22,9 @@ def axis_coefficients(
     offset_v: float,
     output: Channel,
     period_s: float,
+    enable: bool = False,
 ) -> Records:
-    """Coefficients (1,) of one axis.
+    """Coefficients (1,) of one axis; `enable` where the loop has an enable input.
 
     Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
     """
@@ -35,7 +36,7 @@ def axis_coefficients(
         fields["tracking_share"] = _tracking_share(controller, axis.controller.tracking_s, period_s)
     fields |= _prefilter(axis.prefilter)
     fields |= limit_fields(axis.limits, output, period_s)
-    fields |= interlock_fields(axis.interlocks)
+    fields |= interlock_fields(axis.interlocks, enable)
     for name, value in fields.items():
         _assign(coefficients, name, value)
     return coefficients
@@ -155,7 +156,7 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     }
 
 
-def interlock_fields(options: InterlockOptions) -> Mapping[str, float]:
+def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping[str, float]:
     """Thresholds as the law compares them."""
     if options.sensor_min_v >= options.sensor_max_v:
         raise ValueError(
@@ -166,7 +167,16 @@ def interlock_fields(options: InterlockOptions) -> Mapping[str, float]:
         "sensor_max_v": options.sensor_max_v,
         "position_limit_um": options.position_um,
         "sample_age_limit_us": options.sample_age_us,
+        "enable_min_v": options.enable_min_v if enable else -np.inf,
+        **{name: getattr(options, name) for name in WATCHED},
     }
+
+
+WATCHED = (
+    *("frozen_drive_v", "frozen_ticks", "tracking_error_um", "tracking_ticks"),
+    *("oscillation_um", "oscillation_swings", "swing_ticks", "late_us", "late_ticks"),
+)
+"""Thresholds of the interlocks with memory: named alike in options and coefficients."""
 
 
 def joined(parts: Sequence[Records]) -> Records:

@@ -13,6 +13,7 @@ from hil.compiled import jit
 from rtloop.law.filters import controller_enter, controller_output, controller_update, prefilter
 from rtloop.law.hysteresis import follow_drive, inverse_drive
 from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
+from rtloop.law.watch import watch
 from rtloop.signals import Flag, Mode
 
 OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
@@ -40,19 +41,23 @@ def reset_trip(loop):
 
 
 @jit
-def evaluate(coefficients, axes, loop, adc_v, references, driver_status, sample_age_us, heartbeat_lost):
-    """Drives of this tick, in `axes[a].drive_v`, from the inputs in V and the references (µm; V in RAW mode)."""
-    causes = loop_causes(driver_status, heartbeat_lost)
+def evaluate(coefficients, axes, loop, adc_v, references, conditions):
+    """Drives of this tick, in `axes[a].drive_v`, from the inputs in V and the references (µm; V in RAW mode).
+
+    `conditions` is one CONDITIONS record.
+    """
+    causes = loop_causes(conditions)
     for a in range(axes.shape[0]):
         state = axes[a]
         state.position_um = (adc_v[a] - coefficients[a].offset_v) * coefficients[a].um_per_v
         state.usable = 1 if usable(adc_v[a]) and usable(references[a]) else 0
-        causes |= axis_causes(coefficients[a], state, adc_v[a], sample_age_us)
+        causes |= axis_causes(coefficients[a], state, adc_v[a], conditions)
+        causes |= watch(coefficients[a], state, loop.mode, adc_v[a], conditions.lateness_us)
     loop.new_trip = causes & ~loop.trip
     loop.trip |= causes
     if loop.trip != 0:
         loop.mode = OFF
-    loop.tick_flags = loop.trip | (HEARTBEAT_LOST if heartbeat_lost else 0)
+    loop.tick_flags = loop.trip | (HEARTBEAT_LOST if conditions.heartbeat_lost != 0 else 0)
     loop.settled = 1
     for a in range(axes.shape[0]):
         loop.tick_flags |= _drive(coefficients[a], axes[a], loop, references[a])

@@ -83,6 +83,16 @@ COEFFICIENTS = _whole_lines(
         ("sensor_max_v", np.float64),
         ("position_limit_um", np.float64),
         ("sample_age_limit_us", np.float64),
+        ("enable_min_v", np.float64),
+        ("frozen_drive_v", np.float64),
+        ("frozen_ticks", np.int64),
+        ("tracking_error_um", np.float64),
+        ("tracking_ticks", np.int64),
+        ("oscillation_um", np.float64),
+        ("oscillation_swings", np.int64),
+        ("swing_ticks", np.int64),
+        ("late_us", np.float64),
+        ("late_ticks", np.int64),
     ]
 )
 STATE = _whole_lines(
@@ -99,6 +109,16 @@ STATE = _whole_lines(
         ("bump", np.float64),
         ("entering", np.int64),
         ("usable", np.int64),
+        # interlocks with memory
+        ("frozen_adc_v", np.float64),
+        ("frozen_from_v", np.float64),
+        ("frozen_count", np.int64),
+        ("tracking_count", np.int64),
+        ("swing_extreme_um", np.float64),
+        ("swing_direction", np.int64),
+        ("swing_age", np.int64),
+        ("swing_count", np.int64),
+        ("late_count", np.int64),
         # signals of the current tick
         ("position_um", np.float64),
         ("error_um", np.float64),
@@ -114,6 +134,17 @@ LOOP_STATE = np.dtype(
 )
 """State common to all axes: Mode; latched causes and those of this tick, as Flag bits; flags of this tick; 1 when
 every output is at its safe value."""
+CONDITIONS = np.dtype(
+    [
+        ("driver_status", np.int64),
+        ("heartbeat_lost", np.int64),
+        ("sample_age_us", np.float64),
+        ("lateness_us", np.float64),
+        ("enable_v", np.float64),
+    ],
+    align=True,
+)
+"""What a tick is judged by beside its inputs; all of it is recorded."""
 
 
 def records(dtype: np.dtype[Any], count: int) -> Records:

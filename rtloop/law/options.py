@@ -168,6 +168,21 @@ class InterlockOptions(Options):
     sensor_max_v: float = 9.99
     position_um: float = Field(default=60.0, gt=0)
     sample_age_us: float = Field(default=1000.0, ge=0)
+    enable_min_v: float = 2.5
+    """Where [loop] names an enable input: below it the axis trips."""
+    frozen_ticks: int = Field(default=0, ge=0)
+    """Trip when the reading stands still for so many ticks while the drive moves by `frozen_drive_v`; 0 is off."""
+    frozen_drive_v: float = Field(default=0.5, gt=0)
+    tracking_error_um: float = Field(default=5.0, gt=0)
+    tracking_ticks: int = Field(default=0, ge=0)
+    """Trip when the error is beyond `tracking_error_um` for so many ticks of closed loop; 0 is off."""
+    oscillation_um: float = Field(default=4.0, gt=0)
+    oscillation_swings: int = Field(default=0, ge=0)
+    """Trip after so many reversals by more than `oscillation_um`, each within `swing_ticks`; 0 is off."""
+    swing_ticks: int = Field(default=25, ge=1)
+    late_us: float = Field(default=1000.0, gt=0)
+    late_ticks: int = Field(default=0, ge=0)
+    """Trip when so many ticks in a row wake later than `late_us`; 0 is off."""
 
 
 class HoldOptions(Options):

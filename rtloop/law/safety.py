@@ -17,6 +17,7 @@ POSITION = int(Flag.TRIP_POSITION)
 DRIVER = int(Flag.TRIP_DRIVER)
 HEARTBEAT = int(Flag.TRIP_HEARTBEAT)
 STALE = int(Flag.TRIP_STALE)
+ENABLE = int(Flag.TRIP_ENABLE)
 
 
 @jit
@@ -38,7 +39,7 @@ def toward(value, target, step):
 
 
 @jit
-def axis_causes(coefficients, state, adc_v, sample_age_us):
+def axis_causes(coefficients, state, adc_v, conditions):
     """Flag bits of what is wrong on one axis; `state.usable` and `state.position_um` are set before."""
     causes = 0
     if state.usable == 0:
@@ -47,17 +48,19 @@ def axis_causes(coefficients, state, adc_v, sample_age_us):
         causes |= SENSOR_RANGE
     if state.position_um < -coefficients.position_limit_um or state.position_um > coefficients.position_limit_um:
         causes |= POSITION
-    if not sample_age_us <= coefficients.sample_age_limit_us:
+    if not conditions.sample_age_us <= coefficients.sample_age_limit_us:
         causes |= STALE
+    if not conditions.enable_v >= coefficients.enable_min_v:
+        causes |= ENABLE
     return causes
 
 
 @jit
-def loop_causes(driver_status, heartbeat_lost):
+def loop_causes(conditions):
     """Flag bits of what is wrong for all axes at once."""
     causes = 0
-    if driver_status < 0:
+    if conditions.driver_status < 0:
         causes |= DRIVER
-    if heartbeat_lost:
+    if conditions.heartbeat_lost != 0:
         causes |= HEARTBEAT
     return causes

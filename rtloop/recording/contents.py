@@ -28,6 +28,14 @@ def may_hold(entry: Entry, channel: int) -> bool:
     return channel in (entry.index.message_index_offsets or {format.TICKS})
 
 
+def overlaps(entry: Entry, start_ns: float, end_ns: float) -> bool:
+    """Whether a chunk may hold messages between two log times, to a microsecond: a double has no room for more."""
+    index, margin_ns = entry.index, 1e3
+    return index is None or not (
+        index.message_end_time < start_ns - margin_ns or index.message_start_time > end_ns + margin_ns
+    )
+
+
 def read_chunk(source: Source, entry: Entry) -> bytes:
     """The chunk record. Raises DamagedChunk where it contradicts the index, which has a checksum."""
     record = source.read(entry.offset, entry.length)

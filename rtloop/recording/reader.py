@@ -22,7 +22,7 @@ import numpy as np
 from rtloop.recording import format
 from rtloop.recording.chunks import Entry, Source, indexed_chunks, scanned_chunks
 from rtloop.recording.container import DamagedChunk, unpack_chunk
-from rtloop.recording.contents import Message, is_ticks, may_hold, read_chunk, split_messages, tick_rows
+from rtloop.recording.contents import Message, is_ticks, may_hold, overlaps, read_chunk, split_messages, tick_rows
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.events import FINAL, Event
 from rtloop.recording.header import read_header
@@ -98,12 +98,7 @@ class Reader:
         if start_s <= 0.0 and math.isinf(end_s):
             return self.tick_chunks
         start_ns, end_ns = start_s * 1e9 + self.start_unix_ns, end_s * 1e9 + self.start_unix_ns
-        return [
-            entry
-            for entry in self.tick_chunks
-            if entry.index is None
-            or (entry.index.message_end_time >= start_ns - 1e3 and entry.index.message_start_time <= end_ns + 1e3)
-        ]
+        return [entry for entry in self.tick_chunks if overlaps(entry, start_ns, end_ns)]
 
     def blocks(self, names: Sequence[str] | None = None, entries: Iterable[Entry] | None = None) -> Iterator[Rows]:
         """Arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.
@@ -128,10 +123,6 @@ class Reader:
                 self._report("a snapshot of the law is damaged")
                 continue
             yield Snapshot(int.from_bytes(data[:8], "little"), data)
-
-    def check_snapshots(self) -> None:
-        """Read all snapshots for what is wrong with them."""
-        deque(self.snapshots(), maxlen=0)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Each chunk in the order of the file: either its ticks or its messages of the slow topics."""

@@ -31,6 +31,7 @@ class Source(Protocol):
 
     facts: Facts
     wiring: dict[str, Wiring]
+    enable_input: str | None
 
     def pointers(self) -> Pointers:
         """What the loop calls."""
@@ -44,13 +45,15 @@ class Source(Protocol):
 class Tape:
     """Recorded inputs, times, driver status and observed signals, through the playback driver."""
 
+    enable_input: str | None = "enable"
+
     def __init__(self, header: Mapping[str, Any]) -> None:
         axes, observed = header["axes"], tuple(header["observed"])
         channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
-        self.facts = Facts(channels[0], channels[1], observed, real=False)
+        self.facts = Facts((*channels[0], Channel("enable")), channels[1], observed, real=False)
         self.wiring = {axis: Wiring(f"{axis} in", f"{axis} out") for axis in axes}
         self._columns, self._axes, self._observed = len(header["columns"]), len(axes), len(observed)
-        self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + self._axes + 1 + self._observed), np.nan)
+        self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + self._axes + 1 + 1 + self._observed), np.nan)
         self._playback = Playback()
 
     def pointers(self) -> Pointers:
@@ -61,14 +64,17 @@ class Tape:
         """Lay out the rows as the playback driver hands them out."""
         tape, first = self._rows[: len(rows)], TIMING_COLUMNS + 1
         tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
+        # lateness was recorded in µs, from whole ns: the rounding restores these, and so the very same µs
+        tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
         lost = (rows[:, signals.FLAGS].astype(np.int64) & int(Flag.HEARTBEAT_LOST)) != 0
         tape[:, 3] = np.where(lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again
         tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
         for axis in range(self._axes):
             tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
-        tape[:, first + self._axes] = rows[:, signals.SAMPLE_AGE]
+        tape[:, first + self._axes] = rows[:, signals.ENABLE]
+        tape[:, first + self._axes + 1] = rows[:, signals.SAMPLE_AGE]
         if self._observed:
-            tape[:, first + self._axes + 1 :] = rows[:, self._columns - self._observed :]
+            tape[:, first + self._axes + 2 :] = rows[:, self._columns - self._observed :]
         self._playback.load(tape)
 
 
@@ -144,4 +150,5 @@ def _plan(header: Mapping[str, Any], source: Source, law: Law, commands: np.ndar
         table=np.zeros(SLICE_TICKS * len(axes)),
         schedule=commands,
         observed=source.facts.observed,
+        enable_input=source.enable_input,
     )

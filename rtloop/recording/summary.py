@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -78,7 +79,7 @@ def summarise(path: Files, progress: Progress | None = None) -> dict[str, Any]:
     with Parts(find_files(path)) as readers:
         totals = _sum_up(readers, progress)
         for reader in readers:
-            reader.check_snapshots()
+            deque(reader.snapshots(), maxlen=0)  # read for what is wrong with them
         return _report(readers, totals)
 
 

@@ -30,6 +30,8 @@ Progress = Callable[[int], None]
 class Rig:
     """A simulated rig as a source of inputs: it answers what the law commands, whatever was recorded."""
 
+    enable_input: str | None = None
+
     def __init__(self, driver: Driver) -> None:
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.compiled import jit
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
-from rtloop.law.layout import Records, initial_state
+from rtloop.law.layout import CONDITIONS, Records, initial_state, records
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
 from tests.benchmarks.measure import Spread, alternately, seconds
@@ -26,7 +26,7 @@ class Differs(AssertionError):
 
 
 @jit
-def run_law(coefficients, axes, loop, adc_v, references, modes, out):
+def run_law(coefficients, axes, loop, adc_v, references, modes, conditions, out):
     """The law over arrays of inputs, as `run_law` of loop.c."""
     adc, reference = np.empty(1), np.empty(1)
     for k in range(adc_v.size):
@@ -34,7 +34,7 @@ def run_law(coefficients, axes, loop, adc_v, references, modes, out):
             reset_trip(loop)
             set_mode(axes, loop, modes[k], False)
         adc[0], reference[0] = adc_v[k], references[k]
-        evaluate(coefficients, axes, loop, adc, reference, 0, 0.0, False)
+        evaluate(coefficients, axes, loop, adc, reference, conditions[0])
         update(coefficients, axes, loop)
         state = axes[0]
         out[k, 0], out[k, 1] = state.command_um, state.demand_v
@@ -63,7 +63,8 @@ def check_law(coefficients: Records, adc_v: np.ndarray[Any, Any], references: np
     adc_v[9_999::10_000] = random.choice([np.nan, np.inf, 9.995, -6.5], adc_v[9_999::10_000].size)
     outs = [np.empty((adc_v.size, 4)) for _ in range(2)]
     axes, loop = initial_state(coefficients)
-    run_law(coefficients, axes, loop[0], adc_v, references, modes, outs[0])
+    conditions = records(CONDITIONS, 1)
+    run_law(coefficients, axes, loop[0], adc_v, references, modes, conditions, outs[0])
     native_axes, native_loop = initial_state(coefficients)
     native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, outs[1])
     _require_equal("law", outs[0], outs[1])
@@ -80,11 +81,12 @@ def law() -> dict[str, Any]:
     check_law(coefficients, adc_v, references)
     modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
     states = [initial_state(coefficients) for _ in range(2)]
+    conditions = records(CONDITIONS, 1)
     for _, loop in states:
         loop["mode"] = int(Mode.CLOSED_LOOP)
     (axes, loop), (native_axes, native_loop) = states
     pair = alternately(
-        lambda: run_law(coefficients, axes, loop[0], adc_v, references, modes, out),
+        lambda: run_law(coefficients, axes, loop[0], adc_v, references, modes, conditions, out),
         lambda: native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, out),
     )
     if loop["mode"][0] != Mode.CLOSED_LOOP or axes["controller"].tobytes() != native_axes["controller"].tobytes():

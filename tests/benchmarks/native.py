@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.rig import COEFFICIENTS as RIG_COEFFICIENTS
 from hil.rig import STATE as RIG_STATE
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
 from rtloop.law.reference import GENERATOR
 
 SOURCE = Path(__file__).parent / "c"
@@ -26,6 +26,7 @@ STRUCTS = {
     "law_coefficients": COEFFICIENTS,
     "law_state": STATE,
     "loop_state": LOOP_STATE,
+    "conditions": CONDITIONS,
     "rig_coefficients": RIG_COEFFICIENTS,
     "rig_state": RIG_STATE,
     "generator": GENERATOR,

@@ -19,11 +19,11 @@ PROGRAM = """
 import json
 import numpy as np
 from rtloop.law.law import evaluate
-from rtloop.law.layout import COEFFICIENTS, initial_state, records
+from rtloop.law.layout import COEFFICIENTS, CONDITIONS, initial_state, records
 
 coefficients = records(COEFFICIENTS, 1)
 axes, loop = initial_state(coefficients)
-evaluate(coefficients, axes, loop[0], np.zeros(1), np.full(1, 5.0), 0, 0.0, False)
+evaluate(coefficients, axes, loop[0], np.zeros(1), np.full(1, 5.0), records(CONDITIONS, 1)[0])
 hits = sum(evaluate.stats.cache_hits.values())
 print(json.dumps({"usable": bool(axes["usable"][0]), "from_cache": hits == 1}))
 """

@@ -12,7 +12,7 @@ from hil.compiled import jit
 from rtloop.design.discretise import discretise
 from rtloop.law.build import axis_coefficients
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
-from rtloop.law.layout import Records, initial_state
+from rtloop.law.layout import CONDITIONS, Records, initial_state, records
 from rtloop.law.options import AxisOptions
 from rtloop.signals import Mode
 
@@ -47,7 +47,7 @@ class Signals(NamedTuple):
 
 
 @jit
-def run_law(coefficients, axes, loop, modes, resets, adc_v, references, status, age_us, lost, out):
+def run_law(coefficients, axes, loop, modes, resets, adc_v, references, conditions, out):
     """Evaluate, update and note down each tick."""
     adc, reference = np.empty(1), np.empty(1)
     for k in range(modes.size):
@@ -56,7 +56,7 @@ def run_law(coefficients, axes, loop, modes, resets, adc_v, references, status, 
         if modes[k] >= 0:
             set_mode(axes, loop, modes[k], False)
         adc[0], reference[0] = adc_v[k], references[k]
-        evaluate(coefficients, axes, loop, adc, reference, status[k], age_us[k], lost[k] != 0)
+        evaluate(coefficients, axes, loop, adc, reference, conditions[k])
         update(coefficients, axes, loop)
         state = axes[0]
         out[0, k], out[1, k], out[2, k] = state.drive_v, state.demand_v, state.command_um
@@ -92,6 +92,8 @@ class LawBench:
         status: npt.ArrayLike = 0,
         age_us: npt.ArrayLike = 0.0,
         lost: npt.ArrayLike = 0,
+        late_us: npt.ArrayLike = 0.0,
+        enable_v: npt.ArrayLike = 0.0,
     ) -> Signals:
         """Run over `references` (ticks,); the rest may be a number for all ticks. `mode`, `reset` are for the first."""
         wanted = np.atleast_1d(np.asarray(references, float))
@@ -101,9 +103,11 @@ class LawBench:
         if reset:
             forgiven[0] = 1
         out = np.empty((len(Signals._fields), wanted.size))
-        inputs = _spread(status, wanted, int), _spread(age_us, wanted, float), _spread(lost, wanted, int)
+        conditions = records(CONDITIONS, wanted.size)
+        conditions["driver_status"], conditions["sample_age_us"] = status, age_us
+        conditions["heartbeat_lost"], conditions["lateness_us"], conditions["enable_v"] = lost, late_us, enable_v
         adc = _spread(adc_v, wanted, float)
-        run_law(self.coefficients, self.axes, self.loops[0], changes, forgiven, adc, wanted, *inputs, out)
+        run_law(self.coefficients, self.axes, self.loops[0], changes, forgiven, adc, wanted, conditions, out)
         return Signals(*out)
 
     def memory(self) -> dict[str, bytes]:

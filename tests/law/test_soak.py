@@ -7,6 +7,7 @@ import pytest
 
 from hil.compiled import jit
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
+from rtloop.law.layout import CONDITIONS, records
 from rtloop.signals import Mode
 from tests.law.harness import EQ_20, EXACT, PERIOD_S, LawBench, coefficients_of
 
@@ -23,7 +24,7 @@ WILD = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 9.99e8, -9.99e8, 1e-310
 
 
 @jit
-def soak(coefficients, axes, loop, wild, seed, ticks):
+def soak(coefficients, axes, loop, conditions, wild, seed, ticks):
     """Worst |drive|, worst move above the running slew, worst above the trip's, ticks in a running mode, trips."""
     np.random.seed(seed)
     adc, reference = np.zeros(1), np.zeros(1)
@@ -43,21 +44,22 @@ def soak(coefficients, axes, loop, wild, seed, ticks):
             wave = 1.0 if wave > 0.0 else -1.0
         reference[0] = level + amplitude * wave
         adc[0] = 2.0 * np.random.randn()
-        status, age, lost = 0, 0.0, False
+        conditions.driver_status, conditions.heartbeat_lost = 0, 0
+        conditions.sample_age_us, conditions.lateness_us, conditions.enable_v = 0.0, 0.0, 0.0
         if np.random.random() < 0.003:
             adc[0] = wild[np.random.randint(0, wild.size)]
         if np.random.random() < 0.003:
             reference[0] = wild[np.random.randint(0, wild.size)]
         if np.random.random() < 0.001:
-            status, age, lost = (
-                np.random.randint(-2, 2),
-                wild[np.random.randint(0, wild.size)],
-                np.random.random() < 0.2,
-            )
+            conditions.driver_status = np.random.randint(-2, 2)
+            conditions.heartbeat_lost = 1 if np.random.random() < 0.2 else 0
+            conditions.sample_age_us = wild[np.random.randint(0, wild.size)]
+            conditions.lateness_us = wild[np.random.randint(0, wild.size)]
+            conditions.enable_v = wild[np.random.randint(0, wild.size)]
         if np.random.random() < 0.002:
             set_mode(axes, loop, np.random.randint(0, 4) if loop.trip == 0 else 0, False)
         last_v = axes[0].drive_v
-        evaluate(coefficients, axes, loop, adc, reference, status, age, lost)
+        evaluate(coefficients, axes, loop, adc, reference, conditions)
         update(coefficients, axes, loop)
         drive_v = axes[0].drive_v
         if not abs(drive_v) <= largest_v:
@@ -78,7 +80,7 @@ def test_soak(law):
     bench = LawBench(LAWS[law], Mode.CLOSED_LOOP)
     seed = sorted(LAWS).index(law)
     largest_v, above_slew_v, above_trip_v, running, trips = soak(
-        bench.coefficients, bench.axes, bench.loops[0], WILD, seed, TICKS_EACH
+        bench.coefficients, bench.axes, bench.loops[0], records(CONDITIONS, 1)[0], WILD, seed, TICKS_EACH
     )
     assert largest_v == 9.5
     assert above_slew_v <= 8 * np.spacing(9.5)

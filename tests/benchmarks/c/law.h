@@ -9,7 +9,8 @@ enum { OFF, RAW, FEEDFORWARD, CLOSED_LOOP };
 enum {
     COMMAND_LIMITED = 1 << 1, DRIVE_LIMITED = 1 << 2, SLEW_LIMITED = 1 << 3, RAMPING = 1 << 4, HEARTBEAT_LOST = 1 << 5,
     TRIP_NON_FINITE = 1 << 8, TRIP_SENSOR_RANGE = 1 << 9, TRIP_POSITION = 1 << 10, TRIP_DRIVER = 1 << 11,
-    TRIP_HEARTBEAT = 1 << 12, TRIP_STALE = 1 << 13,
+    TRIP_HEARTBEAT = 1 << 12, TRIP_STALE = 1 << 13, TRIP_FROZEN = 1 << 14, TRIP_TRACKING = 1 << 15,
+    TRIP_OSCILLATION = 1 << 16, TRIP_LATE = 1 << 17, TRIP_ENABLE = 1 << 18,
 };
 enum { LANES = 4, BLOCK = 8 };
 
@@ -165,11 +166,65 @@ static inline int64_t drive_of(law_c c, law_s s, loop_s loop, double reference) 
     return flags;
 }
 
+static inline bool frozen(law_c c, law_s s, double adc_v) {
+    if (adc_v != s->frozen_adc_v) {
+        s->frozen_adc_v = adc_v;
+        s->frozen_from_v = s->drive_v;
+        s->frozen_count = 0;
+        return false;
+    }
+    double moved_v = s->drive_v - s->frozen_from_v;
+    if (moved_v < 0) moved_v = -moved_v;
+    return ++s->frozen_count >= c->frozen_ticks && moved_v > c->frozen_drive_v;
+}
+
+static inline void swing(law_s s, int64_t direction) {
+    s->swing_direction = direction;
+    s->swing_extreme_um = s->position_um;
+    s->swing_count++;
+    s->swing_age = 0;
+}
+
+static inline void count_swings(law_c c, law_s s) {
+    double position_um = s->position_um, extreme_um = s->swing_extreme_um;
+    if (++s->swing_age > c->swing_ticks) s->swing_count = 0;
+    if (s->swing_direction >= 0) {
+        if (position_um > extreme_um) s->swing_extreme_um = position_um;
+        else if (position_um < extreme_um - c->oscillation_um) swing(s, -1);
+    } else if (position_um < extreme_um) s->swing_extreme_um = position_um;
+    else if (position_um > extreme_um + c->oscillation_um) swing(s, 1);
+}
+
+static inline int64_t watch(law_c c, law_s s, int64_t mode, double adc_v, double lateness_us) {
+    int64_t causes = 0;
+    if (c->frozen_ticks > 0 && frozen(c, s, adc_v)) causes |= TRIP_FROZEN;
+    if (c->late_ticks > 0) {
+        s->late_count = lateness_us > c->late_us ? s->late_count + 1 : 0;
+        if (s->late_count >= c->late_ticks) causes |= TRIP_LATE;
+    }
+    if (mode != CLOSED_LOOP) {
+        s->tracking_count = s->swing_count = s->swing_age = 0;
+        s->swing_extreme_um = s->position_um;
+        return causes;
+    }
+    if (c->tracking_ticks > 0) {
+        double error_um = s->error_um >= 0 ? s->error_um : -s->error_um;
+        s->tracking_count = error_um > c->tracking_error_um ? s->tracking_count + 1 : 0;
+        if (s->tracking_count >= c->tracking_ticks) causes |= TRIP_TRACKING;
+    }
+    if (c->oscillation_swings > 0) {
+        count_swings(c, s);
+        if (s->swing_count >= c->oscillation_swings) causes |= TRIP_OSCILLATION;
+    }
+    return causes;
+}
+
 static inline void evaluate(
     law_c c, law_s s, loop_s loop, int64_t axes, const double *restrict adc_v, const double *restrict references,
-    int32_t status, double age_us, bool lost
+    const struct conditions *restrict now
 ) {
-    int64_t causes = (status < 0 ? TRIP_DRIVER : 0) | (lost ? TRIP_HEARTBEAT : 0);
+    bool lost = now->heartbeat_lost != 0;
+    int64_t causes = (now->driver_status < 0 ? TRIP_DRIVER : 0) | (lost ? TRIP_HEARTBEAT : 0);
     for (int64_t a = 0; a < axes; a++) {
         double position_um = (adc_v[a] - c[a].offset_v) * c[a].um_per_v;
         s[a].position_um = position_um;
@@ -177,7 +232,9 @@ static inline void evaluate(
         if (!s[a].usable) causes |= TRIP_NON_FINITE;
         if (adc_v[a] < c[a].sensor_min_v || adc_v[a] > c[a].sensor_max_v) causes |= TRIP_SENSOR_RANGE;
         if (position_um < -c[a].position_limit_um || position_um > c[a].position_limit_um) causes |= TRIP_POSITION;
-        if (!(age_us <= c[a].sample_age_limit_us)) causes |= TRIP_STALE;
+        if (!(now->sample_age_us <= c[a].sample_age_limit_us)) causes |= TRIP_STALE;
+        if (!(now->enable_v >= c[a].enable_min_v)) causes |= TRIP_ENABLE;
+        causes |= watch(&c[a], &s[a], loop->mode, adc_v[a], now->lateness_us);
     }
     loop->new_trip = causes & ~loop->trip;
     loop->trip |= causes;

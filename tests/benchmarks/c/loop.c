@@ -10,13 +10,14 @@ void run_law(
     int64_t axes, const double *restrict adc_v, const double *restrict references, const int64_t *restrict modes,
     int64_t ticks, double *restrict out
 ) {
+    const struct conditions now = {0};
     for (int64_t k = 0; k < ticks; k++) {
         if (modes[k] >= 0) {
             loop->trip = 0;
             loop->mode = modes[k];
             for (int64_t a = 0; a < axes; a++) s[a].entering = 1;
         }
-        evaluate(c, s, loop, axes, &adc_v[k * axes], &references[k * axes], 0, 0.0, false);
+        evaluate(c, s, loop, axes, &adc_v[k * axes], &references[k * axes], &now);
         update(c, s, loop, axes);
         out[4 * k] = s->command_um;
         out[4 * k + 1] = s->demand_v;
@@ -38,7 +39,7 @@ struct run {
     int64_t axes, columns, capacity, tick;
     double period_ns, period_us, heartbeat_timeout_ns;
 };
-enum { HOLD, TABLE, STOP = 1, HEARTBEAT_NS = 2, RECORDER_CURSOR = 3, MAX_AXES = 8, COMMON = 12, PER_AXIS = 7 };
+enum { HOLD, TABLE, STOP = 1, HEARTBEAT_NS = 2, RECORDER_CURSOR = 3, MAX_AXES = 8, COMMON = 13, PER_AXIS = 7 };
 
 static inline double reference_sample(struct generator *g, int64_t tick, const double *table) {
     if (tick < g->held_until) return g->held;
@@ -68,7 +69,8 @@ static inline void run_tick(struct run *restrict r) {
     double heartbeat_ns = (double)atomic_load_explicit(&r->words[HEARTBEAT_NS], memory_order_acquire);
     bool lost = none - heartbeat_ns > r->heartbeat_timeout_ns;
     struct law_state *s = r->law_state;
-    evaluate(r->law_coefficients, s, r->loop_state, r->axes, adc_v, references, 0, 0.0, lost);
+    struct conditions now = {.heartbeat_lost = lost, .lateness_us = (none - deadline_ns) * 1e-3};
+    evaluate(r->law_coefficients, s, r->loop_state, r->axes, adc_v, references, &now);
     for (int64_t a = 0; a < r->axes; a++) {
         r->last_drive_v[a] = s[a].drive_v;
         rig_advance(&r->rig_coefficients[a], &r->rig_state[a], s[a].drive_v);
@@ -86,7 +88,7 @@ static inline void run_tick(struct run *restrict r) {
     row[7] = 0;
     row[8] = (double)(r->loop_state->tick_flags | (row[2] + row[6] > r->period_us));
     row[9] = (double)r->loop_state->mode;
-    row[10] = row[11] = 0;
+    row[10] = row[11] = row[12] = 0;
     double *restrict column = row + COMMON, *restrict observed = column + PER_AXIS * r->axes;
     for (int64_t a = 0; a < r->axes; a++, column += PER_AXIS, observed += 2) {
         column[0] = adc_v[a];

@@ -1,0 +1,87 @@
+"""What H∞ synthesis assumes of a generalised plant, each judged by itself and named where it fails.
+
+    (A, B2) can be stabilised, (C2, A) detected         otherwise no controller makes the loop stable
+    D12 has full column rank, D21 full row rank         otherwise u costs nothing, or y is known without noise
+    [A − jω B2; C1 D12] full column rank, [A − jω B1; C2 D21] full row rank for all ω
+
+The last: a zero on the imaginary axis would have to be cancelled there (Zhou, Doyle & Glover 1996, section 17.1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.design.augment import GeneralisedPlant
+
+SMALL = 1e-10
+"""A singular value is zero below this, relative to the largest of the same rows, each brought to length 1."""
+
+
+class NoController(ValueError):
+    """No controller exists, or none for this γ; the message says which condition fails."""
+
+
+def check_assumptions(plant: GeneralisedPlant) -> None:
+    """Raises NoController, naming every assumption that does not hold."""
+    faults = [
+        *_stabilisable("stabilisability", "u does not move", plant.a, plant.b2),
+        *_stabilisable("detectability", "y does not show", plant.a.T, plant.c2.T),
+        *_ranks(plant),
+    ]
+    if not faults:
+        faults += _axis_zeros("from u to z", plant.a, plant.b2, plant.c1, plant.d12)
+        faults += _axis_zeros("from w to y", plant.a.T, plant.c2.T, plant.b1.T, plant.d21.T)
+    if faults:
+        raise NoController("; ".join(faults))
+
+
+def _stabilisable(condition: str, says: str, a: Real, b: Real) -> list[str]:
+    """Modes in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus)."""
+    faults = []
+    for value in np.linalg.eigvals(a):
+        if value.imag < 0 or value.real < -SMALL * max(abs(value), 1e-300):
+            continue
+        if _is_singular(np.hstack([a - value * np.eye(a.shape[0]), b.astype(complex)])):
+            faults.append(f"{condition}: {says} the mode at s = {_root(value)} rad/s, which is not stable")
+    return faults
+
+
+def _ranks(plant: GeneralisedPlant) -> list[str]:
+    faults = []
+    for name, matrix, says in (
+        ("D12", plant.d12, "full column rank is needed: every u must cost something at high frequencies"),
+        ("D21", plant.d21.T, "full row rank is needed: every y must be disturbed at high frequencies"),
+    ):
+        values = np.linalg.svd(matrix, compute_uv=False)
+        rank = int(np.sum(values > SMALL * values.max(initial=0.0)))
+        if rank < matrix.shape[1]:
+            faults.append(f"rank: {name} has rank {rank} of {matrix.shape[1]}; {says}")
+    return faults
+
+
+def _axis_zeros(which: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
+    """Zeros on the imaginary axis: the modes of A − B D⁺C that C, less what D explains, does not see."""
+    solve = np.linalg.pinv(d)
+    inner, unseen = a - b @ solve @ c, c - d @ solve @ c
+    faults = []
+    for value in np.linalg.eigvals(inner):
+        on_axis = abs(value.real) <= 1e-9 * max(abs(value), SMALL * float(np.linalg.norm(inner)))
+        if value.imag < 0 or not on_axis:
+            continue
+        if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), unseen]).T):
+            faults.append(f"imaginary-axis zero: the path {which} has a zero at ω = {value.imag:.6g} rad/s")
+    return faults
+
+
+def _is_singular(matrix: Real) -> bool:
+    """Whether rows, each brought to length 1, depend on each other."""
+    lengths = np.linalg.norm(matrix, axis=1)
+    if np.any(lengths == 0):
+        return True
+    values = np.linalg.svd(matrix / lengths[:, None], compute_uv=False)
+    return bool(values[-1] <= SMALL * values[0])
+
+
+def _root(value: complex) -> str:
+    return f"{value.real:.6g}" + (f" ± {value.imag:.6g}j" if value.imag else "")

@@ -1,0 +1,95 @@
+"""The generalised plant that H∞ synthesis starts from, and the loop that a controller closes around it.
+
+    x' = A x + B1 w + B2 u        w: what acts from outside       z: what is to be kept small
+    z  = C1 x + D11 w + D12 u     u: what the controller moves    y: what it sees
+    y  = C2 x + D21 w + D22 u
+
+`augmented` builds it as in Figs 9-b and 9-c of the paper, eqs (10)-(12):
+
+    w = (x_d, Ω_w)    z = (o1, o2) = (W1 e, W2 v)    u = v    y = e = x_d − D v − W3 Ω_w
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from hil.linear import Complex, Real
+from rtloop.design.closedloop import realised
+from rtloop.design.transfer import Transfer
+from rtloop.design.weights import Weights
+
+
+class Matrices(NamedTuple):
+    """x' = A x + B u, y = C x + D u with any number of inputs and outputs: (n, n), (n, m), (p, n), (p, m)."""
+
+    a: Real
+    b: Real
+    c: Real
+    d: Real
+
+    def response(self, s: Complex) -> Complex:
+        """D + C (sI − A)⁻¹ B at complex points `s` (k,), shape (k, p, m)."""
+        pencil = s[:, None, None] * np.eye(self.a.shape[0]) - self.a
+        inputs = np.broadcast_to(self.b.astype(complex), (s.size, *self.b.shape))
+        return self.d + self.c @ np.linalg.solve(pencil, inputs)
+
+
+class GeneralisedPlant(NamedTuple):
+    """The nine matrices: n states, m1 and m2 inputs w and u, p1 and p2 outputs z and y."""
+
+    a: Real
+    b1: Real
+    b2: Real
+    c1: Real
+    c2: Real
+    d11: Real
+    d12: Real
+    d21: Real
+    d22: Real
+
+    def closed_with(self, controller: Matrices) -> Matrices:
+        """F_l(P, K): the loop from w to z with u = K y. Raises ValueError where D22 and D_K leave no solution."""
+        well = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
+        if np.linalg.cond(well) > 1e14:
+            raise ValueError("controller: I − D22·D_K is singular, so the loop is not well posed")
+        inverse = np.linalg.inv(well)  # y = inverse (C2 x + D21 w + D22 C_K x_K)
+        seen_plant, seen_w = inverse @ self.c2, inverse @ self.d21
+        seen_own = inverse @ self.d22 @ controller.c
+        own = controller.c + controller.d @ seen_own  # u = D_K seen_plant x + own x_K + D_K seen_w w
+        u_plant, u_w = controller.d @ seen_plant, controller.d @ seen_w
+        a = np.block([
+            [self.a + self.b2 @ u_plant, self.b2 @ own],
+            [controller.b @ seen_plant, controller.a + controller.b @ seen_own],
+        ])  # fmt: skip
+        b = np.vstack([self.b1 + self.b2 @ u_w, controller.b @ seen_w])
+        c = np.hstack([self.c1 + self.d12 @ u_plant, self.d12 @ own])
+        return Matrices(a, b, c, self.d11 + self.d12 @ u_w)
+
+
+def augmented(plant: Transfer, weights: Weights) -> GeneralisedPlant:
+    """The paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
+
+    D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
+    """
+    if not plant.is_strictly_proper:
+        raise ValueError(f"plant: {plant.zeros.size} zeros and {plant.order} poles; fewer zeros than poles are needed")
+    g, w1, w2, w3 = (realised(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
+    none_g, none_2, none_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
+    error = np.concatenate([-g.c, 0 * w1.b, none_2, -w3.c])  # e without x_d and without the direct part of W3
+    a = block_diag(g.a, w1.a, w2.a, w3.a)
+    a[g.b.size : g.b.size + w1.b.size] += np.outer(w1.b, error)
+    b1 = np.column_stack([
+        np.concatenate([none_g, w1.b, none_2, none_3]),
+        np.concatenate([none_g, -w3.d * w1.b, none_2, w3.b]),
+    ])  # fmt: skip
+    b2 = np.concatenate([g.b, 0 * w1.b, w2.b, none_3])[:, None]
+    o1 = w1.d * error + np.concatenate([none_g, w1.c, none_2, none_3])
+    o2 = np.concatenate([none_g, 0 * w1.c, w2.c, none_3])
+    direct = np.array([[1.0, -w3.d]])
+    return GeneralisedPlant(
+        a, b1, b2, np.vstack([o1, o2]), error[None, :],
+        np.vstack([w1.d * direct, 0 * direct]), np.array([[0.0], [w2.d]]), direct, np.zeros((1, 1)),
+    )  # fmt: skip

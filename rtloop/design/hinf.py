@@ -1,0 +1,167 @@
+"""H∞ synthesis: the controller that keeps the loop from w to z below γ, and the smallest γ for which there is one.
+
+The general formulas (D11 ≠ 0, D22 ≠ 0) of Glover & Doyle, Systems & Control Letters 11, 1988, as in Zhou, Doyle & Glover,
+Robust and Optimal Control, 1996, theorem 17.1; the state-space idea is Doyle, Glover, Khargonekar & Francis, IEEE TAC
+34, 1989. Two Riccati equations decide whether a γ can be reached, and bisection finds the smallest that can.
+
+At γ_opt itself I − γ⁻²·Y·X is singular, and the controller has a pole that runs off to infinity: ask for a little more.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import sqrtm
+
+from hil.linear import Real
+from rtloop.design.assumptions import NoController, check_assumptions
+from rtloop.design.augment import GeneralisedPlant, Matrices
+from rtloop.design.norm import hinf_norm
+from rtloop.design.normalised import Normalised, normalised
+from rtloop.design.riccati import Fault, NoSolution, stabilising_solution
+
+LARGEST_GAMMA = 1e8
+
+
+class Hinf(NamedTuple):
+    """`controller` from y to u; the loop from w to z with it has the norm `achieved` ≤ `gamma`.
+
+    `gamma_opt` is the least γ, to `tolerance`; `limiting` the condition that fails just below it.
+    """
+
+    controller: Matrices
+    gamma: float
+    gamma_opt: float
+    achieved: float
+    limiting: str
+
+
+class _Solutions(NamedTuple):
+    """X∞, Y∞, and the state feedback F and output injection L that belong to them."""
+
+    x: Real
+    y: Real
+    f: Real
+    injection: Real
+
+
+def synthesise_hinf(
+    plant: GeneralisedPlant, gamma: float | None = None, backoff: float = 0.004, tolerance: float = 1e-7
+) -> Hinf:
+    """The central controller at `gamma`, by default at (1 + `backoff`)·γ_opt. Raises NoController.
+
+    Order: that of the plant.
+    """
+    check_assumptions(plant)
+    normal = normalised(plant)
+    gamma_opt, limiting = smallest_gamma(normal, tolerance)
+    wanted = gamma_opt * (1 + backoff) if gamma is None else gamma
+    try:
+        controller = normal.restored(_central(normal, _solve(normal, wanted), wanted))
+    except NoController as fault:
+        raise NoController(f"gamma: {wanted:g} cannot be reached; {gamma_opt:.6g} can. {fault}") from None
+    loop = plant.closed_with(controller)
+    achieved = hinf_norm(loop).norm
+    if not achieved <= 1.01 * wanted:
+        raise NoController(
+            f"the controller for γ = {wanted:.6g} reaches {achieved:.6g}: rounding has spoilt it; "
+            "a larger back-off, or weights whose corners lie less far apart, would help"
+        )
+    return Hinf(controller, wanted, gamma_opt, achieved, limiting)
+
+
+def smallest_gamma(normal: Normalised, tolerance: float = 1e-7) -> tuple[float, str]:
+    """γ_opt (from above, to `tolerance` of it) and the condition that fails just below. Raises NoController."""
+    low = high = max(_direct_bound(normal), 1e-6)
+    limiting = "the direct part D11, which no controller changes"
+    while (fault := _fault(normal, high * (1 + tolerance))) is not None:
+        low, high, limiting = high, 2 * high, fault
+        if high > LARGEST_GAMMA:
+            raise NoController(f"no controller up to γ = {LARGEST_GAMMA:g}: {limiting}")
+    while high - low > tolerance * high:
+        middle = math.sqrt(low * high)
+        fault = _fault(normal, middle)
+        low, high, limiting = (low, middle, limiting) if fault is None else (middle, high, fault)
+    return high * (1 + tolerance), limiting
+
+
+def _fault(normal: Normalised, gamma: float) -> str | None:
+    """The condition that fails at γ, or None."""
+    try:
+        _solve(normal, gamma)
+    except NoController as fault:
+        return str(fault)
+    return None
+
+
+def _direct_bound(normal: Normalised) -> float:
+    """What u and y cannot touch of D11: the larger norm of its first rows and of its first columns."""
+    rows, columns = normal.d11.shape[0] - normal.b2.shape[1], normal.d11.shape[1] - normal.c2.shape[0]
+    parts = normal.d11[:rows], normal.d11[:, :columns]
+    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
+
+
+def _solve(normal: Normalised, gamma: float) -> _Solutions:
+    """Both Riccati equations and the coupling between them. Raises NoController."""
+    if gamma <= _direct_bound(normal):
+        raise NoController(f"γ must exceed the norm of the direct part D11 that u and y cannot touch ({gamma:.6g} ≤ it)")
+    a, b1, b2, c1, c2, d11, d12, d21 = normal.matrices
+    b, d_row = np.hstack([b1, b2]), np.hstack([d11, d12])
+    c, d_column = np.vstack([c1, c2]), np.vstack([d11, d21])
+    r = d_row.T @ d_row - _corner(gamma, b1.shape[1], b.shape[1])
+    r_dual = d_column @ d_column.T - _corner(gamma, c1.shape[0], c.shape[0])
+    x = _riccati("state feedback, X∞", a, b, c1, d_row, r)
+    y = _riccati("estimation, Y∞", a.T, c.T, b1.T, d_column.T, r_dual)
+    radius = float(np.max(np.abs(np.linalg.eigvals(x @ y)), initial=0.0))
+    if not radius < gamma**2:
+        raise NoController(f"coupling: the spectral radius of X∞·Y∞ must stay below γ² ({radius:.6g} ≥ {gamma**2:.6g})")
+    f = -np.linalg.solve(r, d_row.T @ c1 + b.T @ x)
+    injection = -np.linalg.solve(r_dual.T, (b1 @ d_column.T + y @ c.T).T).T
+    return _Solutions(x, y, f, injection)
+
+
+def _corner(gamma: float, count: int, size: int) -> Real:
+    corner = np.zeros((size, size))
+    corner[:count, :count] = gamma**2 * np.eye(count)
+    return corner
+
+
+_SAYS: dict[Fault, str] = {
+    "imaginary axis": "its Hamiltonian matrix has eigenvalues on the imaginary axis",
+    "no graph": "the stable subspace of its Hamiltonian matrix gives no matrix",
+    "indefinite": "its solution is not positive semidefinite",
+}
+
+
+def _riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
+    """X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; with everything transposed, Y∞."""
+    n = a.shape[0]
+    left, right = np.vstack([b, -c1.T @ d]), np.hstack([d.T @ c1, b.T])
+    hamiltonian = np.block([[a, np.zeros((n, n))], [-c1.T @ c1, -a.T]]) - left @ np.linalg.solve(r, right)
+    try:
+        return stabilising_solution(hamiltonian)
+    except NoSolution as error:
+        raise NoController(f"Riccati equation of the {name}: {_SAYS[error.fault]}") from None
+
+
+def _central(normal: Normalised, solutions: _Solutions, gamma: float) -> Matrices:
+    """The central controller (Q = 0) of theorem 17.1, for D12 = [0; I], D21 = [0 I], D22 = 0."""
+    a, b1, b2, _, c2, d11, _, _ = normal.matrices
+    x, y, f, injection = solutions
+    m2, p2 = b2.shape[1], c2.shape[0]
+    rows, columns = d11.shape[0] - m2, d11.shape[1] - p2
+    d1111, d1112, d1121, d1122 = d11[:rows, :columns], d11[:rows, columns:], d11[rows:, :columns], d11[rows:, columns:]
+    outer = np.linalg.inv(gamma**2 * np.eye(rows) - d1111 @ d1111.T)
+    inner = np.linalg.inv(gamma**2 * np.eye(columns) - d1111.T @ d1111)
+    direct = -d1121 @ d1111.T @ outer @ d1112 - d1122
+    d12 = np.real(sqrtm(np.eye(m2) - d1121 @ inner @ d1121.T))
+    d21 = np.real(sqrtm(np.eye(p2) - d1112.T @ outer @ d1112))
+    f12, f2 = f[columns : columns + p2], f[columns + p2 :]
+    l12, l2 = injection[:, rows : rows + m2], injection[:, rows + m2 :]
+    z = np.linalg.inv(np.eye(a.shape[0]) - y @ x / gamma**2)
+    own2, seen2 = z @ (b2 + l12) @ d12, -d21 @ (c2 + f12)
+    own1 = -z @ l2 + own2 @ np.linalg.solve(d12, direct)
+    seen_through = np.linalg.solve(d21, seen2)
+    return Matrices(a + np.hstack([b1, b2]) @ f + own1 @ seen_through, own1, f2 + direct @ seen_through, direct)

@@ -1,0 +1,138 @@
+"""ARMAX prediction error in modal coordinates: one-step-ahead errors of a model, and how they depend on it.
+
+    y = G u + H ε + offset,     G = B/A = Σ r_i / (z − λ_i),     H = C/A = 1 + Σ k_i / (z − λ_i),     λ = exp((σ + jω)T)
+    ε = H⁻¹ (y − G u − offset),     dε = −H⁻¹ (dG u + dH ε + d offset)
+
+This is the ARMAX model A y = B u + C ε (Ljung, System Identification, 1999, section 4.2) with orders
+na = nb = nc = n and one sample of delay, but its unknowns are modes and not coefficients of polynomials: those of slow
+and fast poles together span many powers of ten. A mode is filtered as a first-order recursion, H⁻¹ as sections of
+second order; nothing is expanded. Before the first sample everything is at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter, sosfilt, zpk2sos
+
+from hil.linear import Complex, Modal, Real
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """A model at period `period_s`: `rates` (m,) in rad/s, one of each pair, real ones with imaginary part 0.
+
+    `residues` r (m,) and `noise_gains` k (m,) are of the sums in z, `offset` of the output.
+    """
+
+    period_s: float
+    rates: Complex
+    residues: Complex
+    noise_gains: Complex
+    offset: float = 0.0
+
+    @property
+    def order(self) -> int:
+        """Number of poles, conjugates included."""
+        return int(np.where(self.rates.imag != 0, 2, 1).sum())
+
+    @property
+    def images(self) -> Complex:
+        """λ (m,)."""
+        return np.exp(self.rates * self.period_s)
+
+    @property
+    def static_gain(self) -> float:
+        """G at z = 1, output per input at rest."""
+        return float((_weights(self) * self.residues / (1 - self.images)).sum().real)
+
+    def discrete(self) -> Modal:
+        """G as a sum over all modes in z, conjugates included."""
+        pairs = self.rates.imag != 0
+        poles = np.concatenate([self.images, self.images[pairs].conj()])
+        residues = np.concatenate([self.residues, self.residues[pairs].conj()])
+        return Modal(poles, residues[None, :], np.zeros(1))
+
+    def output(self, u: Real) -> Real:
+        """G u + offset, without noise, shape of `u`."""
+        return self.offset + (_weights(self)[:, None] * self.residues[:, None] * _modes(self, u)).sum(axis=0).real
+
+    def predictor_poles(self) -> Complex:
+        """Roots of C (n,): the poles of H⁻¹, which must lie inside the unit circle."""
+        blocks, columns, rows = np.zeros((self.order, self.order)), np.zeros(self.order), np.zeros(self.order)
+        i = 0
+        for image, gain in zip(self.images, self.noise_gains, strict=True):
+            blocks[i, i], columns[i], rows[i] = image.real, gain.real, 1.0
+            if image.imag:
+                blocks[i : i + 2, i : i + 2] = [[image.real, -image.imag], [image.imag, image.real]]
+                columns[i + 1], rows[i] = gain.imag, 2.0
+                i += 1
+            i += 1
+        return np.linalg.eigvals(blocks - np.outer(columns, rows)).astype(complex)
+
+    def whiten(self, signals: Real, poles: Complex) -> Real:
+        """H⁻¹ applied to each of `signals` (k, samples); `poles` (n,) are the predictor's."""
+        if not self.order or not np.any(self.noise_gains):
+            return signals
+        zeros = np.concatenate([self.images, self.images[self.rates.imag != 0].conj()])
+        return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
+
+    def errors(self, u: Real, y: Real) -> Real | None:
+        """ε (samples,); None where the predictor is unstable."""
+        poles = self.predictor_poles()
+        if np.any(np.abs(poles) >= 1):
+            return None
+        return self.whiten(y - self.output(u), poles)
+
+    def sensitivities(self, u: Real, errors: Real, *, noise: bool) -> Real:
+        """dε by each unknown, (unknowns, samples), in the order of `pack`."""
+        through_input, through_noise = _modes(self, u), _modes(self, errors)
+        rows: list[Real] = []
+        for i, image in enumerate(self.images):
+            moved = self.residues[i] * _mode(image, through_input[i])
+            if noise:
+                moved = moved + self.noise_gains[i] * _mode(image, through_noise[i])
+            parts = [self.period_s * image * moved, through_input[i], *([through_noise[i]] if noise else [])]
+            pair = self.rates[i].imag != 0
+            rows += [row for part in parts for row in (_both(part) if pair else [part.real])]
+        rows.append(np.ones(u.size))
+        return -self.whiten(np.array(rows), self.predictor_poles())
+
+    def pack(self, *, noise: bool) -> Real:
+        """The unknowns: for each mode rate, residue and noise gain (one or two numbers each); then the offset."""
+        values: list[float] = []
+        for i, rate in enumerate(self.rates):
+            for number in (rate, self.residues[i], *([self.noise_gains[i]] if noise else [])):
+                values += [number.real, number.imag] if rate.imag != 0 else [number.real]
+        return np.array([*values, self.offset])
+
+    def unpack(self, values: Real, *, noise: bool) -> Innovations:
+        """The model with other unknowns; which modes are pairs stays."""
+        found: list[list[complex]] = []
+        numbers = iter(values[:-1].tolist())
+        for rate in self.rates:
+            pair = rate.imag != 0
+            found.append([complex(next(numbers), next(numbers) if pair else 0.0) for _ in range(3 if noise else 2)])
+        columns = np.array(found, dtype=complex).reshape(len(found), 3 if noise else 2).T
+        gains = columns[2] if noise else self.noise_gains
+        return Innovations(self.period_s, columns[0], columns[1], gains, float(values[-1]))
+
+
+def _weights(model: Innovations) -> Real:
+    """2 for a pair, whose conjugate is left out, 1 for a real mode."""
+    return np.where(model.rates.imag != 0, 2.0, 1.0)
+
+
+def _modes(model: Innovations, signal: Real) -> Complex:
+    """Each mode's response 1/(z − λ) to `signal`, (m, samples)."""
+    return np.array([_mode(image, signal) for image in model.images]).reshape(model.rates.size, signal.size)
+
+
+def _mode(image: complex, signal: Real | Complex) -> Complex:
+    return np.asarray(lfilter([0.0, 1.0], [1.0, -image], signal), dtype=complex)
+
+
+def _both(part: Complex) -> list[Real]:
+    """Dependence of 2 Re(w·part) on real and imaginary part of w."""
+    return [2 * part.real, -2 * part.imag]

@@ -1,0 +1,74 @@
+"""A first guess of modes from recorded input and output: ARX, its impulse response, and the response's modes.
+
+    y_k = Σ a_i y_k−i + Σ b_i u_k−i + constant,     i = 1 … long            least squares
+    H = (g_i+j), balanced by its singular values                            Ho & Kalman 1966, Kung 1978 (ERA)
+
+A long ARX model is unbiased under any noise (Ljung, System Identification, 1999, section 10.4), and ERA finds the
+few modes that its impulse response is made of.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import hankel, lstsq
+from scipy.signal import lfilter
+
+from hil.linear import Complex, Real
+from rtloop.design.innovations import Innovations
+
+ARX_ORDER = 40
+HANKEL_ROWS = 150
+SMALLEST_IMAGE = 1e-3
+"""Poles in z nearer to 0 are a delay, which has no rate."""
+
+
+def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> Real:
+    """g_1 … g_length of y = Σ g_i u_k−i, by least squares of an ARX model of order `order`, from rest."""
+    delayed = np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in (y, u) for i in range(1, order + 1)])
+    columns = np.vstack([delayed, np.ones(y.size)]).T
+    solution = lstsq(columns, y, cond=1e-12, lapack_driver="gelsy")[0]
+    assert solution is not None
+    pulse = np.zeros(length + 1)
+    pulse[0] = 1.0
+    return np.asarray(lfilter([0.0, *solution[order:-1]], [1.0, *-solution[:order]], pulse), dtype=float)[1:]
+
+
+class Guesses:
+    """Models of any order from one impulse response `g` (k,), k ≥ 2·rows."""
+
+    def __init__(self, g: Real, period_s: float) -> None:
+        self._period_s = period_s
+        rows = min(HANKEL_ROWS, (g.size - 1) // 2)
+        self._matrix = hankel(g[: rows + 1], g[rows : 2 * rows])
+        self._left, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
+
+    def model(self, order: int) -> Innovations | None:
+        """`order` modes without noise model; None where a mode has no continuous counterpart or does not decay."""
+        images = self._images(order)
+        if np.any((images.imag == 0) & (images.real < SMALLEST_IMAGE)) or np.any(np.abs(images) < SMALLEST_IMAGE):
+            return None
+        images = images[images.imag >= 0]
+        images = np.where(np.abs(images) >= 1, images * (0.9999 / np.abs(images)), images)
+        nothing = np.zeros(images.size, dtype=complex)
+        return Innovations(self._period_s, np.log(images) / self._period_s, nothing, nothing)
+
+    def _images(self, order: int) -> Complex:
+        """Eigenvalues of the shift along the Hankel matrix's dominant column space."""
+        root = np.sqrt(self.singular_values[:order])
+        observability = self._left[:, :order] * root
+        return np.linalg.eigvals(np.linalg.lstsq(observability[:-1], observability[1:], rcond=None)[0]).astype(complex)
+
+
+def with_residues(model: Innovations, u: Real, y: Real) -> Innovations:
+    """The model with residues and offset that fit best, its rates as they are."""
+    rows = -model.sensitivities(u, np.zeros_like(u), noise=False)
+    values, kept = model.pack(noise=False), []
+    i = 0
+    for rate in model.rates:
+        width = 2 if rate.imag != 0 else 1
+        kept += range(i + width, i + 2 * width)
+        i += 2 * width
+    kept.append(values.size - 1)
+    scale = np.sqrt((rows[kept] ** 2).mean(axis=1)) + 1e-300
+    values[kept] = np.linalg.lstsq((rows[kept] / scale[:, None]).T, y, rcond=None)[0] / scale
+    return model.unpack(values, noise=False)

@@ -1,0 +1,67 @@
+"""Algebraic Riccati equations by their Hamiltonian matrix: X = Ric(H), so that A + R X is stable.
+
+    AᵀX + X A + X R X + Q = 0,     H = [A R; −Q −Aᵀ]
+
+X exists where H has no eigenvalue on the imaginary axis and its stable subspace is the graph of a matrix (Doyle, Glover,
+Khargonekar & Francis 1989, section II; Laub 1979 for the ordered Schur form). R and Q need not be definite.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import matrix_balance, schur
+
+from hil.linear import Real
+
+Fault = Literal["imaginary axis", "no graph", "indefinite"]
+
+
+class NoSolution(Exception):
+    """X does not exist, or is not ≥ 0; `fault` says why."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault)
+        self.fault: Fault = fault
+
+
+def stabilising_solution(hamiltonian: Real) -> Real:
+    """X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n). Raises NoSolution.
+
+    The states are scaled by powers of two first, alike for X and its dual, so that H stays Hamiltonian: time constants of
+    a second beside some of ten microseconds are ordinary here.
+    """
+    n = hamiltonian.shape[0] // 2
+    scale = _scale(hamiltonian)
+    both = np.concatenate([scale, 1 / scale])
+    balanced = hamiltonian * both / both[:, None]
+    form, vectors, stable = schur(balanced, sort="lhp")
+    if stable != n or np.min(np.abs(_real_parts(form)), initial=np.inf) <= 1e-14 * np.linalg.norm(balanced):
+        raise NoSolution("imaginary axis")
+    upper, lower = vectors[:n, :n], vectors[n:, :n]
+    if np.linalg.cond(upper) > 1e14:
+        raise NoSolution("no graph")
+    x = np.linalg.solve(upper.T, lower.T).T
+    if np.linalg.norm(x - x.T) > 1e-4 * np.linalg.norm(x):
+        raise NoSolution("imaginary axis")  # rounding has parted a pair on the axis, which no symmetric X survives
+    x = 0.5 * (x + x.T)
+    eigenvalues = np.linalg.eigvalsh(x)
+    if eigenvalues[0] < -1e-9 * max(float(np.abs(eigenvalues).max()), 1e-300):
+        raise NoSolution("indefinite")
+    return x / scale / scale[:, None]
+
+
+def _real_parts(form: Real) -> Real:
+    """Of the eigenvalues of a real Schur form: its diagonal, whose 2×2 blocks have equal entries."""
+    return np.diag(form)
+
+
+def _scale(hamiltonian: Real) -> Real:
+    """t (n,), powers of two: diag(t, 1/t) balances H as well as a symplectic scaling can (Benner 2001)."""
+    n = hamiltonian.shape[0] // 2
+    if not n:
+        return np.empty(0)
+    _, (scale, _) = matrix_balance(hamiltonian, permute=False, separate=True)
+    logarithm = np.log2(scale)
+    return 2.0 ** np.round(0.5 * (logarithm[:n] - logarithm[n:]))
