@@ -106,7 +106,9 @@ def _direct_bound(normal: Normalised) -> float:
 def _solve(normal: Normalised, gamma: float) -> _Solutions:
     """Both Riccati equations and the coupling between them. Raises NoController."""
     if gamma <= _direct_bound(normal):
-        raise NoController(f"γ must exceed the norm of the direct part D11 that u and y cannot touch ({gamma:.6g} ≤ it)")
+        raise NoController(
+            f"γ must exceed the norm of the direct part D11 that u and y cannot touch ({gamma:.6g} ≤ it)"
+        )
     a, b1, b2, c1, c2, d11, d12, d21 = normal.matrices
     b, d_row = np.hstack([b1, b2]), np.hstack([d11, d12])
     c, d_column = np.vstack([c1, c2]), np.vstack([d11, d21])

@@ -34,6 +34,7 @@ class LiveLaw:
         self._block, self._desk = block, desk
         self._lock = threading.Lock()
         self._first_spare = prepared.plan.table.size
+        self._offsets_v: dict[int, float] = {}
         self._places = [0] * len(prepared.plan.axes)
 
     def axis_number(self, name: str) -> int:
@@ -96,6 +97,26 @@ class LiveLaw:
             values[1] = self._store(number, data)
             return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
 
+    def play_raw(self, number: int, volts: np.ndarray[Any, Any]) -> int:
+        """Play `volts` (n,) once, for raw mode; returns the tick. Raises Refused."""
+        with self._lock:
+            first = self._store(number, volts)
+            return self._desk.submit(
+                Kind.SET_REFERENCE, axis=number, values=[float(Generator.TABLE), first, volts.size, 1.0, 0.0]
+            )
+
+    def restore_reference(self, number: int) -> int:
+        """The reference that the configuration gives; returns the tick."""
+        generator = self.prepared.plan.generators[number]
+        values = [float(generator["kind"]), *generator["parameters"].tolist()]
+        return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=values)
+
+    def tare(self, number: int, offset_v: float) -> int:
+        """Make `offset_v` the reading at position 0; returns the tick."""
+        with self._lock:
+            self._offsets_v[number] = offset_v
+            return self._stage(number, self.prepared)
+
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Take over another configuration; what changed. Raises Refused where that needs a restart."""
         with self._lock:
@@ -126,7 +147,8 @@ class LiveLaw:
     def _stage(self, number: int, prepared: Prepared) -> int:
         """Copy coefficients to where the loop takes them from, and have it take them."""
         before, after = self.prepared.configuration.axes[number], prepared.configuration.axes[number]
-        coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1]
+        coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1].copy()
+        coefficients["offset_v"] = self._offsets_v.get(number, float(coefficients["offset_v"][0]))
         size = COEFFICIENTS.itemsize
         self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -25,13 +26,14 @@ from rtloop import signals
 from rtloop.config import Configuration, load
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
-from rtloop.errors import LoopFault, RtloopError
+from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.prepare import Prepared, prepare
 from rtloop.running import recording_path
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
 from rtloop.service.paths import block_path
+from rtloop.service.preparation import prepare_actuator
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 from rtloop.signals import Flag, Mode
 
@@ -60,6 +62,10 @@ class Service:
     def __init__(self, config: Path) -> None:
         self.config = config
         self.configuration: Configuration = load(config)
+        options = self.configuration.service
+        if self.configuration.schedule and (options.tare_s > 0 or options.depolarise is not None):
+            fault = "schedule: not allowed with service.tare_s or service.depolarise, which take the first ticks"
+            raise ConfigError(str(config), [fault])
         self.notifier = Notifier()
         self.faults: list[str] = []
         self.armed = not self.configuration.service.arm
@@ -138,6 +144,7 @@ class Service:
 
     def run(self) -> int:
         """Serve until told to end, or until the loop died too often; the exit code."""
+        log.info("starting %s", self.configuration.name)
         resting = self.configuration.service.arm
         while not self._ending.is_set():
             try:
@@ -158,17 +165,20 @@ class Service:
         """One loop from its start to its end; `resting` starts with the outputs off and without a schedule."""
         with Processes(block_path(self.configuration)) as processes:
             prepared = prepare(self.configuration)
-            if resting:
+            options = self.configuration.service
+            preparing = not resting and (options.tare_s > 0 or options.depolarise is not None)
+            if resting or preparing:
                 plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
                 prepared = replace(prepared, plan=plan)
             prepared = replace(prepared, plan=replace(prepared.plan, spare_samples=SPARE_SAMPLES))
-            stall_s = self.configuration.service.stall_ms / 1000
-            supervisor = Supervisor(processes, prepared, recording_path(prepared, None), stall_s)
+            supervisor = Supervisor(processes, prepared, recording_path(prepared, None), options.stall_ms / 1000)
             try:
                 supervisor.start()
                 self._desk = Desk(supervisor.block)
                 self.live = LiveLaw(prepared, supervisor.block, self._desk)
                 self.supervisor = supervisor
+                if preparing:
+                    self._aside(self._prepare_and_start)
                 return self._watch(supervisor)
             finally:
                 self.supervisor = self._desk = self.live = None
@@ -182,7 +192,7 @@ class Service:
                 supervisor.stop()
             if self._reload.is_set():
                 self._reload.clear()
-                self._apply_reload()
+                self._aside(self._apply_reload)
             self._tell(supervisor)
             state = self.state
             if state is not said:
@@ -231,6 +241,24 @@ class Service:
         self._told_ticks = 0
         time.sleep(RESTART_PAUSE_S)
         return True
+
+    def _aside(self, work: Callable[[], None]) -> None:
+        """Do slow work in a thread of its own: the watch goes on meanwhile."""
+        threading.Thread(target=work, daemon=True).start()
+
+    def _prepare_and_start(self) -> None:
+        """Depolarise, tare, then the configured references and mode."""
+        supervisor, live, desk = self.supervisor, self.live, self._desk
+        if supervisor is None or live is None or desk is None:
+            return
+        try:
+            prepare_actuator(self.configuration.service, supervisor, live, desk)
+            for number in range(len(live.prepared.plan.axes)):
+                live.restore_reference(number)
+            self.start()
+        except RtloopError as error:
+            self.faults.append(str(error))
+            log.error("%s", error)
 
     def _apply_reload(self) -> None:
         """Take over what may change under way; a configuration that is invalid or needs a restart changes nothing."""

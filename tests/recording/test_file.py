@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from rtloop.recording.contents import Message
+from rtloop.recording.errors import OutputError
 from rtloop.recording.format import EVENTS, TICKS, chunk_rows, tick_dtype, tick_schema
 from rtloop.recording.reader import Reader
 from rtloop.recording.writer import Writer
@@ -171,3 +173,18 @@ def test_the_message_index_for_viewers_that_need_it(tmp_path: Path):
     assert stock_rows(path).tobytes() == rows.tobytes()
     with Reader(path) as reader:
         assert np.concatenate(list(reader.blocks())).tobytes() == rows.tobytes()
+
+
+def test_space_that_is_to_stay_free_ends_the_file_well(tmp_path: Path, rows: np.ndarray, monkeypatch):
+    free = iter([10_000, 10_000, 10_000, 9_999])  # blocks of 1 KiB at each look
+    status = SimpleNamespace(f_frsize=1024)
+    monkeypatch.setattr("os.statvfs", lambda _: SimpleNamespace(**vars(status), f_bavail=next(free)))
+    writer = Writer(tmp_path / "run.mcap", make_header(), 1, min_free_bytes=10_000 * 1024)
+    writer.write_ticks(rows[:1000])
+    writer.write_ticks(rows[1000:2000])
+    with pytest.raises(OutputError, match="9 MiB are free, at least 9 MiB are to stay free"):
+        writer.write_ticks(rows[2000:])
+    writer.finish(lambda logged: Message(EVENTS, 1, json.dumps({"kind": "finished", "what": {"n": logged}}).encode()))
+    with Reader(tmp_path / "run.mcap") as reader:
+        assert np.concatenate(list(reader.blocks())).tobytes() == rows[:2000].tobytes()
+        assert reader.totals == {"n": 2000}

@@ -1,0 +1,36 @@
+"""Depolarising and taring on a rig that remembers: measured on the board's own truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.service.options import DepolariseOptions
+from rtloop.service.preparation import decaying_sine
+
+R = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
+P = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
+
+
+def displacement_um(volts: np.ndarray, plays: np.ndarray) -> float:
+    """Eq (4) after `volts`, from the memory `plays`, which moves."""
+    for value in volts:
+        plays[:] = np.maximum(value - np.array(R), np.minimum(value + np.array(R), plays))
+    return float(np.dot(P, plays))
+
+
+def test_the_sweep_wipes_out_what_the_actuator_remembers():
+    for history in ([10.0, 0.0], [-10.0, 0.0], [7.0, -3.0, 0.0]):
+        plays = np.zeros(len(R))
+        before = displacement_um(np.array(history), plays)
+        sweep = decaying_sine(DepolariseOptions(amplitude_v=10.0, frequency_hz=10.0, cycles=40), 10_000.0)
+        after = displacement_um(np.append(sweep, 0.0), plays)
+        assert abs(before) > 1.0
+        assert abs(after) < 0.25
+        assert np.max(np.abs(sweep)) <= 10.0
+
+
+def test_the_sweep_begins_and_ends_at_rest():
+    sweep = decaying_sine(DepolariseOptions(amplitude_v=5.0, frequency_hz=20.0, cycles=10), 1000.0)
+    assert sweep.size == 500
+    assert sweep[0] == 0.0
+    assert abs(sweep[-1]) < 1e-12
