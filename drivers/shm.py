@@ -5,7 +5,6 @@ Codes are 16 bit over ±10 V. The age of a sample is the time since the board to
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -27,7 +26,6 @@ CONTEXT = np.dtype(
 )
 TRIES = 1000
 NO_SAMPLE = 1
-CONTROLLER_BYTE = 1
 
 
 class ShmOptions(RigOptions):
@@ -143,7 +141,5 @@ class ShmDriver(Driver):
             raise DriverError(f"{self._file}: board version {facts['version'][0]}, this driver speaks {board.VERSION}")
         if facts["channels"][0] < len(self.wiring):
             raise DriverError(f"{self._file}: {facts['channels'][0]} channels, {len(self.wiring)} are needed")
-        try:
-            fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, CONTROLLER_BYTE)
-        except OSError:
-            raise DriverError(f"{self._file}: another controller drives this board") from None
+        if not board.take_role(fd, board.CONTROLLER_BYTE):
+            raise DriverError(f"{self._file}: another controller drives this board")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import struct
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,17 +31,20 @@ FULL_SCALE_V = 10.0
 LSB_V = 2 * FULL_SCALE_V / 2**BITS
 LOWEST_CODE, HIGHEST_CODE = -(2 ** (BITS - 1)), 2 ** (BITS - 1) - 1
 SLICE_S = 0.02
+BOARD_BYTE, CONTROLLER_BYTE = 0, 1
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
 """First in the file, written once."""
-WORDS, SEQUENCE, FAULT = 8, 0, 1
-"""uint64 words: samples so far (BUSY while one is written), and the fault that a test asks for."""
+WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS = 8, 0, 1, 2
+"""uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, and how late the board's
+own clock ever was: between two looks at its outputs lay at most so much more than its period."""
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 SEEN = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("largest_step_v", np.float64), ("last_v", np.float64),
-     ("true_position_um", np.float64), ("largest_position_um", np.float64)]
+     ("true_position_um", np.float64), ("largest_position_um", np.float64), ("moved_ns", np.int64)]
 )  # fmt: skip
+"""What an output did; `moved_ns`: CLOCK_MONOTONIC when it last changed."""
 
 
 class BoardMemory:
@@ -87,14 +91,22 @@ class BoardBusy(OSError):
     """Another board serves this file."""
 
 
-def serve(path: Path, options: RigOptions, axes: Sequence[str], rate_hz: float, stopped: Callable[[], bool]) -> int:
+def serve(
+    path: Path,
+    options: RigOptions,
+    axes: Sequence[str],
+    rate_hz: float,
+    stopped: Callable[[], bool],
+    ready: Callable[[], None] = lambda: None,
+) -> int:
     """Be the board at `path` until `stopped`; returns the samples taken. Raises ValueError, OSError, BoardBusy."""
     if len(axes) > MAX_CHANNELS:
         raise ValueError(f"{len(axes)} axes; a board has at most {MAX_CHANNELS} channels")
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
     try:
-        _lock(fd, path)
+        if not take_role(fd, BOARD_BYTE):
+            raise BoardBusy(f"{path}: another board serves this file")
         os.ftruncate(fd, file_bytes())  # never shorter: a controller may still have it mapped
         memory = BoardMemory(fd)
         memory.reset()
@@ -104,6 +116,7 @@ def serve(path: Path, options: RigOptions, axes: Sequence[str], rate_hz: float, 
         _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
+        ready()
         start_ns, index, slice_ticks = time.monotonic_ns(), 0, max(1, round(SLICE_S * rate_hz))
         while not stopped():
             index = _run(*arguments, start_ns, 1e9 / rate_hz, index, slice_ticks)
@@ -113,12 +126,18 @@ def serve(path: Path, options: RigOptions, axes: Sequence[str], rate_hz: float, 
         os.close(fd)
 
 
-def _lock(fd: int, path: Path) -> None:
-    """One board a file; a controller takes a lock of its own, on another byte."""
+def take_role(fd: int, byte: int) -> bool:
+    """Lock one byte of the file for this open file: BOARD_BYTE or CONTROLLER_BYTE; False where another has it.
+
+    The lock belongs to the open file and not to the process, whose locks would all go when any of its descriptors
+    of the file is closed.
+    """
+    request = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0)
     try:
-        fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, 0)
+        fcntl.fcntl(fd, fcntl.F_OFD_SETLK, request)
     except OSError:
-        raise BoardBusy(f"{path}: another board serves this file") from None
+        return False
+    return True
 
 
 @jit
@@ -131,6 +150,8 @@ def _run(
         now_ns = monotonic_ns(timespec)
         while now_ns < wake_ns:
             now_ns = sleep_until(wake_ns, timespec)
+        if np.uint64(now_ns - wake_ns) > words[LONGEST_LATE_NS]:
+            words[LONGEST_LATE_NS] = np.uint64(now_ns - wake_ns)
         fault = load_acquire(words, FAULT)
         sequence = load_acquire(words, SEQUENCE)
         store_release(words, SEQUENCE, BUSY)
@@ -145,7 +166,7 @@ def _run(
         store_release(words, SEQUENCE, sequence + np.uint64(1))
         for i in range(coefficients.shape[0]):
             volts = seen[i].last_v if fault == STUCK_OUTPUT else dac_codes[i] * LSB_V
-            _witness(seen[i], volts)
+            _witness(seen[i], volts, now_ns)
             advance(coefficients[i], state[i], volts)
         index += 1
     return index
@@ -160,9 +181,11 @@ def _look(seen, state, index):
 
 
 @jit
-def _witness(seen, volts):
+def _witness(seen, volts, now_ns):
     """What the output did."""
     step_v = abs(volts - seen.last_v)
+    if step_v > 0.0:
+        seen.moved_ns = now_ns
     if step_v > seen.largest_step_v:
         seen.largest_step_v = step_v
     if volts < seen.lowest_v:

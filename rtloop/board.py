@@ -13,6 +13,7 @@ from rtloop.config import load
 from rtloop.engine.plan import Pacing
 from rtloop.engine.realtime import prepare_realtime
 from rtloop.errors import ConfigError, UnavailableError
+from rtloop.service.notify import Notifier
 
 BOARD_PRIORITY = 85
 
@@ -37,7 +38,8 @@ def serve_board(config: Path) -> int:
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
     click.echo(f"board at {options.file}: {len(axes)} channels at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
     try:
-        samples = serve(Path(options.file), options, axes, rate_hz, lambda: stopped)
+        ready = lambda: Notifier().send(READY=1)
+        samples = serve(Path(options.file), options, axes, rate_hz, lambda: stopped, ready)
     except ValueError as error:
         raise ConfigError(str(config), [f"driver: {error}"]) from None
     except OSError as error:

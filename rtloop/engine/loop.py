@@ -68,11 +68,9 @@ def run_ticks(loop, until_tick):
             return FAILURE
         _tick(loop)
         loop.tick += 1
-        if loop.failed == WRITE_FAILED:
-            return FAILURE
         state = state_of(loop)
         if state.settled != 0:
-            if loop.failed == READ_FAILED:
+            if loop.failed != 0:
                 return FAILURE
             if state.trip & TRIP_HEARTBEAT != 0:
                 return ORPHANED
@@ -85,9 +83,10 @@ def run_ticks(loop, until_tick):
 def _prepare(loop):
     """What a tick does before its deadline: schedule and commands, stop request, snapshot of the law."""
     apply_commands(loop)
-    if loop.stopping == 0 and load_acquire(words_of(loop), STOP_WORD) != 0:
+    failing = loop.failed == WRITE_FAILED  # one write may fail and the next succeed: the ramp is tried
+    if loop.stopping == 0 and (failing or load_acquire(words_of(loop), STOP_WORD) != 0):
         loop.stopping = 1
-        publish_event(loop, STOP_KIND, ALL_AXES, SUPERVISOR, 0, (0.0, 0.0))
+        publish_event(loop, STOP_KIND, ALL_AXES, LOOP_ORIGIN if failing else SUPERVISOR, 0, (0.0, 0.0))
         set_mode(axes_of(loop), state_of(loop), OFF, False)
     if loop.tick >= loop.next_snapshot:
         _publish_snapshot(loop)

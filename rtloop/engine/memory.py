@@ -7,6 +7,7 @@ file (a memfd or a path in the runtime directory) can attach. A plain mapping is
 
 from __future__ import annotations
 
+import fcntl
 import json
 import mmap
 import os
@@ -125,6 +126,20 @@ class SharedBlock:
     def words(self) -> np.ndarray[Any, Any]:
         """The control words, indexed by Word."""
         return self._arrays["words"]
+
+    def claim(self) -> None:
+        """Mark the calling process as the one that drives, for as long as it lives."""
+        self.words[Word.LOOP_PID] = os.getpid()
+        fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
+
+    def driven_by(self) -> int | None:
+        """The process that claimed the block and still lives; not for that process itself."""
+        try:
+            fcntl.lockf(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1)
+        except OSError:
+            return int(self.words[Word.LOOP_PID])
+        fcntl.lockf(self.fd, fcntl.LOCK_UN, 1)
+        return None
 
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""

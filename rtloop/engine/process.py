@@ -54,6 +54,7 @@ def main() -> int:
     except EOFError:
         return 0  # there was nothing to run
     block = SharedBlock(fd)
+    block.claim()
     driver: Driver | None = None
     state = ProcessState.FAILED
     try:
@@ -103,6 +104,8 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
     while not block.words[Word.GO]:
         if block.words[Word.STOP]:
             return Outcome.STOPPED
+        if time.monotonic_ns() - int(block.words[Word.HEARTBEAT_NS]) > plan.pacing.heartbeat_timeout_s * 1e9:
+            return Outcome.HEARTBEAT_LOST
         time.sleep(GO_POLL_S)
     if plan.pacing.paced:
         context.start_ns = time.monotonic_ns() + START_DELAY_NS

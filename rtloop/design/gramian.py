@@ -1,0 +1,91 @@
+"""Square roots of the Gramians of a stable system, found without ever forming a Gramian that could lose its digits.
+
+    A P + P Aᵀ + b bᵀ = 0,   P = L Lᵀ
+
+In modal coordinates P is a Cauchy matrix, P_ij = −βᵢ β̄ⱼ/(pᵢ + p̄ⱼ). Gaussian elimination keeps its form, so that each
+entry of L is a product of differences and sums of poles, accurate to a few units in the last place (Gohberg, Kailath &
+Olshevsky, Mathematics of Computation 64, 1995; Demmel, SIAM J. Matrix Anal. 21, 1999). Poles at −1 rad/s beside poles at
+−1e5 rad/s cost nothing there, where a Lyapunov solver and a Cholesky factorisation would lose the small Hankel values.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import block_diag, solve_continuous_lyapunov
+
+from hil.linear import Complex, Modal, Real
+from rtloop.design.realisation import System
+
+
+def modal_root(poles: Complex, inputs: Complex) -> Real:
+    """L (n, n) with L Lᵀ the controllability Gramian of the real modal form; its first column carries most.
+
+    `poles` (n,) all stable, no two alike, conjugates side by side with the upper one first; `inputs` β (n,), conjugate
+    alike. The real form has x = (√2 Re, √2 Im) of each upper mode, which is a unitary change of coordinates.
+    """
+    factor = _cauchy_root(poles, inputs)
+    real = _to_real(poles) @ factor
+    return _one_root(np.hstack([real.real, real.imag]))
+
+
+def system_roots(system: System) -> tuple[Real, Real]:
+    """(L, R) with P = L Lᵀ and Q = R Rᵀ for a stable system in any form, from Lyapunov equations."""
+    p = solve_continuous_lyapunov(system.a, -np.outer(system.b, system.b))
+    q = solve_continuous_lyapunov(system.a.T, -np.outer(system.c, system.c))
+    return _root_of(p), _root_of(q)
+
+
+def real_modal_system(modal: Modal) -> System:
+    """The real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, so that the two are alike."""
+    upper = modal.poles.imag >= 0
+    a, b, c = [], [], []
+    for pole, beta, gamma in zip(modal.poles[upper], *(part[upper] for part in modal_vectors(modal)), strict=True):
+        if pole.imag == 0:
+            a.append(np.array([[pole.real]]))
+            b.append([beta.real])
+            c.append([gamma.real])
+        else:
+            a.append(np.array([[pole.real, -pole.imag], [pole.imag, pole.real]]))
+            b.append([np.sqrt(2) * beta.real, np.sqrt(2) * beta.imag])
+            c.append([np.sqrt(2) * gamma.real, -np.sqrt(2) * gamma.imag])
+    if not a:
+        return System(np.empty((0, 0)), np.empty(0), np.empty(0), float(modal.direct[0]))
+    return System(block_diag(*a), np.concatenate(b), np.concatenate(c), float(modal.direct[0]))
+
+
+def modal_vectors(modal: Modal) -> tuple[Complex, Complex]:
+    """β and γ (n,) with γᵢβᵢ = rᵢ and |βᵢ| = |γᵢ|."""
+    residues = modal.residues[0]
+    beta = np.sqrt(np.abs(residues)).astype(complex)
+    return beta, np.divide(residues, beta, out=np.zeros_like(residues), where=beta != 0)
+
+
+def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
+    """F (n, n) with F Fᴴ = P, by elimination with the largest pivot first; each step multiplies, none subtracts P's."""
+    left = inputs.astype(complex)
+    factor = np.zeros((poles.size, poles.size), dtype=complex)
+    for k in range(poles.size):
+        diagonal = np.abs(left) ** 2 / (-2 * poles.real)
+        pivot = int(np.argmax(diagonal))
+        if diagonal[pivot] == 0:
+            break
+        factor[:, k] = -left * np.conj(left[pivot]) / (poles + np.conj(poles[pivot])) / np.sqrt(diagonal[pivot])
+        left = left * (poles - poles[pivot]) / (poles + np.conj(poles[pivot]))
+        left[pivot] = 0.0
+    return factor
+
+
+def _to_real(poles: Complex) -> Complex:
+    """Unitary (n, n) from modal to real coordinates."""
+    turn = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
+    return block_diag(*(np.eye(1) if pole.imag == 0 else turn for pole in poles if pole.imag >= 0)).astype(complex)
+
+
+def _one_root(wide: Real) -> Real:
+    """L (n, n), lower triangular, with L Lᵀ = wide·wideᵀ."""
+    return np.linalg.qr(wide.T, mode="r").T
+
+
+def _root_of(gramian: Real) -> Real:
+    values, vectors = np.linalg.eigh(gramian)
+    return vectors * np.sqrt(np.maximum(values, 0.0))

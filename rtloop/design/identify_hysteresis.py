@@ -1,0 +1,182 @@
+"""Thresholds and weights of a Prandtl-Ishlinskii model from recorded slow drives (quasi-static: eq (4) of the paper).
+
+    x_k+1 = Σ p_i F_{r_i}[u]_k + offset = Σ s_i (F_{r_i} − F_{r_{i+1}})[u]_k + offset,     s_i = Σ_{j≤i} p_j
+
+For given thresholds this is linear in the weights (Kuhnen 2003). Written with their partial sums s_i, which are the
+slopes of the initial loading curve, the condition that an inverse exists, s_i > 0, is a bound on each unknown: least
+squares with bounds instead of a quadratic programme.
+
+Position and plays are averaged over blocks of equal length: both sides of a linear equation alike, so that a long
+recording costs nothing in accuracy. What the plant's lag adds, rate × lag, counts as hysteresis: drive slowly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from hil.linear import Real
+from rtloop.design.loop_shape import LoopShape, loop_shape
+from rtloop.design.measured import Measured, UnsuitableData
+from rtloop.design.plays import model_output, play_outputs, turning_points
+from rtloop.law.hysteresis import PlayModel
+from rtloop.law.layout import MAX_PLAYS
+
+Placement = Literal["chebyshev", "uniform"]
+Weights = Literal["invertible", "free"]
+
+BLOCKS = 20_000
+"""At most so many averaged samples of each recording take part."""
+LEAST_SLOPE = 0.05
+"""Of "invertible" weights: the least partial sum, as a part of the mean slope, so that the inverse stays moderate."""
+REST = 0.02
+"""A recording starts from rest where its first drive is below this part of the largest."""
+LEAST_DIRECTION = 1e-9
+"""Smallest singular value of the scaled columns, relative to the largest, for weights that can be told apart."""
+
+
+@dataclass(frozen=True)
+class HysteresisFit:
+    """The model in V and µm, and how well it explains what it was made from.
+
+    `offsets_um` is of each recording's sensor; errors are of averaged samples; percentages are of the range.
+    """
+
+    model: PlayModel
+    offsets_um: tuple[float, ...]
+    rms_error_um: float
+    max_error_um: float
+    range_um: float
+    drive_v: float
+    measured_loop: LoopShape
+    model_loop: LoopShape
+    placement: str
+    weights: Weights
+    least_slope_um_per_v: float
+
+    @property
+    def invertible(self) -> bool:
+        """Every partial sum of the weights is above 0."""
+        return bool(np.all(np.cumsum(self.model.weights) > 0))
+
+
+class _Equations(NamedTuple):
+    columns: Real
+    position_um: Real
+
+
+def placed_thresholds(count: int, largest_v: float, placement: Placement) -> Real:
+    """`count` thresholds in V below `largest_v`, the largest drive.
+
+    "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
+    give those of eq (4). "uniform": R·i/n from 0 on, without a dead band.
+    """
+    if placement not in get_args(Placement):
+        raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
+    if not 1 <= count <= MAX_PLAYS:
+        raise ValueError(f"number of operators: {count}; 1 to {MAX_PLAYS} are allowed")
+    if placement == "uniform":
+        return largest_v * np.arange(count) / count
+    return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(1, count + 1) / (count + 1)))
+
+
+def identify_hysteresis(
+    runs: Sequence[Measured],
+    count: int = 15,
+    placement: Placement = "chebyshev",
+    thresholds_v: Sequence[float] | None = None,
+    weights: Weights = "invertible",
+) -> HysteresisFit:
+    """The model that fits all `runs`, each from rest at 0 V. Raises UnsuitableData, ValueError for the options."""
+    for run in runs:
+        _require_loop(run)
+    largest_v = max(float(np.abs(run.drive_v).max()) for run in runs)
+    given = thresholds_v is not None
+    thresholds = np.array(thresholds_v, float) if given else placed_thresholds(count, largest_v, placement)
+    _require_reached(thresholds, largest_v)
+    equations = [_equations(run, thresholds, i, len(runs)) for i, run in enumerate(runs)]
+    columns = np.vstack([part.columns for part in equations])
+    position = np.concatenate([part.position_um for part in equations])
+    range_um = max(float(np.ptp(part.position_um)) for part in equations)
+    least = LEAST_SLOPE * range_um / max(float(np.ptp(run.drive_v)) for run in runs)
+    slopes, offsets = _solve(columns, position, thresholds.size, least if weights == "invertible" else -np.inf)
+    errors = columns @ np.concatenate([slopes, offsets]) - position
+    model = PlayModel(thresholds, np.diff(slopes, prepend=0.0))
+    widest = max(runs, key=lambda run: float(np.ptp(run.drive_v)))
+    return HysteresisFit(
+        model,
+        tuple(offsets.tolist()),
+        float(np.sqrt(np.mean(errors**2))),
+        float(np.abs(errors).max()),
+        range_um,
+        largest_v,
+        loop_shape(widest.drive_v[:-1], widest.position_um[1:]),
+        loop_shape(widest.drive_v, model_output(model, widest.drive_v)),
+        "given" if given else placement,
+        weights,
+        least,
+    )
+
+
+def _equations(run: Measured, thresholds: Real, index: int, runs: int) -> _Equations:
+    """Averaged columns (blocks, plays + runs) and positions (blocks,); a column of ones for the run's own offset."""
+    plays = play_outputs(run.drive_v[:-1], thresholds)
+    plays[:, :-1] -= plays[:, 1:].copy()
+    offset = np.zeros((plays.shape[0], runs))
+    offset[:, index] = 1.0
+    size = max(1, plays.shape[0] // BLOCKS)
+    return _Equations(_averaged(np.hstack([plays, offset]), size), _averaged(run.position_um[1:, None], size)[:, 0])
+
+
+def _averaged(rows: Real, size: int) -> Real:
+    """Means of `size` successive rows; an incomplete block at the end is left out."""
+    kept = rows[: rows.shape[0] // size * size]
+    return kept.reshape(-1, size, rows.shape[1]).mean(axis=1)
+
+
+def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Real, Real]:
+    """Slopes ≥ `least` and offsets, by least squares. Raises UnsuitableData where they cannot be told apart."""
+    scale = np.linalg.norm(columns, axis=0)
+    sizes = np.linalg.svd(columns / scale, compute_uv=False)
+    if sizes[-1] < LEAST_DIRECTION * sizes[0]:
+        raise UnsuitableData(
+            f"too little excitation: {plays} weights cannot be told apart by these drives; fewer operators, or drives "
+            "with loops of several sizes, would help"
+        )
+    triangle, remainder = np.linalg.qr(columns / scale), position
+    bounds = np.concatenate([np.full(plays, least) * scale[:plays], np.full(columns.shape[1] - plays, -np.inf)])
+    solution = lsq_linear(triangle.R, triangle.Q.T @ remainder, (bounds, np.inf), method="bvls", tol=1e-12).x / scale
+    return solution[:plays], solution[plays:]
+
+
+def _require_loop(run: Measured) -> None:
+    """Raise UnsuitableData for a drive that does not start at rest or makes no loop."""
+    drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
+    if abs(drive[0]) > REST * largest_v:
+        raise UnsuitableData(
+            f"{run.name}: it starts at {drive[0]:g} V, so that the actuator's memory is not known; a drive that starts "
+            "at 0 V from rest, with its initial loading curve, is needed"
+        )
+    turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
+    if turns.size < 2:
+        raise UnsuitableData(
+            f"{run.name}: too little excitation: the drive turns back {turns.size} times; at least 2 are needed "
+            "(one and a half periods of a sine make the major loop)"
+        )
+
+
+def _require_reached(thresholds: Real, largest_v: float) -> None:
+    if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
+        raise ValueError(f"thresholds: {thresholds.size} given; 1 to {MAX_PLAYS} are allowed")
+    if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):
+        raise ValueError(f"thresholds: {thresholds.tolist()} must be at least 0 and ascend")
+    beyond = thresholds[thresholds >= largest_v]
+    if beyond.size:
+        raise UnsuitableData(
+            f"too little excitation: thresholds from {beyond[0]:g} V on are never reached by a drive of at most "
+            f"{largest_v:g} V; drive further, or leave them out"
+        )

@@ -1,0 +1,55 @@
+"""Height and width of a hysteresis loop: h/H, the paper's measure of how much hysteresis there is."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.design.plays import turning_points
+
+BINS = 200
+
+
+class LoopShape(NamedTuple):
+    """Largest distance h of the two branches at the same drive, and the range H of the output."""
+
+    height: float
+    width: float
+
+    @property
+    def percent(self) -> float:
+        """100·h/H."""
+        return 100 * self.height / self.width
+
+
+def loop_shape(drive: Real, output: Real) -> LoopShape:
+    """Of the last whole loop in `drive` and `output`, each (samples,).
+
+    Both branches are averaged in bins of the drive, so that noise on the output counts little. NaN without a loop.
+    """
+    span = float(np.ptp(drive))
+    turns = turning_points(drive, 0.5 * span)
+    if turns.size < 2:
+        return LoopShape(np.nan, float(np.ptp(output)))
+    ends = [*turns.tolist(), drive.size - 1]
+    branches = [slice(start, end + 1) for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    whole = [part for part in branches if np.ptp(drive[part]) > 0.98 * span]
+    last = whole[-2:] if len(whole) >= 2 else branches[-2:]
+    edges = np.linspace(drive.min(), drive.max(), BINS + 1)
+    first, second = (_means(drive[part], output[part], edges) for part in last)
+    inner = slice(1, -1)
+    return LoopShape(float(np.nanmax(np.abs(first - second)[inner])), float(np.nanmax(output) - np.nanmin(output)))
+
+
+def _means(drive: Real, output: Real, edges: Real) -> Real:
+    """Mean output at each bin's centre: the drive's own mean in the bin is corrected by the branch's slope."""
+    bins = np.clip(np.digitize(drive, edges) - 1, 0, BINS - 1)
+    counts = np.bincount(bins, minlength=BINS).astype(float)
+    counts[counts == 0] = np.nan
+    centres = 0.5 * (edges[:-1] + edges[1:])
+    means = np.bincount(bins, output, BINS) / counts
+    drives = np.bincount(bins, drive, BINS) / counts
+    slope = np.gradient(means, drives)
+    return means + slope * (centres - drives)

@@ -1,0 +1,138 @@
+"""What identification reads from a recording, and when a recording cannot serve."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.errors import RtloopError
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import Recording, load
+from rtloop.signals import trip_causes
+
+LEAST_SPAN_TO_NOISE = 50.0
+"""Position must move by this many standard deviations of its noise."""
+LEAST_TICKS = 100
+PLATEAU_DRIVE = 0.02
+"""A reading that stands still at its extreme while the drive moves by more than this part of its span is clipped."""
+PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
+"""Or one that stands still for so many ticks and comes there or leaves with a jump of so many usual changes."""
+
+
+class UnsuitableData(RtloopError):
+    """Recorded data, or a model, that the answer cannot be had from; the message says why and what would help."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
+
+    `even` says that no tick is missing or late by a period; `digest` is the SHA-256 of the recording's files.
+    """
+
+    name: str
+    period_s: float
+    drive_v: Real
+    position_um: Real
+    command_um: Real
+    even: bool
+    configuration: str
+    digest: str
+
+
+def measured(path: Path, axis: str | None = None) -> Measured:
+    """One recording's axis (the only one, if there is one). Raises RecordingError, UnsuitableData."""
+    recording = load(path)
+    axis = _axis(recording, axis, path)
+    wanted = ("drive_v", "position_um", "command_um", "adc_v")
+    drive, position, command, adc = recording.read(*(f"{axis}_{name}" for name in wanted))
+    deadlines, missed, flags = recording.read("deadline_ns", "periods_missed", "flags")
+    if drive.size < LEAST_TICKS:
+        raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
+    _refuse_trip(path, flags)
+    require_usable(str(path), drive, position, adc)
+    intervals = np.diff(deadlines)
+    period_ns = float(np.median(intervals))
+    even = not np.any(missed[1:]) and bool(np.all(np.abs(intervals - period_ns) <= 1))
+    return Measured(
+        str(path), period_ns * 1e-9, drive, position, command, even, recording.configuration, _digest(recording.paths)
+    )
+
+
+def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> None:
+    """Raise UnsuitableData where a signal is not finite or clipped, or where nothing moved."""
+    if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
+        raise UnsuitableData(f"{name}: drive or position holds numbers that are not finite")
+    noise, span = noise_of(position_um), float(np.ptp(position_um))
+    if np.ptp(drive_v) == 0:
+        raise UnsuitableData(
+            f"{name}: too little excitation: the drive stays at {drive_v[0]:g} V; a sine, step or chirp is needed"
+        )
+    if span < LEAST_SPAN_TO_NOISE * noise or span == 0:
+        raise UnsuitableData(
+            f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
+            f"at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm is needed: drive further"
+        )
+    if (where := _clipped(drive_v, adc_v)) is not None:
+        raise UnsuitableData(
+            f"{name}: saturated: the reading stands still at {adc_v[where]:.6g} V from tick {where} on while it should "
+            "move; a smaller drive, or a sensor or converter of larger range, is needed"
+        )
+
+
+def noise_of(position: Real) -> float:
+    """Standard deviation of white noise on a smooth signal, from its second differences' median."""
+    return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
+
+
+def _clipped(drive: Real, adc: Real) -> int | None:
+    """First tick of a plateau at an extreme that is none of the signal's own, or None. A rest at the start is."""
+    changes = np.abs(np.diff(adc))
+    usual = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
+    for extreme in (adc.max(), adc.min()):
+        at = adc == extreme
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]])))
+        for start, end in edges.reshape(-1, 2):
+            if start == 0 or end - start < PLATEAU_TICKS:
+                continue
+            into, out_of = changes[start - 1], changes[end - 1] if end < adc.size else 0.0
+            if max(into, out_of) > PLATEAU_JUMP * usual:
+                return int(start)
+            if np.ptp(drive[start:end]) > PLATEAU_DRIVE * np.ptp(drive):
+                return int(start)
+    return None
+
+
+def _refuse_trip(path: Path, flags: Real) -> None:
+    tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
+    if not np.any(tripped):
+        return
+    first = int(np.argmax(np.isin(flags, np.unique(flags)[tripped])))
+    raise UnsuitableData(
+        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); a run to the end is needed: "
+        "a smaller drive, or interlocks that allow this one"
+    )
+
+
+def _axis(recording: Recording, axis: str | None, path: Path) -> str:
+    axes = recording.header.get("axes", [])
+    if axis is None and len(axes) == 1:
+        return axes[0]
+    if axis not in axes:
+        raise RecordingError(f"{path}: axis {axis!r}; it holds {', '.join(axes) or 'none'}: --axis says which")
+    return axis
+
+
+def _digest(paths: tuple[Path, ...]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        with open(path, "rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+    return digest.hexdigest()

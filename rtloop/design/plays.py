@@ -1,0 +1,71 @@
+"""Play operators over whole recordings, and the initial loading curve that stands for a sum of them.
+
+    F_r[u]_k = max(u_k − r, min(u_k + r, F_r[u]_k−1)),     F_r = 0 before the first sample
+    φ(u) = Σ p_i max(u − r_i, 0)                           initial loading curve, u ≥ 0
+
+Krasnosel'skii & Pokrovskii, Systems with Hysteresis, 1989; Kuhnen, European Journal of Control 9, 2003.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.linear import Real
+from rtloop.law.hysteresis import PlayModel
+
+
+def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike) -> Real:
+    """F_r[u], (samples, plays), of virgin plays.
+
+    While the drive does not turn back, the formula holds for all samples at once with the state before the first.
+    """
+    u, r = np.asarray(drive, dtype=float), np.asarray(thresholds, dtype=float)
+    outputs = np.empty((u.size, r.size))
+    last = np.zeros(r.size)
+    bounds = [0, *(_reversals(u) + 1).tolist(), u.size]
+    for start, end in zip(bounds[:-1], bounds[1:], strict=True):
+        part = u[start:end, None]
+        outputs[start:end] = np.maximum(part - r, np.minimum(part + r, last))
+        last = outputs[end - 1] if end else last
+    return outputs
+
+
+def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
+    """P[u] (samples,) of a virgin model."""
+    return play_outputs(drive, model.thresholds) @ model.weights
+
+
+def turning_points(drive: Real, least: float) -> npt.NDArray[np.intp]:
+    """Where the drive turned back by at least `least`: its alternating highest and lowest samples."""
+    found: list[int] = []
+    candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
+    low = high = 0
+    for k in candidates:
+        low = k if drive[k] <= drive[low] else low
+        high = k if drive[k] >= drive[high] else high
+        if drive[k] <= drive[high] - least:
+            found += [high] if not found or drive[found[-1]] < drive[high] else []
+            low = high = k
+        elif drive[k] >= drive[low] + least:
+            found += [low] if not found or drive[found[-1]] > drive[low] else []
+            low = high = k
+    return np.array(found, dtype=np.intp)
+
+
+def loading_slopes(model: PlayModel) -> Real:
+    """dφ/du between thresholds (n,): behind r_i, Σ_{j≤i} p_j."""
+    return np.cumsum(model.weights)
+
+
+def loading_curve(model: PlayModel, drive: npt.ArrayLike) -> Real:
+    """φ at `drive` ≥ 0, any shape."""
+    u = np.asarray(drive, dtype=float)
+    return (np.maximum(u[..., None] - model.thresholds, 0.0) * model.weights).sum(axis=-1)
+
+
+def _reversals(u: Real) -> npt.NDArray[np.intp]:
+    """Indices of the samples after which the direction is another than before; rests do not count."""
+    steps = np.flatnonzero(np.diff(u))
+    directions = np.sign(np.diff(u)[steps])
+    return steps[1:][directions[1:] != directions[:-1]]
