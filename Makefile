@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench soak-recordings check clean
+.PHONY: run test bench soak-recordings check install uninstall test-systemd clean
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -31,6 +31,14 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
 	$(BIN)/python -m rtloop.warm
 	touch $@
+
+# As root; PREFIX, DESTDIR and PIP_ARGS (such as "--no-index --find-links FOLDER") are explained in deploy/install.
+install uninstall:
+	PYTHON='$(PYTHON)' PREFIX='$(PREFIX)' DESTDIR='$(DESTDIR)' PIP_ARGS='$(PIP_ARGS)' deploy/install $@
+
+# As root, with debootstrap and systemd-container: the installed service under a real systemd, in a Debian container.
+test-systemd: $(READY)
+	PYTHON='$(abspath $(BIN)/python)' tests/systemd/run
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -59,15 +59,16 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None) -> N
 def _client(context: click.Context) -> Any:
     from rtloop.errors import UnavailableError
     from rtloop.service.client import Client
-    from rtloop.service.paths import runtime_folder
+    from rtloop.service.paths import client_folders
 
     name, path = context.obj
     if path is None:
-        folder = runtime_folder()
-        found = sorted(folder.glob("*.sock")) if name is None else [folder / f"{name}.sock"]
+        folders = client_folders()
+        found = [item for folder in folders for item in sorted(folder.glob(f"{name or '*'}.sock"))]
         if len(found) != 1:
-            there = ", ".join(item.stem for item in found) or "none"
-            raise UnavailableError(f"{folder}: services running: {there}; --name or --socket says which")
+            there = ", ".join(item.stem for item in found) or "none that may be reached"
+            where = ", ".join(str(folder) for folder in folders)
+            raise UnavailableError(f"{where}: services: {there}; --name or --socket says which")
         path = found[0]
     return Client(path)
 

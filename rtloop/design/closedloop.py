@@ -35,14 +35,22 @@ class Loop:
 
     def open(self, hz: npt.ArrayLike) -> Complex:
         """L at frequencies (k,) in Hz."""
+        points = self._points(hz)
+        return self.controller.response(points) * self.plant.response(points)
+
+    def _points(self, hz: npt.ArrayLike) -> Complex:
+        """Frequencies as points of the s or z plane."""
         beside_axis = 1e-12 + 1j  # an undamped root on the axis itself has no response
         points = 2 * np.pi * beside_axis * np.atleast_1d(np.asarray(hz, dtype=float))
-        points = points if self.period_s is None else np.exp(points * self.period_s)
-        return self.controller.response(points) * self.plant.response(points)
+        return points if self.period_s is None else np.exp(points * self.period_s)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
         """|S| at frequencies (k,) in Hz."""
         return 1.0 / np.abs(1.0 + self.open(hz))
+
+    def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
+        """|C·S|, from the reference to the command, at frequencies (k,) in Hz."""
+        return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
 from rtloop.design.discretise import DiscreteController
 from rtloop.design.margins import margins
+from rtloop.design.reach import reach
 from rtloop.design.step import step_metrics
 from rtloop.design.transfer import Transfer
 
@@ -93,7 +94,7 @@ def resonance_shift_tolerated(
 
     if not stable(0.0):
         return Tolerance(0.0, 0.0)
-    return Tolerance(_reach(lambda p: stable(-p), largest_percent), _reach(stable, largest_percent))
+    return Tolerance(reach(lambda p: stable(-p), largest_percent), reach(stable, largest_percent))
 
 
 def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
@@ -101,15 +102,19 @@ def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
 
     Raises ValueError for a plant without complex poles.
     """
-    upper = np.flatnonzero(plant.poles.imag > 0)
-    if not upper.size:
-        raise ValueError("plant: it has no complex poles; at least one resonance is needed")
-    pair = plant.poles[upper]
-    lightest = pair[np.argmin(-pair.real / np.abs(pair))]
+    lightest = lightest_pair(plant)
     moved = (plant.poles == lightest) | (plant.poles == np.conj(lightest))
     factor = 1 + percent / 100
     gain = plant.gain * factor ** int(moved.sum())
     return Transfer(plant.zeros, np.where(moved, factor * plant.poles, plant.poles), gain)
+
+
+def lightest_pair(plant: Transfer) -> complex:
+    """The pole of positive imaginary part with the least damping ratio. Raises ValueError where all poles are real."""
+    upper = plant.poles[plant.poles.imag > 0]
+    if not upper.size:
+        raise ValueError("plant: it has no complex poles; at least one resonance is needed")
+    return complex(upper[np.argmin(-upper.real / np.abs(upper))])
 
 
 def _analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float]) -> LoopAnalysis:
@@ -133,21 +138,6 @@ def _analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float]) -> LoopAnal
         poles=tuple(complex(p) for p in poles),
         **with_margins,
     )
-
-
-def _reach(stable: Callable[[float], bool], largest: float) -> float:
-    """The smallest percentage at which `stable` fails: stepwise outwards, then by bisection to 1e-4."""
-    step = 0.25
-    low = 0.0
-    while stable(min(low + step, largest)):
-        low += step
-        if low >= largest:
-            return largest
-    high = min(low + step, largest)
-    while high - low > 1e-4:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low
 
 
 def _plain(value: Any) -> Any:

@@ -27,12 +27,19 @@ def margins(loop: Loop) -> Margins:
     """The lowest crossover, the smallest phase margin of all, the smallest factor > 1 that reaches −1, max |S|."""
     hz = loop.frequencies
     response = loop.open(hz)
-    crossings = [_bisect(lambda f: abs(loop.open(f)[0]) - 1, *ends) for ends in _sign_changes(hz, np.abs(response) - 1)]
-    phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossings]
+    crossed = crossings(loop)
+    phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossed]
     gain, gain_hz = _gain_margin(loop, hz, response)
     peak, peak_hz = _highest(loop.sensitivity, hz)
-    crossover = crossings[0] if crossings else math.nan
+    crossover = crossed[0] if crossed else math.nan
     return Margins(crossover, min(phases, default=math.inf), gain, gain_hz, peak, peak_hz)
+
+
+def crossings(loop: Loop) -> list[float]:
+    """Frequencies in Hz at which |L| = 1, rising."""
+    hz = loop.frequencies
+    changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
+    return [_bisect(lambda f: abs(loop.open(f)[0]) - 1, *ends) for ends in changes]
 
 
 def _gain_margin(loop: Loop, hz: Real, response: Complex) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hil.linear import Complex, Modal, Real
+from hil.linear import Modal, Real
 from rtloop.design.gramian import modal_root, modal_vectors, real_modal_system, system_roots
 from rtloop.design.realisation import System, beside_imaginary_axis, cascade, scaled, well_conditioned_sum
 from rtloop.design.transfer import Transfer
@@ -78,7 +78,7 @@ def reduce_order(
     kept = min(keep, balanced.hankel.size)
     bound = 2 * float(balanced.hankel[kept:].sum())
     rest = _cut(balanced, kept, direct, method)
-    return Reduced(_with_unstable(rest, unstable), _padded(balanced.hankel, transfer.order - kept_always), bound)
+    return Reduced(_with_unstable(rest, unstable), balanced.hankel, bound)
 
 
 def _parts(transfer: Transfer) -> tuple[Modal | System, Modal | None]:
@@ -136,9 +136,3 @@ def _with_unstable(rest: System, unstable: Modal | None) -> Transfer:
         a, np.concatenate([rest.b, other.b]), np.concatenate([rest.c, other.c[0]]), rest.d
     )
 
-
-def _padded(hankel: Real, size: int) -> Real:
-    return np.concatenate([hankel, np.zeros(size - hankel.size)])
-
-
-__all__ = ["Complex", "Reduced", "ReductionMethod", "hankel_singular_values", "order_for", "reduce_order"]

@@ -253,6 +253,8 @@ class AxisOptions(Options):
     feedforward: FeedforwardOptions
     controller: ControllerOptions | None = None
     model: ModelOptions | None = None
+    specification: str | None = None
+    """File, relative to the configuration's, with what the loop is asked to do; `rtloop design verify` judges it."""
     prefilter: PrefilterOptions = PrefilterOptions()
     limits: LimitsOptions = LimitsOptions()
     interlocks: InterlockOptions = InterlockOptions()

@@ -39,7 +39,7 @@ def write_page(
     bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
     time_s = next(iter(bands.values())).time_s
     data = {
-        "about": _about(recording, len(time_s)),
+        "about": _about(recording, bands),
         "problems": recording.problems,
         "time_s": _encoded(time_s, np.float64),
         "panels": _panels(recording.header["axes"], bands),
@@ -54,10 +54,12 @@ def write_page(
     return target
 
 
-def _about(recording: Recording, points: int) -> str:
+def _about(recording: Recording, bands: dict[str, Band]) -> str:
     host = recording.header.get("host", {})
-    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel")]
-    return " · ".join([*filter(None, parts), f"{points:,} points, each with the extremes of its ticks"])
+    points = len(next(iter(bands.values())).time_s)
+    each = "every tick" if all(band.thin for band in bands.values()) else "each with the extremes of its ticks"
+    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), f"{points:,} points, {each}"]
+    return " · ".join(filter(None, parts))
 
 
 def _panels(axes: list[str], bands: dict[str, Band]) -> list[dict[str, Any]]:

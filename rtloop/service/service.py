@@ -267,7 +267,8 @@ class Service:
             self.reload_now()
         except (RtloopError, DriverError) as error:
             log.error("reload refused, the old configuration stays: %s", error)
-        self.notifier.send(READY=1)
+        if self._ready:
+            self.notifier.send(READY=1)
 
     def reload_now(self) -> dict[str, Any]:
         """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""

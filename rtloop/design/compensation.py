@@ -1,0 +1,129 @@
+"""The output of the inverse compensation, y = P[P̂⁻¹[v]]: again a Prandtl-Ishlinskii operator, eqs (1)-(3) of the paper.
+
+A sum of plays is known by its initial loading curve φ, and where the inner operator's curve increases, the loading
+curve of a composition is the composition of the loading curves (Brokate & Sprekels, Hysteresis and Phase Transitions,
+1996, section 2.9; Krejčí & Kuhnen, IEE Proc. Control Theory 148, 2001). Both curves here are piecewise linear, so is
+
+    ψ(v) = φ_P(φ_P̂⁻¹(v)),     P∘P̂⁻¹[v] = Σ w_k F_ζk[v],     ζ: where ψ bends,   w: by how much its slope changes,
+
+exactly. Eq (2) splits it into ρ v + Ω(v). While |v| ≤ V ever since rest, Ω = −∫_0^V (ψ′(r) − ρ) λ′(r) dr with the
+memory curve λ(r) = F_r[v], |λ′| ≤ 1, whence
+
+    |Ω| ≤ ξ(ρ) = ∫_0^V |ψ′(r) − ρ| dr,
+
+and as every such λ can be reached, no smaller bound holds. Eq (3), |∫ r p_η(r) dr|, leaves the signs of the density
+inside the integral: it equals ξ where all of p_η has one sign, and is no bound otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.linear import Real
+from rtloop.design.plays import loading_curve, loading_slopes, model_output
+from rtloop.law.hysteresis import PlayModel
+
+SAME = 1e-9
+"""Bends closer than this part of the largest are one."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """P∘P̂⁻¹ for |v| ≤ `command_um`: `operator` has thresholds in µm and weights in µm/µm, those within reach.
+
+    `gain` is ρ as in eq (2), the sum of the weights within reach; `best_gain` the ρ of the least ξ.
+    """
+
+    operator: PlayModel
+    command_um: float
+    gain: float
+    best_gain: float
+
+    def bound_um(self, gain: float) -> float:
+        """ξ in µm for this ρ: the least number that |Ω| never exceeds."""
+        return float(np.abs(loading_slopes(self.operator) - gain) @ self._lengths)
+
+    @property
+    def printed_bound_um(self) -> float:
+        """The right side of eq (3), |Σ ζ w|; a bound only where the weights behind the first have one sign."""
+        return float(abs(self.operator.thresholds @ self.operator.weights))
+
+    @property
+    def safe_bound_um(self) -> float:
+        """Σ ζ |w|, by the triangle inequality for ρ = `gain`: simple, always valid, loose."""
+        return float(self.operator.thresholds @ np.abs(self.operator.weights))
+
+    def worst_commands_um(self, gain: float) -> Real:
+        """Turning points of v, from rest, at the last of which |Ω| = ξ for this ρ.
+
+        λ′ = −sign(ψ′ − ρ): from large r to small, each run of one sign is what one turning point of v leaves behind.
+        """
+        signs = np.where(loading_slopes(self.operator) > gain, -1.0, 1.0)
+        edges = np.append(self.operator.thresholds, self.command_um)
+        turns: list[float] = []
+        memory = 0.0
+        for i in range(signs.size - 1, -1, -1):
+            if i == signs.size - 1 or signs[i] != signs[i + 1]:
+                turns.append(memory - signs[i] * edges[i + 1])
+            memory -= signs[i] * (edges[i + 1] - edges[i])
+        return np.array(turns)
+
+    @property
+    def _lengths(self) -> Real:
+        return np.diff(self.operator.thresholds, append=self.command_um)
+
+
+def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float) -> Residual:
+    """P∘P̂⁻¹ of the actuator's model P and of the compensator in use, `inverse`, for commands up to `command_um` µm.
+
+    Raises ValueError where the compensator's loading curve does not increase, and where no command is allowed.
+    """
+    slopes = loading_slopes(inverse)
+    if inverse.thresholds[0] != 0 or not np.all(slopes > 0):
+        raise ValueError(
+            "compensator: the slopes of its loading curve must all be above 0, from a first threshold of 0; "
+            f"they are {np.array2string(slopes, precision=4)} from {inverse.thresholds[0]:g} µm on"
+        )
+    if not (np.isfinite(command_um) and command_um > 0):
+        raise ValueError(f"command_um: {command_um}; a finite number above 0 is needed")
+    bends = np.concatenate([inverse.thresholds, _commands_for(inverse, actuator.thresholds)])
+    thresholds = _distinct(bends[bends < command_um], command_um)
+    middles = 0.5 * (thresholds + np.append(thresholds[1:], command_um))
+    drives = loading_curve(inverse, middles)
+    steepness = _slope_at(actuator, drives) * _slope_at(inverse, middles)
+    operator = PlayModel(thresholds, np.diff(steepness, prepend=0.0))
+    lengths = np.diff(thresholds, append=command_um)
+    return Residual(operator, command_um, float(steepness[-1]), _weighted_median(steepness, lengths))
+
+
+def compensated(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
+    """y (samples,) for a sequence of commands v (samples,), by simulation of both models from rest."""
+    return model_output(actuator, model_output(inverse, commands_um))
+
+
+def _commands_for(inverse: PlayModel, drives: Real) -> Real:
+    """The v ≥ 0 at which the increasing curve of `inverse` reaches each of `drives`."""
+    at = loading_curve(inverse, inverse.thresholds)
+    part = np.clip(np.searchsorted(at, drives, side="right") - 1, 0, None)
+    return inverse.thresholds[part] + (drives - at[part]) / loading_slopes(inverse)[part]
+
+
+def _slope_at(model: PlayModel, points: Real) -> Real:
+    """dφ at `points`; 0 in the dead band before the first threshold."""
+    slopes = np.concatenate([[0.0], loading_slopes(model)])
+    return slopes[np.searchsorted(model.thresholds, points, side="right")]
+
+
+def _distinct(values: Real, largest: float) -> Real:
+    ordered = np.sort(values)
+    return ordered[np.concatenate([[True], np.diff(ordered) > SAME * largest])]
+
+
+def _weighted_median(values: Real, weights: Real) -> float:
+    """The ρ at which Σ weights·|values − ρ| is least."""
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(reached, 0.5 * reached[-1])])

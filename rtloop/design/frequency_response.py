@@ -1,0 +1,86 @@
+"""A frequency response measured from a recorded chirp or multisine, with coherence, beside a model's.
+
+    H₁ = S_ux / S_uu,     γ² = |S_ux|² / (S_uu S_xx)          Welch 1967; Bendat & Piersol 2010, chapter 6
+
+Where the coherence is low, noise or nonlinearity is measured and not the plant; such frequencies are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import csd, welch
+
+from hil.linear import Complex, Real
+from rtloop.design.innovations import Innovations
+from rtloop.design.measured import UnsuitableData
+
+LEAST_COHERENCE = 0.99
+SEGMENT_S = 0.8
+"""Length of a segment: a resolution of 1.25 Hz, narrower than a resonance of 595 Hz and damping 0.007."""
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """`hz`, complex `response` in output per input, `coherence`, each (k,)."""
+
+    hz: Real
+    response: Complex
+    coherence: Real
+
+    @property
+    def trusted(self) -> Real:
+        """Where the coherence suffices, (k,) of bool."""
+        return self.coherence >= LEAST_COHERENCE
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Model against measurement where it can be trusted: relative deviations of the complex response, and the peaks."""
+
+    from_hz: float
+    to_hz: float
+    median_deviation: float
+    largest_deviation: float
+    largest_at_hz: float
+    measured_peak_hz: float
+    model_peak_hz: float
+
+
+def frequency_response(u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S) -> FrequencyResponse:
+    """Of input `u` and output `x`, each (samples,), by Welch's method with Hann windows that overlap by three quarters.
+
+    Raises UnsuitableData for a recording shorter than two segments.
+    """
+    samples = round(segment_s / period_s)
+    if u.size < 2 * samples:
+        raise UnsuitableData(
+            f"{u.size * period_s:g} s; a frequency response needs at least {2 * segment_s:g} s of excitation"
+        )
+    settings = {"fs": 1 / period_s, "nperseg": samples, "noverlap": 3 * samples // 4}
+    hz, cross = csd(u, x, **settings)
+    inputs, outputs = welch(u, **settings)[1], welch(x, **settings)[1]
+    inside = (hz > 0) & (inputs > 1e-12 * inputs.max())
+    coherence = np.abs(cross[inside]) ** 2 / (inputs[inside] * np.maximum(outputs[inside], 1e-300))
+    return FrequencyResponse(hz[inside], cross[inside] / inputs[inside], coherence)
+
+
+def agreement(model: Innovations, found: FrequencyResponse) -> Agreement:
+    """The model as it is sampled, against `found`. Raises UnsuitableData where no frequency can be trusted."""
+    kept = np.asarray(found.trusted)
+    if not np.any(kept):
+        raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")
+    hz, there = found.hz[kept], found.response[kept]
+    predicted = model.discrete().response(np.exp(2j * np.pi * hz * model.period_s))[0]
+    deviation = np.abs(predicted - there) / np.abs(there)
+    worst = int(np.argmax(deviation))
+    return Agreement(
+        float(hz[0]),
+        float(hz[-1]),
+        float(np.median(deviation)),
+        float(deviation[worst]),
+        float(hz[worst]),
+        float(hz[np.argmax(np.abs(there))]),
+        float(hz[np.argmax(np.abs(predicted))]),
+    )

@@ -1,0 +1,99 @@
+"""Pictures of what was identified: the loop and its model, the response and its modes, what compensation leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.design.compensation import Residual, compensated
+from rtloop.design.frequency_response import FrequencyResponse
+from rtloop.design.identify_dynamics import DynamicsFit, Excitation
+from rtloop.design.identify_hysteresis import HysteresisFit
+from rtloop.design.measured import Measured
+from rtloop.design.plays import model_output
+from rtloop.errors import OutputError
+from rtloop.law.hysteresis import PlayModel
+from rtloop.recording.errors import MissingExtra
+
+POINTS = 20_000
+
+
+def plot_hysteresis(fit: HysteresisFit, run: Measured, output: Path) -> None:
+    """Measured and modelled loop (Fig 4 of the paper), and the error in time. Raises OutputError, MissingExtra."""
+    figure, (loop, error) = _figure(1, 2)
+    kept = slice(None, None, max(1, run.drive_v.size // POINTS))
+    drive, position = run.drive_v[:-1], run.position_um[1:] - fit.offsets_um[0]
+    model = model_output(fit.model, drive)
+    loop.plot(drive[kept], position[kept], color="tab:blue", linewidth=2, label="measured")
+    loop.plot(drive[kept], model[kept], color="0.15", linewidth=0.8, label="model")
+    _label(loop, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
+           f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
+    error.plot(np.arange(drive.size)[kept] * run.period_s, (position - model)[kept], color="tab:red", linewidth=0.8)
+    _label(error, "time / s", "measured − model / µm", f"{fit.rms_error_um:.3g} µm rms", legend=False)
+    _save(figure, output)
+
+
+def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, output: Path) -> None:
+    """Response and model in time (Fig 5 of the paper) and over frequency. Raises OutputError, MissingExtra."""
+    figure, (time, frequency) = _figure(1, 2)
+    offset = run.position_um[0]
+    count = min(run.input.size, POINTS)
+    time_s = np.arange(count) * run.period_s
+    time.plot(time_s, run.position_um[:count], color="tab:blue", linewidth=2, label="measured")
+    time.plot(time_s, (fit.model.output(run.input) + offset)[:count], color="0.15", linewidth=0.8, label="model")
+    _label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
+    if measured is not None:
+        kept = np.asarray(measured.trusted)
+        shown = np.abs(measured.response[kept])
+        frequency.loglog(measured.hz[kept], shown, ".", color="tab:blue", markersize=3, label="measured")
+    hz = np.geomspace(1.0, 0.5 / run.period_s, 4000)
+    response = fit.model.discrete().response(np.exp(2j * np.pi * hz * run.period_s))[0]
+    frequency.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
+    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
+    _label(frequency, "frequency / Hz", "position per input", modes)
+    _save(figure, output)
+
+
+def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
+    """y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
+    figure, (whole, rest) = _figure(1, 2)
+    command: Real = residual.command_um * np.sin(np.linspace(0, 5 * np.pi, 4000))
+    y = compensated(actuator, inverse, command)
+    whole.plot(command, y, color="tab:blue", linewidth=1)
+    _label(whole, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
+    bound = residual.bound_um(residual.gain)
+    rest.plot(command, y - residual.gain * command, color="tab:red", linewidth=1, label="Ω of a sine")
+    for sign in (-1, 1):
+        rest.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
+    _label(rest, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
+    _save(figure, output)
+
+
+def _figure(rows: int, columns: int) -> tuple[Any, Any]:
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns)
+
+
+def _label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
+    panel.set_xlabel(x)
+    panel.set_ylabel(y)
+    panel.set_title(title, fontsize=10)
+    panel.grid(alpha=0.3)
+    if legend:
+        panel.legend(fontsize=8)
+
+
+def _save(figure: Any, output: Path) -> None:
+    try:
+        figure.savefig(output, format="png", dpi=110)
+    except OSError as error:
+        raise OutputError(f"{output}: {error.strerror or error}") from None

@@ -1,0 +1,116 @@
+"""Identified models as sections of a configuration, with where they come from, and back."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from rtloop import __version__
+from rtloop.config import describe
+from rtloop.design.identify_dynamics import DynamicsFit
+from rtloop.design.identify_hysteresis import HysteresisFit
+from rtloop.design.measured import Measured, UnsuitableData
+from rtloop.design.toml_text import roots, section
+from rtloop.errors import ConfigError, OutputError
+from rtloop.law.hysteresis import PlayModel
+from rtloop.law.options import FeedforwardOptions
+from rtloop.recording.errors import RecordingError
+
+
+def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
+    """[axis.feedforward]. Raises UnsuitableData for weights that have no inverse."""
+    try:
+        model.without_dead_band().inverse()
+    except ValueError as fault:
+        raise UnsuitableData(f"{fault}; weights 'invertible' keep them so, fewer operators would help too") from None
+    values = {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
+    return section("axis.feedforward", values, comments)
+
+
+def model_section(fit: DynamicsFit, comments: Sequence[str]) -> str:
+    """[axis.model] as zeros, poles and gain."""
+    return section("axis.model", model_values(fit), comments)
+
+
+def model_values(fit: DynamicsFit) -> dict[str, Any]:
+    """The keys of [axis.model]."""
+    d = fit.transfer
+    return {"form": "zpk", "gain": d.gain, "zeros": roots(d.zeros), "poles": roots(d.poles)}
+
+
+def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[str]:
+    """Where the hysteresis model comes from, a line each."""
+    return [
+        f"Hysteresis, identified by rtloop {__version__} from {sources(runs)}",
+        f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
+        f"drive up to {fit.drive_v:.6g} V",
+        f"error {fit.rms_error_um:.3g} µm rms, at most {100 * fit.max_error_um / fit.range_um:.3g} % "
+        f"of {fit.range_um:.4g} µm; h/H {fit.measured_loop.percent:.2f} % measured, {fit.model_loop.percent:.2f} % model",
+    ]
+
+
+def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
+    """Where the dynamics come from, a line each."""
+    modes = (f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})" for mode in fit.modes)
+    return [
+        f"Dynamics, identified by rtloop {__version__} from {sources([run])}, input: {how}",
+        f"ARMAX of order {fit.model.order} at {1 / run.period_s:g} Hz: prediction error {fit.rms_error_um:.3g} µm rms, "
+        f"fit {fit.fit_percent:.2f} %",
+        "modes: " + ", ".join(modes),
+        f"normalised to D(0) = 1; its static gain of {fit.static_gain:.6g} is in the hysteresis",
+    ]
+
+
+def sources(runs: Sequence[Measured]) -> str:
+    """Names and digests of recordings."""
+    return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
+
+
+def with_gain(model: PlayModel, gain: float) -> PlayModel:
+    """The hysteresis with a gain put into it, so that D(0) can be 1."""
+    return PlayModel(model.thresholds, gain * model.weights)
+
+
+def read_feedforward(path: Path, axis: str | None = None) -> FeedforwardOptions:
+    """The [axis.feedforward] of a file: an identified section, or a configuration's of axis `axis` (the first).
+
+    Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
+    """
+    try:
+        content = path.read_text("utf-8")
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
+    return feedforward_of(content, str(path), axis)
+
+
+def feedforward_of(content: str, source: str, axis: str | None = None) -> FeedforwardOptions:
+    """The same, from TOML text. Raises ConfigError."""
+    try:
+        found: Any = tomllib.loads(content).get("axis")
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+    if isinstance(found, list):
+        found = next((one for one in found if isinstance(one, dict) and axis in (None, one.get("name"))), None)
+    if not isinstance(found, dict) or "feedforward" not in found:
+        raise ConfigError(source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; it is needed"])
+    try:
+        return FeedforwardOptions.model_validate(found["feedforward"])
+    except ValidationError as error:
+        raise ConfigError(source, describe(error, "axis.feedforward", found["feedforward"])) from None
+
+
+def write_new(path: Path, content: str) -> None:
+    """Write a text file, never over an existing one. Raises OutputError."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        if path.exists():
+            raise OutputError(f"{path} exists already; it is not overwritten")
+        part.write_text(content, "utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror or error}") from None

@@ -1,0 +1,103 @@
+"""What a loop achieves beside what is asked of it: a number, a limit, a verdict for each."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+
+from rtloop.design.closedloop import Loop
+from rtloop.design.margins import margins
+from rtloop.design.specification import SensorOptions, SpecificationOptions
+from rtloop.design.step import step_metrics
+
+
+class Limit(NamedTuple):
+    """At most, or at least, this much; infinite for a frequency range without end."""
+
+    value: float
+    at_most: bool
+
+    def met(self, value: float) -> bool:
+        """Whether `value` is within, but for rounding; NaN (undefined, unstable) is not."""
+        slack = 1e-9 * max(1.0, abs(self.value)) if math.isfinite(self.value) else 0.0
+        return value <= self.value + slack if self.at_most else value >= self.value - slack
+
+
+def limits(asked: SpecificationOptions) -> dict[str, Limit]:
+    """What is required, by the name of the quantity (`rtloop.design.specification.QUANTITIES`)."""
+    found: dict[str, Limit] = {}
+    for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
+                          ("bandwidth_hz", False)):  # fmt: skip
+        if (value := getattr(asked, name)) is not None:
+            found[name] = Limit(value, at_most)
+    if asked.command is not None:
+        found["peak_command"] = Limit(asked.command.command_um / asked.command.reference_um, True)
+    if asked.disturbance is not None:
+        found["disturbance_hz"] = Limit(asked.disturbance.up_to_hz or math.inf, False)
+    return found
+
+
+def specified(loop: Loop, asked: SpecificationOptions) -> dict[str, float]:
+    """The quantities that a specification is about; NaN throughout for an unstable loop."""
+    if not loop.is_stable:
+        return dict.fromkeys((*SPECIFIED, *(["disturbance_hz"] if asked.disturbance else [])), math.nan)
+    step = step_metrics(loop, ())
+    found = {
+        "static_error_percent": 100 * abs(1 / (1 + loop.static_gain)),
+        "settling_ms": 1e3 * step.settling_time_s,
+        "overshoot_percent": step.overshoot_percent,
+        "peak_command": step.peak_command,
+        "bandwidth_hz": held_up_to(loop, math.sqrt(0.5)),
+    }
+    if asked.disturbance is not None:
+        found["disturbance_hz"] = held_up_to(loop, asked.disturbance.error_um / asked.disturbance.largest_um)
+    return found
+
+
+SPECIFIED = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_command", "bandwidth_hz")
+
+
+def described(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
+    """What else there is to know: poles, margins, what the sensor's noise does."""
+    found = margins(loop)
+    name, worst = ("max_re_pole", loop.poles.real) if loop.period_s is None else ("max_abs_pole", np.abs(loop.poles))
+    return {
+        name: float(worst.max(initial=-math.inf)),
+        "crossover_hz": found.crossover_hz,
+        "phase_margin_deg": found.phase_margin_deg,
+        "gain_margin": found.gain_margin,
+        "modulus_margin": 1 / found.max_sensitivity,
+        "max_sensitivity": found.max_sensitivity,
+        "sensitivity_1hz": float(loop.sensitivity(1.0)[0]),
+        **_noise(loop, sensor),
+    }
+
+
+def held_up_to(loop: Loop, level: float) -> float:
+    """The frequency in Hz below which |S| ≤ `level`: 0 if not even at rest, infinite if everywhere."""
+    if abs(1 / (1 + loop.static_gain)) > level:
+        return 0.0
+    hz = loop.frequencies
+    above = np.flatnonzero(loop.sensitivity(hz) > level)
+    if not above.size:
+        return math.inf
+    if above[0] == 0:
+        return float(hz[0])
+    low, high = float(hz[above[0] - 1]), float(hz[above[0]])
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if loop.sensitivity(middle)[0] <= level else (low, middle)
+    return low
+
+
+def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
+    """rms in x and v of white noise at every sample, from the stationary covariance; in continuous time it has none."""
+    if loop.period_s is None or not loop.is_stable or sensor.deviation_um == 0:
+        return {}
+    a, b, c, d = loop.matrices
+    covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b)) @ c.T
+    x, v = 1e3 * sensor.deviation_um * np.sqrt(np.diag(covariance) + d**2)
+    return {"noise_x_nm": float(x), "noise_v_nm": float(v)}

@@ -1,0 +1,22 @@
+"""How far something may go before it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+
+def reach(holds: Callable[[float], bool], largest: float, step: float = 0.25, tolerance: float = 1e-4) -> float:
+    """The smallest value in (0, `largest`] at which `holds` fails: stepwise outwards, then by bisection.
+
+    `largest` where it holds throughout. `holds` is taken to be true at 0; a failure narrower than a step may be missed.
+    """
+    low = 0.0
+    while holds(min(low + step, largest)):
+        low += step
+        if low >= largest:
+            return largest
+    high = min(low + step, largest)
+    while high - low > tolerance:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low

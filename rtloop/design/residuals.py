@@ -1,0 +1,63 @@
+"""What is left over after a fit: is it white, and does it still hold something of the input?
+
+    Q = N (N + 2) Σ r_k²/(N − k)     ~ χ²(lags − unknowns of the noise model)            Ljung & Box 1978
+    √N r_εu(k)                       ~ N(0, Σ_j r_ε(j) r_u(j)), bound at 99 %             Ljung 1999, section 16.6
+
+Both are strict: with many samples of little noise they find traces that no controller would notice. The sizes say more
+than the verdicts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from hil.linear import Real
+
+LAGS = 25
+LEVEL = 0.99
+
+
+@dataclass(frozen=True)
+class ResidualTests:
+    """Largest autocorrelation (part of the variance), Q over its bound, largest cross-correlation over its bound."""
+
+    largest_autocorrelation: float
+    whiteness_ratio: float
+    largest_cross_correlation: float
+    cross_ratio: float
+
+    @property
+    def white(self) -> bool:
+        """The errors do not predict each other."""
+        return self.whiteness_ratio <= 1
+
+    @property
+    def independent(self) -> bool:
+        """The errors do not follow from the past input."""
+        return self.cross_ratio <= 1
+
+
+def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> ResidualTests:
+    """Tests of `errors` (N,) by themselves and against the changes of the input `u` (N,), at lags 1 … `lags`.
+
+    Changes of the input, because a level that lasts correlates with any slow drift.
+    """
+    change = np.diff(u, prepend=0.0)
+    own, inputs = _correlations(errors, errors, lags), _correlations(change, change, lags)
+    across = _correlations(errors, change, lags)[1:] / np.sqrt(own[0] * inputs[0] or 1.0)
+    own, inputs = own / (own[0] or 1.0), inputs / (inputs[0] or 1.0)
+    n, k = errors.size, np.arange(1, lags + 1)
+    ljung_box = n * (n + 2) * float(np.sum(own[1:] ** 2 / (n - k)))
+    variance = max(1.0 + 2 * float(own[1:] @ inputs[1:]), 1e-3)
+    bound = float(norm.ppf(0.5 + LEVEL / 2)) * np.sqrt(variance / n)
+    largest = float(np.abs(across).max())
+    limit = float(chi2.ppf(LEVEL, max(lags - unknowns // 3, 1)))
+    return ResidualTests(float(np.abs(own[1:]).max()), ljung_box / limit, largest, largest / bound)
+
+
+def _correlations(a: Real, b: Real, lags: int) -> Real:
+    """Σ a_k b_k−j, j = 0 … lags."""
+    return np.array([float(a[j:] @ b[: b.size - j]) for j in range(lags + 1)])

@@ -1,0 +1,79 @@
+"""A synthesised controller as the section [axis.controller] of a configuration, with where it comes from."""
+
+from __future__ import annotations
+
+import hashlib
+
+from hil.linear import Complex
+from rtloop import __version__
+from rtloop.design.specification import DesignOptions
+from rtloop.design.synthesise import Synthesis
+from rtloop.design.transfer import Transfer
+
+_METHODS = {"residualise": "balanced residualisation", "truncate": "balanced truncation"}
+
+
+def controller_section(found: Synthesis, design: DesignOptions, source: str, text: str) -> str:
+    """TOML, to be put below the [[axis]] it is for. `source` and `text` are the specification's name and content.
+
+    The numbers are written so that reading them gives the same bits; no date, so that the same input gives the same text.
+    """
+    lines = [*provenance(found, design, source, text)]
+    return "".join(f"# {line}\n" for line in lines) + _section(found.controller, design)
+
+
+def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
+    """Where the controller comes from, a line each."""
+    hinf, w = found.hinf, found.weights
+    order, full = found.controller.order, found.full.order
+    lines = [
+        f"Synthesised by rtloop {__version__} from {source} (SHA-256 {hashlib.sha256(text.encode()).hexdigest()[:16]}…)",
+        *(f"plant: {_formula(plant.transfer())}" for plant in [design.plant] if plant),
+        f"W1 = {_formula(w.tracking)}",
+        f"W2 = {_formula(w.command)}",
+        f"W3 = {_formula(w.disturbance)}",
+        f"H∞ (Glover & Doyle 1988): γ_opt = {hinf.gamma_opt:.6g}, γ = {hinf.gamma:.6g}, "
+        f"achieved {hinf.achieved:.6g} at order {full}",
+        "each specification is relaxed by up to γ",
+        "Hankel singular values: " + ", ".join(f"{value:.4g}" for value in found.hankel),
+    ]
+    if order < full:
+        method = _METHODS[design.synthesis.reduction]
+        lines.append(f"reduced to order {order} by {method}: achieved {found.achieved:.6g}")
+    return lines
+
+
+def _section(controller: Transfer, design: DesignOptions) -> str:
+    output = design.controller
+    prewarp = "" if output.prewarp_hz is None else f"prewarp_hz = {output.prewarp_hz!r}\n"
+    return (
+        "[axis.controller]\n"
+        'form = "zpk"\n'
+        f"gain = {controller.gain!r}\n"
+        f"zeros = {_roots(controller.zeros)}\n"
+        f"poles = {_roots(controller.poles)}\n"
+        f'method = "{output.method}"\n{prewarp}'
+    )
+
+
+def _roots(roots: Complex) -> str:
+    pairs = [f"    [{float(root.real)!r}, {float(root.imag)!r}],\n" for root in roots]
+    return "[\n" + "".join(pairs) + "]" if pairs else "[]"
+
+
+def _formula(transfer: Transfer) -> str:
+    """Gain and factors, short, for people."""
+    above = "".join(_factors(transfer.zeros)) or "1"
+    below = "".join(_factors(transfer.poles))
+    return f"{transfer.gain:.6g} {above}/{below}" if below else f"{transfer.gain:.6g}"
+
+
+def _factors(roots: Complex) -> list[str]:
+    found = []
+    for root in roots:
+        if root.imag == 0:
+            found.append(f"(s {'−' if root.real > 0 else '+'} {abs(root.real):.6g})")
+        elif root.imag > 0:
+            middle = -2 * root.real
+            found.append(f"(s² {'−' if middle < 0 else '+'} {abs(middle):.6g} s + {abs(root) ** 2:.6g})")
+    return found

@@ -1,0 +1,178 @@
+"""What a loop is asked to do, and the weights that follow from it: the models of SPEC.toml.
+
+    [plant]  [specification]  [specification.disturbance]  [specification.command]  [specification.claims]
+    [sensor]  [weights]  [synthesis]  [controller]
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from hil.options import Options
+from rtloop.design.transfer import Transfer
+from rtloop.design.weights import DisturbanceRule, Weights, command_weight, disturbance_weight, tracking_weight
+from rtloop.law.options import ModelOptions, TransferOptions
+
+
+class DisturbanceOptions(Options):
+    """A disturbance of `largest_um` at the output may leave an error of `error_um`."""
+
+    largest_um: float = Field(gt=0)
+    error_um: float = Field(gt=0)
+    up_to_hz: float | None = Field(default=None, gt=0)
+    """Up to this frequency; without it at all frequencies, as eq (18) of the paper asks."""
+
+
+class CommandOptions(Options):
+    """A step of the reference by `reference_um` may need a command v of `command_um`."""
+
+    reference_um: float = Field(gt=0)
+    command_um: float = Field(gt=0)
+
+
+class SpecificationOptions(Options):
+    """Everything may be left out; what is there is judged."""
+
+    overshoot_percent: float | None = Field(default=None, ge=0, lt=100)
+    """Over the final value."""
+    static_error_percent: float | None = Field(default=None, gt=0, lt=100)
+    settling_ms: float | None = Field(default=None, gt=0)
+    """To within 5 % of the final value."""
+    bandwidth_hz: float | None = Field(default=None, gt=0)
+    """|S| stays below 1/√2 up to here."""
+    disturbance: DisturbanceOptions | None = None
+    command: CommandOptions | None = None
+    claims: dict[str, str] = {}
+    """What the source of the controller says of it, by the name of a quantity: printed beside what was computed."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unknown = sorted(set(self.claims) - set(QUANTITIES))
+        if unknown:
+            raise ValueError(f"claims: {', '.join(unknown)} is not known; allowed are {', '.join(QUANTITIES)}")
+        return self
+
+
+QUANTITIES = {
+    "static_error_percent": ("static error", "%"),
+    "settling_ms": ("settling (5 %)", "ms"),
+    "overshoot_percent": ("overshoot", "%"),
+    "peak_command": ("peak of v per unit step", ""),
+    "bandwidth_hz": ("bandwidth, |S| < 0.71", "Hz"),
+    "disturbance_hz": ("disturbance held up to", "Hz"),
+    "max_re_pole": ("largest real part of a pole", "rad/s"),
+    "max_abs_pole": ("largest |pole| in z", ""),
+    "crossover_hz": ("crossover", "Hz"),
+    "phase_margin_deg": ("phase margin", "°"),
+    "gain_margin": ("gain margin", ""),
+    "modulus_margin": ("modulus margin", ""),
+    "max_sensitivity": ("max |S|", ""),
+    "sensitivity_1hz": ("|S| at 1 Hz", ""),
+    "noise_x_nm": ("sensor noise in x, rms", "nm"),
+    "noise_v_nm": ("sensor noise in v, rms", "nm"),
+    "gamma": ("‖F_l(P, C)‖∞", ""),
+    "resonance_shift": ("resonance may move by", "%"),
+}
+"""Label and unit of everything that is computed of a loop."""
+
+
+class SensorOptions(Options):
+    """What measures x, beyond what the plant's model contains already."""
+
+    noise_um: float = Field(default=0.0, ge=0)
+    """White, rms."""
+    resolution_um: float = Field(default=0.0, ge=0)
+    bandwidth_hz: float | None = Field(default=None, gt=0)
+    """First-order lag."""
+
+    @property
+    def deviation_um(self) -> float:
+        """Noise and rounding together, rms: a step of resolution spreads evenly, by its width over √12."""
+        return math.hypot(self.noise_um, self.resolution_um / math.sqrt(12))
+
+    def seen_through(self, plant: Transfer) -> Transfer:
+        """The plant with the sensor's lag behind it."""
+        if self.bandwidth_hz is None:
+            return plant
+        rate = 2 * math.pi * self.bandwidth_hz
+        return plant * Transfer.from_zpk([], [-rate], rate)
+
+
+class WeightOptions(Options):
+    """Weights of one's own, instead of those that the rules of the paper make of the specification."""
+
+    tracking: TransferOptions | None = None
+    command: TransferOptions | None = None
+    disturbance: TransferOptions | None = None
+    disturbance_rule: DisturbanceRule = "printed"
+
+
+class SynthesisOptions(Options):
+    """How the controller is computed and reduced."""
+
+    backoff_percent: float = Field(default=0.4, gt=0, le=100)
+    """How far above γ_opt: at γ_opt itself a pole of the controller runs off to infinity."""
+    largest_gamma: float = Field(default=5.0, gt=0)
+    """γ is the factor by which specifications are missed; beyond this they contradict each other."""
+    order: int | None = Field(default=None, ge=0)
+    """Of the reduced controller; by default the lowest that loses no more than `largest_loss_percent`."""
+    largest_loss_percent: float = Field(default=10.0, ge=0)
+    """By how much reduction may raise the norm of the weighted loop."""
+    reduction: Literal["residualise", "truncate"] = "residualise"
+
+
+class OutputOptions(Options):
+    """What is written into [axis.controller] beside the transfer function."""
+
+    method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
+    prewarp_hz: float | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.prewarp_hz is not None and self.method != "tustin":
+            raise ValueError(f"prewarp_hz is set, but method is {self.method!r}: allowed with 'tustin' only")
+        return self
+
+
+class DesignOptions(Options):
+    """SPEC.toml as a whole."""
+
+    plant: ModelOptions | None = None
+    specification: SpecificationOptions = SpecificationOptions()
+    sensor: SensorOptions = SensorOptions()
+    weights: WeightOptions = WeightOptions()
+    synthesis: SynthesisOptions = SynthesisOptions()
+    controller: OutputOptions = OutputOptions()
+
+
+def weights_of(design: DesignOptions) -> Weights:
+    """W1, W2, W3: given ones, else by the paper's rules. Raises ValueError naming what a rule lacks."""
+    given, asked = design.weights, design.specification
+    tracking = given.tracking.transfer() if given.tracking else _tracking(asked)
+    if given.command:
+        command = given.command.transfer()
+    else:
+        command = command_weight(tracking, asked.command.command_um / asked.command.reference_um if asked.command else 1)
+    if given.disturbance:
+        disturbance = given.disturbance.transfer()
+    else:
+        wanted = asked.disturbance
+        ratio = wanted.error_um / wanted.largest_um if wanted else 1.0
+        disturbance = disturbance_weight(tracking, ratio, given.disturbance_rule if wanted else "none")
+    return Weights(tracking, command, disturbance)
+
+
+def _tracking(asked: SpecificationOptions) -> Transfer:
+    """Eq (15). A given bandwidth goes before the one that a settling time asks for, 3/t rad/s."""
+    if asked.static_error_percent is None:
+        raise ValueError("specification.static_error_percent: missing; the tracking weight needs it")
+    if asked.bandwidth_hz is not None:
+        rate = 2 * math.pi * asked.bandwidth_hz
+    elif asked.settling_ms is not None:
+        rate = 3 / (1e-3 * asked.settling_ms)
+    else:
+        raise ValueError("specification.settling_ms: missing, and so is bandwidth_hz; the tracking weight needs one")
+    return tracking_weight(asked.static_error_percent / 100, rate, (asked.overshoot_percent or 0.0) / 100)

@@ -1,0 +1,137 @@
+"""From a plant and weights to a controller that can run: augmented plant, H∞ controller, reduction.
+
+Nothing here discretises: the controller is written in s, and the loop's own rate makes C(z) of it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.design.closedloop import realised
+from rtloop.design.hinf import Hinf, NoController, smallest_gamma, synthesise_hinf
+from rtloop.design.norm import hinf_norm
+from rtloop.design.normalised import normalised
+from rtloop.design.reduce import Reduced, ReductionMethod, hankel_singular_values, reduce_order
+from rtloop.design.specification import DesignOptions, weights_of
+from rtloop.design.transfer import Transfer
+from rtloop.design.weights import Weights
+
+
+class Synthesis(NamedTuple):
+    """`controller` is what should run; `achieved` the norm of the weighted loop with it, `hinf` and `full` without
+    reduction. `hankel` (n,) are the full controller's Hankel singular values.
+    """
+
+    controller: Transfer
+    full: Transfer
+    achieved: float
+    weights: Weights
+    hinf: Hinf
+    hankel: Real
+
+
+def synthesise(
+    plant: Transfer,
+    weights: Weights,
+    *,
+    order: int | None = None,
+    reduction: ReductionMethod = "residualise",
+    backoff: float = 0.004,
+    largest_loss: float = 0.1,
+) -> Synthesis:
+    """The whole chain. `order` of the reduced controller, by default the lowest whose weighted loop has a norm of at
+    most (1 + `largest_loss`)·γ. Raises NoController, ValueError for an order that leaves no stable loop.
+    """
+    standard = augmented(plant, weights)
+    found = synthesise_hinf(standard, backoff=backoff)
+    full = Transfer.from_state_space(*found.controller)
+    orders = range(full.order + 1) if order is None else [order]
+    for candidate in orders:
+        reduced, achieved = _reduced(standard, full, candidate, reduction)
+        if order is not None or achieved <= (1 + largest_loss) * found.gamma:
+            break
+    if not np.isfinite(achieved):
+        raise ValueError(
+            f"order: {order} leaves an unstable loop with method {reduction!r}; "
+            "a higher one, or none so that the lowest good one is found, would help"
+        )
+    return Synthesis(reduced.transfer, full, achieved, weights, found, hankel_singular_values(full))
+
+
+def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
+    """‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
+    a, b, c, d = realised(controller)
+    return hinf_norm(standard.closed_with(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
+
+
+def _reduced(
+    standard: GeneralisedPlant, full: Transfer, order: int, method: ReductionMethod
+) -> tuple[Reduced, float]:
+    if order >= full.order and order <= full.order:
+        return Reduced(full, np.empty(0), 0.0), weighted_norm(standard, full)
+    reduced = reduce_order(full, order, method)
+    return reduced, weighted_norm(standard, reduced.transfer)
+
+
+def synthesise_design(design: DesignOptions) -> Synthesis:
+    """From SPEC.toml. Raises ValueError for a specification that lacks something, NoController for one that contradicts
+    itself, with what would help.
+    """
+    if design.plant is None:
+        raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
+    plant, weights, how = design.plant.transfer(), weights_of(design), design.synthesis
+    _check(plant, design)
+    found = synthesise(
+        plant, weights, order=how.order, reduction=how.reduction,
+        backoff=how.backoff_percent / 100, largest_loss=how.largest_loss_percent / 100,
+    )  # fmt: skip
+    if found.hinf.gamma_opt > how.largest_gamma:
+        raise NoController(_contradiction(plant, weights, found.hinf.gamma_opt, how.largest_gamma))
+    return found
+
+
+def _check(plant: Transfer, design: DesignOptions) -> None:
+    """What no controller can do, before one is looked for. Raises NoController."""
+    asked, gain = design.specification, abs(plant.dc_gain)
+    if asked.static_error_percent is not None and gain == 0:
+        raise NoController("specification.static_error_percent: the plant's gain at 0 Hz is 0, so every error stays")
+    if asked.command is not None and asked.static_error_percent is not None:
+        held = asked.command.reference_um * (1 - asked.static_error_percent / 100) / gain
+        if asked.command.command_um < held:
+            raise NoController(
+                f"specification.command.command_um: {asked.command.command_um:g} µm cannot hold a reference of "
+                f"{asked.command.reference_um:g} µm within {asked.static_error_percent:g} % on a plant of static gain "
+                f"{gain:.6g}; at least {held:.6g} µm are needed, or a smaller reference_um"
+            )
+
+
+def _contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
+    """Which weight makes γ large: γ without each of them."""
+    w1, w2, w3 = weights
+    slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
+    without = {
+        "disturbance": Weights(w1, w2, Transfer.from_zpk([], [], 0.0)),
+        "command": Weights(w1, Transfer(w2.zeros, w2.poles, w2.gain / 100), w3),
+        "tracking (ten times slower)": Weights(slower, w2, w3),
+    }
+    gammas = {name: _gamma(plant, relaxed) for name, relaxed in without.items()}
+    worst = min(gammas, key=lambda name: gammas[name])
+    listed = ", ".join(f"{name} {value:.4g}" for name, value in gammas.items())
+    zeros = plant.zeros[plant.zeros.real > 0]
+    nearest = f"; its zero at {zeros.real.min():.4g} rad/s allows about half of that as bandwidth" if zeros.size else ""
+    return (
+        f"specification: γ_opt = {gamma:.4g}, so each would be missed by up to that factor; synthesis.largest_gamma "
+        f"allows {largest:g}. They contradict each other or the plant. With one relaxed, γ_opt is: {listed}. "
+        f"The hardest is {worst}: relax it{nearest}"
+    )
+
+
+def _gamma(plant: Transfer, weights: Weights) -> float:
+    try:
+        return smallest_gamma(normalised(augmented(plant, weights)), 1e-4)[0]
+    except NoController:
+        return float("inf")

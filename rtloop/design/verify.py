@@ -1,0 +1,191 @@
+"""A controller judged: every specification with what is required, what is achieved and a verdict, and how robust it is.
+
+Twice: in continuous time, C(s)·D(s), as it is designed; and as it will run, C(z) behind the hold and the delay, seen
+through the sensor. A controller that meets its specification on paper only does not meet it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from rtloop.design.augment import augmented
+from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
+from rtloop.design.compare import compare
+from rtloop.design.discretise import DiscreteController
+from rtloop.design.judgement import Limit, described, limits, specified
+from rtloop.design.robustness import (
+    Range,
+    changes,
+    delay_margin_us,
+    delay_ticks_tolerated,
+    maker,
+    until_missed,
+    until_unstable,
+)
+from rtloop.design.specification import QUANTITIES, DesignOptions, weights_of
+from rtloop.design.synthesise import weighted_norm
+from rtloop.design.transfer import Transfer
+from rtloop.design.weights import Weights
+
+DELAYS = (0, 1, 2)
+"""Samples of delay for which the tolerated shift of the resonance is always shown."""
+
+
+class Row(NamedTuple):
+    """One quantity; None where it is not defined in that time. `claim` is what the controller's source says."""
+
+    name: str
+    limit: Limit | None
+    continuous: float | None
+    running: float | None
+    claim: str
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return QUANTITIES[self.name][0]
+
+    @property
+    def unit(self) -> str:
+        """As it is printed."""
+        return QUANTITIES[self.name][1]
+
+    def met(self, value: float | None) -> bool | None:
+        """The verdict, None where nothing is required or nothing known."""
+        return None if self.limit is None or value is None else self.limit.met(value)
+
+
+class Robustness(NamedTuple):
+    """Percent by which each of `ranges` may move until unstable, and, as it runs, until what is met now is missed.
+
+    `shifts` is that of the resonance, by kind of time; delays are what may come on top.
+    """
+
+    ranges: dict[str, dict[str, Range | None]]
+    shifts: dict[str, Range]
+    delay_us: float
+    delay_ticks: int
+
+
+class Verification(NamedTuple):
+    """Everything found out about one axis. `weights` is None where the specification gives none."""
+
+    rows: tuple[Row, ...]
+    robustness: Robustness
+    warnings: tuple[str, ...]
+    continuous: Loop
+    running: Loop
+    delay_ticks: int
+    weights: Weights | None
+    gamma: float | None
+
+    @property
+    def missed(self) -> list[Row]:
+        """The required rows that the loop misses as it will run."""
+        return [row for row in self.rows if row.met(row.running) is False]
+
+    @property
+    def meets(self) -> bool:
+        """Stable as it will run, with every requirement met."""
+        return self.running.is_stable and not self.missed
+
+
+def verify(
+    controller: Transfer, discrete: DiscreteController, plant: Transfer, design: DesignOptions, delay_ticks: int = 0
+) -> Verification:
+    """Judge C(s), and C(z) behind `delay_ticks` samples, on a plant. Raises ValueError for one with direct feedthrough."""
+    asked, sensed = design.specification, design.sensor.seen_through(plant)
+    continuous, running = continuous_loop(controller, plant), discrete_loop(discrete, sensed, delay_ticks)
+    weights = _weights(design)
+    gamma = None if weights is None else weighted_norm(augmented(plant, weights), controller)
+    columns = [specified(loop, asked) | described(loop, design.sensor) for loop in (continuous, running)]
+    if gamma is not None:
+        columns[0]["gamma"] = gamma
+    required = limits(asked)
+    rows = tuple(
+        Row(name, required.get(name), columns[0].get(name), columns[1].get(name), asked.claims.get(name, ""))
+        for name in QUANTITIES
+        if any(name in column for column in columns)
+    )
+    robustness = _robustness(controller, discrete, plant, sensed, design, delay_ticks, rows)
+    return Verification(
+        rows, robustness, tuple(compare(controller, discrete, up_to_hz=0.2 / discrete.period_s).warnings),
+        continuous, running, delay_ticks, weights, gamma,
+    )  # fmt: skip
+
+
+def _weights(design: DesignOptions) -> Weights | None:
+    try:
+        return weights_of(design)
+    except ValueError:
+        return None
+
+
+def _robustness(
+    controller: Transfer,
+    discrete: DiscreteController,
+    plant: Transfer,
+    sensed: Transfer,
+    design: DesignOptions,
+    delay_ticks: int,
+    rows: tuple[Row, ...],
+) -> Robustness:
+    on_paper, runs = maker(controller), maker(discrete, delay_ticks)
+    met = {row.name: row.limit for row in rows if row.limit is not None and row.met(row.running)}
+    ranges = {
+        name: {
+            "continuous": until_unstable(on_paper, plant, change),
+            "running": until_unstable(runs, sensed, change),
+            "running_missed": until_missed(runs, sensed, change, design.specification, met) if met else None,
+        }
+        for name, change in changes(plant).items()
+    }
+    shifts = {}
+    if (move := changes(plant).get("resonance")) is not None:
+        shifts["continuous"] = until_unstable(on_paper, plant, move)
+        shifts |= {f"{ticks}": until_unstable(maker(discrete, ticks), sensed, move) for ticks in DELAYS}
+    more = delay_ticks_tolerated(discrete, sensed) - delay_ticks
+    return Robustness(ranges, shifts, delay_margin_us(on_paper(plant)), more)
+
+
+def as_dict(found: Verification) -> dict[str, Any]:
+    """For JSON; null for what is not defined or has no limit."""
+    robust = found.robustness
+    return {
+        "meets": found.meets,
+        "stable": {"continuous": found.continuous.is_stable, "running": found.running.is_stable},
+        "delay_ticks": found.delay_ticks,
+        "rate_hz": 1 / found.running.period_s if found.running.period_s else None,
+        "rows": [_row(row) for row in found.rows],
+        "resonance_shift_percent": {name: _percent(value) for name, value in robust.shifts.items()},
+        "robustness_percent": {
+            name: {which: value and _percent(value) for which, value in ranges.items()}
+            for name, ranges in robust.ranges.items()
+        },
+        "delay_margin_us": _number(robust.delay_us),
+        "more_delay_ticks": robust.delay_ticks,
+        "warnings": list(found.warnings),
+    }
+
+
+def _row(row: Row) -> dict[str, Any]:
+    limit = row.limit
+    return {
+        "name": row.name,
+        "unit": row.unit,
+        "required": None if limit is None else {"value": _number(limit.value), "at_most": limit.at_most},
+        "continuous": _number(row.continuous),
+        "continuous_met": row.met(row.continuous),
+        "running": _number(row.running),
+        "running_met": row.met(row.running),
+        "claim": row.claim or None,
+    }
+
+
+def _percent(found: Range) -> list[float | None]:
+    return [None if found.down is None else -found.down, found.up]
+
+
+def _number(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

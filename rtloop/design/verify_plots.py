@@ -1,0 +1,122 @@
+"""Pictures of a verification: the open loop, the sensitivities against their templates, the step.
+
+The only module of the design that draws. Templates ("gabarits" in the paper) are 1/W1 for |S| and 1/W2 for |CS|, eq (14):
+as specified, and relaxed by the factor γ that the controller reaches.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.design.closedloop import Loop
+from rtloop.design.specification import SpecificationOptions
+from rtloop.design.step import step_response
+from rtloop.design.transfer import Transfer
+from rtloop.design.verify import Verification
+from rtloop.errors import RtloopError
+
+PAPER_TIME, RUN_TIME, TEMPLATE = "tab:blue", "tab:red", "0.35"
+
+
+class MissingExtra(RtloopError):
+    """An optional package is missing; the message names what to install."""
+
+    exit_code = 78
+
+
+def pictures(found: Verification, asked: SpecificationOptions, title: str) -> dict[str, bytes]:
+    """PNG files by name: bode, sensitivity, step. Raises MissingExtra without matplotlib."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("pictures need matplotlib: pip install 'rtloop[plot]'") from None
+    drawn: dict[str, bytes] = {}
+    for name, draw in (("bode", _bode), ("sensitivity", _sensitivity), ("step", _step)):
+        figure = Figure(figsize=(10, 7), layout="constrained")
+        FigureCanvasAgg(figure)
+        panels = figure.subplots(2, 1, sharex=True)
+        draw(panels, found, asked)
+        for panel in panels:
+            panel.grid(visible=True, which="both", alpha=0.2)
+            panel.legend(fontsize=8, framealpha=0.9)
+        figure.suptitle(f"{title}: {name}", fontsize=11)
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=110)
+        drawn[name] = file.getvalue()
+    return drawn
+
+
+def _loops(found: Verification) -> list[tuple[str, Loop, str]]:
+    rate = 1 / found.running.period_s if found.running.period_s else math.nan
+    runs = f"as it runs: {rate:g} Hz, {found.delay_ticks} samples of delay"
+    return [("continuous", found.continuous, PAPER_TIME), (runs, found.running, RUN_TIME)]
+
+
+def _frequencies(loop: Loop, found: Verification) -> Real:
+    """From a thousandth of the crossover to ten times the sampling rate."""
+    hz = loop.frequencies
+    top = 10 / found.running.period_s if found.running.period_s else math.inf
+    return hz[(hz >= 1e-2) & (hz <= top)]
+
+
+def _bode(panels: Any, found: Verification, _: SpecificationOptions) -> None:
+    for label, loop, color in _loops(found):
+        hz = _frequencies(loop, found)
+        response = loop.open(hz)
+        panels[0].loglog(hz, np.abs(response), color=color, label=f"|L| {label}")
+        panels[1].semilogx(hz, np.degrees(np.unwrap(np.angle(response))), color=color, label=f"phase of L, {label}")
+    panels[0].axhline(1, color=TEMPLATE, linewidth=0.8)
+    panels[1].axhline(-180, color=TEMPLATE, linewidth=0.8, linestyle=":")
+    panels[0].set_ylabel("|L|")
+    panels[1].set_ylabel("phase / °")
+    panels[1].set_xlabel("frequency / Hz")
+
+
+def _sensitivity(panels: Any, found: Verification, _: SpecificationOptions) -> None:
+    for label, loop, color in _loops(found):
+        hz = _frequencies(loop, found)
+        panels[0].loglog(hz, loop.sensitivity(hz), color=color, label=f"|S| {label}")
+        panels[1].loglog(hz, loop.command_sensitivity(hz), color=color, label=f"|CS| {label}")
+    if found.weights is not None:
+        hz = _frequencies(found.continuous, found)
+        _template(panels[0], hz, found.weights.tracking, "W1", found.gamma)
+        _template(panels[1], hz, found.weights.command, "W2", found.gamma)
+    panels[0].set_ylabel("|S|, error per reference")
+    panels[1].set_ylabel("|CS|, command per reference")
+    panels[1].set_xlabel("frequency / Hz")
+
+
+def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | None) -> None:
+    inverse = 1 / np.abs(weight.response(2j * np.pi * hz))
+    panel.loglog(hz, inverse, color=TEMPLATE, linestyle="--", label=f"1/{name}, as specified")
+    if gamma is not None and math.isfinite(gamma):
+        panel.loglog(hz, gamma * inverse, color=TEMPLATE, linestyle=":", label=f"γ/{name}, γ = {gamma:.3g}")
+
+
+def _step(panels: Any, found: Verification, asked: SpecificationOptions) -> None:
+    shown_s = 4e-3 * (asked.settling_ms or 5.0)
+    for label, loop, color in _loops(found):
+        if not loop.is_stable:
+            panels[0].plot([], [], color=color, label=f"{label}: unstable")
+            panels[1].plot([], [], color=color, label=f"{label}: unstable")
+            continue
+        response = step_response(loop, shown_s)
+        style = {"color": color} if loop.period_s is None else {"color": color, "drawstyle": "steps-post"}
+        panels[0].plot(1e3 * response.time_s, response.position, label=f"x {label}", color=color)
+        panels[1].plot(1e3 * response.time_s, response.command, label=f"v {label}", **style)
+    panels[0].axhspan(0.95, 1.05, color="0.9", label="±5 %")
+    if asked.settling_ms is not None:
+        panels[0].axvline(asked.settling_ms, color=TEMPLATE, linestyle="--", label="settled by, as specified")
+    if asked.command is not None:
+        most = asked.command.command_um / asked.command.reference_um
+        panels[1].axhline(most, color=TEMPLATE, linestyle="--", label="largest v, as specified")
+    panels[0].set_ylabel("x per unit step")
+    panels[1].set_ylabel("v per unit step")
+    panels[1].set_xlabel("time / ms")
+    panels[1].set_xlim(0, 1e3 * shown_s)

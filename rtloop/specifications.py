@@ -1,0 +1,46 @@
+"""The specification file, checked as a whole: every fault at once, each with its key and what is allowed."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import ValidationError
+
+from rtloop.config import InputFileError, describe
+from rtloop.design.specification import DesignOptions
+from rtloop.errors import ConfigError
+
+
+class SpecificationFile(NamedTuple):
+    """A valid SPEC.toml, where it stands, and its text."""
+
+    path: Path
+    text: str
+    design: DesignOptions
+
+
+def load_specification(path: Path) -> SpecificationFile:
+    """Read and check. Raises InputFileError, or ConfigError with all faults."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputFileError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise InputFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(str(path), [f"not valid TOML: {error}"]) from None
+    try:
+        return SpecificationFile(path, text, DesignOptions.model_validate(raw))
+    except ValidationError as error:
+        raise ConfigError(str(path), describe(error, "", raw, _keys())) from None
+
+
+def _keys() -> set[str]:
+    """All keys that a specification may have, to guess at what was meant by another."""
+    schema = DesignOptions.model_json_schema()
+    parts = [schema, *schema.get("$defs", {}).values()]
+    return set().union(*(part.get("properties", {}) for part in parts))

@@ -1,0 +1,51 @@
+"""Faults on real processes, and what came of them, as a table: `make faults`. Exit code 0 if every verdict holds."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from rich.console import Console
+from rich.table import Table
+
+from tests.faults import clock, hardware, processes, requests, storage
+from tests.faults.fault import Row, measure
+
+FAULTS = (*processes.FAULTS, *hardware.FAULTS, *storage.FAULTS, *requests.FAULTS, *clock.FAULTS)
+COLUMNS = ("fault", "what must happen", "safe after", "lost / executed", "largest |drive|, step (allowed)", "verdict")
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """A row as text."""
+    measured, ticks = row.measured, row.account
+    safe = "—" if measured.safe_ms is None else (
+        f"{measured.safe_ms:.1f} ms, {measured.safe_ms * row.rate_hz / 1000:.0f} ticks"
+    )  # fmt: skip
+    drive = f"{row.largest_v:.2f} V, {row.step_v:.3f} V ({row.bound_v:.3f})"
+    verdict = f"not possible here: {row.skipped}" if row.skipped else ("holds" if not row.problems else "FAILS")
+    notes = [measured.note] if measured.note else []
+    return (row.fault.name, row.fault.must, safe, f"{ticks.lost} / {ticks.executed}", drive,
+            "; ".join([verdict, *notes, *row.problems]))  # fmt: skip
+
+
+def main() -> int:
+    """All faults, or those whose name contains one of the words given."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("words", nargs="*")
+    words = parser.parse_args().words
+    chosen = [fault for fault in FAULTS if not words or any(word in fault.name for word in words)]
+    rows = []
+    for number, fault in enumerate(chosen, start=1):
+        print(f"{number}/{len(chosen)} {fault.name}", file=sys.stderr, flush=True)
+        rows.append(measure(fault))
+        if rows[-1].problems:
+            print("   " + "\n   ".join(rows[-1].problems), file=sys.stderr, flush=True)
+    table = Table(*COLUMNS, title=f"{len(rows)} faults")
+    for row in rows:
+        table.add_row(*cells(row))
+    Console(width=200).print(table)
+    return int(any(row.problems for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

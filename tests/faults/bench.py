@@ -1,0 +1,250 @@
+"""A service on a board, both real processes in a folder of their own, and the evidence that the board keeps."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hil import board
+from hil.board import LSB_V, BoardMemory
+from rtloop.engine.memory import SharedBlock, Word
+from rtloop.errors import RtloopError
+from rtloop.service.client import Client
+from tests.faults import plain_card
+from tests.faults.configuration import ROOT, SLEW_V_PER_S, on_a_board, on_a_card
+
+START_TIMEOUT_S, TIMEOUT_S = 120.0, 20.0
+POLL_S = 0.002
+
+
+class Seen(NamedTuple):
+    """What the board says of its output; `late_s` is how late its own clock ever was."""
+
+    last_v: float
+    lowest_v: float
+    highest_v: float
+    largest_step_v: float
+    moved_ns: int
+    late_s: float
+
+    @property
+    def largest_v(self) -> float:
+        return max(-self.lowest_v, self.highest_v)
+
+
+def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = TIMEOUT_S) -> Any:
+    """The first true value of `condition`; a failure that names `what` once the time is over."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        if value := condition():
+            return value
+        time.sleep(POLL_S)
+    raise AssertionError(f"not within {timeout_s:g} s: {what}")
+
+
+class Bench:
+    """`with Bench(folder) as bench`: a service that runs in closed loop on a board, or on a plain card."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *changes: tuple[str, str],
+        card: bool = False,
+        text: str | None = None,
+        name: str = "lab",
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        self.folder, self.card, self.config = folder, card, folder / f"{name}.toml"
+        self.config.write_text(text or (on_a_card if card else on_a_board)(folder, *changes))
+        self.environment = os.environ | {
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}",
+            "RUNTIME_DIRECTORY": str(folder / "run"),
+            **(environment or {}),
+        }
+        self.client = Client(folder / "run" / f"{name}.sock")
+        self.board: subprocess.Popen[str] | None = None
+        self.service: subprocess.Popen[str] | None = None
+        self.blocks: list[SharedBlock] = []
+        self.witnessed: list[Seen] = []
+        self._started: list[subprocess.Popen[str]] = []
+        self.struck_ns = 0
+        if card:
+            plain_card.install(folder)
+
+    def __enter__(self) -> Bench:
+        try:
+            if not self.card:
+                self.start_board()
+            self.start_service()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for block in self.blocks:
+            for word in (Word.LOOP_PID, Word.RECORDER_PID):
+                if pid := int(block.words[word]):
+                    self._end_child(pid)
+        for process in self._started:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+
+    # processes
+
+    def rtloop(self, *arguments: str | Path) -> subprocess.Popen[str]:
+        """Start a command; what it says goes to a log that `log` shows."""
+        command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
+        with open(self.folder / "log", "a") as log:
+            process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log, text=True)
+        self._started.append(process)
+        return process
+
+    def start_board(self) -> None:
+        """Start the board and wait until it takes samples."""
+        self.board = self.rtloop("hil", "serve", self.config)
+        path = self.folder / "board"
+        wait_for(lambda: path.exists() and path.stat().st_size >= board.file_bytes(), "a board", START_TIMEOUT_S)
+        wait_for(lambda: self.memory.facts["magic"][0] == board.MAGIC, "a board that runs", START_TIMEOUT_S)
+
+    def start_service(self) -> None:
+        """Start the service and wait until its loop runs."""
+        self.service = self.rtloop("serve", self.config)
+        wait_for(lambda: self.status().get("ticks"), "a loop that runs", START_TIMEOUT_S)
+        self.follow()
+
+    def follow(self) -> SharedBlock:
+        """The shared block of the present loop, which stays readable after the loop's end."""
+        fd = os.open(self.folder / "run" / f"{self.config.stem}.block", os.O_RDWR | os.O_CLOEXEC)
+        self.blocks.append(SharedBlock(fd))
+        return self.blocks[-1]
+
+    def pid(self, role: str) -> int:
+        """Process of the service, of its present loop ("rt") or of its present recorder."""
+        assert self.service is not None
+        if role == "service":
+            return self.service.pid
+        return int(self.blocks[-1].words[Word.LOOP_PID if role == "rt" else Word.RECORDER_PID])
+
+    def _end_child(self, pid: int) -> None:
+        """End a loop or recorder of ours that still lives; its number may belong to somebody else by now."""
+        with suppress(OSError):
+            if str(ROOT) in Path(f"/proc/{pid}/environ").read_text() and str(self.folder) in Path(
+                f"/proc/{pid}/environ"
+            ).read_text():
+                os.kill(pid, signal.SIGKILL)
+
+    # what the service says
+
+    def status(self) -> dict[str, Any]:
+        """Of the service; empty while it does not answer."""
+        try:
+            return self.client.get("/status")
+        except RtloopError:
+            return {}
+
+    def await_state(self, state: str, *causes: str, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
+        """Wait for a state, and for trips of these causes among others."""
+        report: dict[str, Any] = {}
+
+        def there() -> bool:
+            nonlocal report
+            report = self.status()
+            return report.get("state") == state and set(causes) <= set(report.get("trip", ()))
+
+        wait_for(there, f"{state} {causes}; there is {report or self.log()[-2000:]}", timeout_s)
+        return report
+
+    def await_restart(self, count: int = 1) -> None:
+        """Wait for a new loop in place of one that ended."""
+        wait_for(lambda: self.status().get("restarts", 0) >= count and self.status().get("ticks"), "a restart")
+        self.follow()
+
+    def await_drive(self) -> None:
+        """Wait until the loop is closed and drives."""
+        wait_for(lambda: self.status().get("mode") == "closed_loop", "closed loop")
+        wait_for(lambda: abs(self.seen().last_v) > 1.0, "a drive")
+        ticks = self.ticks
+        wait_for(lambda: self.ticks > ticks + 1000, "a thousand ticks")
+
+    def recover(self) -> None:
+        """Reset, start, and see that it drives again."""
+        self.client.post("/reset")
+        self.client.post("/start")
+        self.await_drive()
+
+    @property
+    def ticks(self) -> int:
+        """Executed by the newest loop that is followed."""
+        return int(self.blocks[-1]["ticks_head"][0])
+
+    def log(self) -> str:
+        """What all processes said."""
+        return (self.folder / "log").read_text()
+
+    # what the board says
+
+    @property
+    def memory(self) -> BoardMemory:
+        """The board's memory."""
+        fd = os.open(self.folder / "board", os.O_RDWR | os.O_CLOEXEC)
+        try:
+            return BoardMemory(fd)
+        finally:
+            os.close(fd)
+
+    def seen(self) -> Seen:
+        """What the output did, read from the board."""
+        if self.card:
+            record = np.memmap(self.folder / "card", plain_card.MEMORY, "r", shape=(1,))[0]
+            late_s = 0.0
+        else:
+            memory = self.memory
+            record, late_s = memory.seen[0], float(memory.words[board.LONGEST_LATE_NS]) / 1e9
+        values = [record[name] for name in ("last_v", "lowest_v", "highest_v", "largest_step_v")]
+        return Seen(*map(float, values), int(record["moved_ns"]), late_s)
+
+    def ask_for(self, fault: int) -> None:
+        """A fault of the board or of the card."""
+        if self.card:
+            np.memmap(self.folder / "card", plain_card.MEMORY, "r+", shape=(1,))["fault"] = fault
+        else:
+            self.memory.words[board.FAULT] = fault
+
+    def strike(self, *faults: Callable[[], Any]) -> None:
+        """Bring about a fault, and remember when."""
+        self.struck_ns = time.monotonic_ns()
+        for fault in faults:
+            fault()
+
+    def await_safe(self, within_ms: float) -> float:
+        """ms from the fault until the output was at 0 V for good, by the board's own clock."""
+        wait_for(lambda: self.seen().last_v == 0.0, "a safe output")
+        took_ms = (self.seen().moved_ns - self.struck_ns) / 1e6
+        assert took_ms <= within_ms, f"safe after {took_ms:.0f} ms, allowed {within_ms:g} ms"
+        return took_ms
+
+    def witness(self) -> None:
+        """Keep what the board says now: a board that is started again forgets."""
+        self.witnessed.append(self.seen())
+
+    def step_bound_v(self, rate_hz: float, seen: Seen) -> float:
+        """What the slew allows between two looks of the board: two periods of the loop, and the board's lateness."""
+        return SLEW_V_PER_S * (2 / rate_hz + seen.late_s) + LSB_V
+
+    def stop(self) -> int:
+        """SIGTERM to the service; its exit code."""
+        assert self.service is not None
+        if self.service.poll() is None:
+            self.service.send_signal(signal.SIGTERM)
+        return self.service.wait(60.0)

@@ -1,0 +1,40 @@
+"""The wall clock is set forward and back while the loop runs.
+
+The host's own clock stays as it is: a small library put in front of libc steps CLOCK_REALTIME for these processes
+alone, by an hour, ten times a second.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from tests.faults.bench import Bench, wait_for
+from tests.faults.fault import Fault, Measured, NotPossible
+
+SOURCE = Path(__file__).with_name("stepping_clock.c")
+
+
+def stepping_clock(folder: Path) -> dict[str, str]:
+    """The environment that makes the wall clock step. Raises NotPossible without a compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise NotPossible("no C compiler for the library that steps the clock")
+    library = folder / "stepping_clock.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", library, SOURCE, "-ldl"], check=True)
+    return {"LD_PRELOAD": str(library)}
+
+
+def steps(bench: Bench) -> Measured:
+    first = int(bench.blocks[-1].words[10])
+    ticks = bench.ticks
+    bench.strike()
+    wait_for(lambda: bench.ticks > ticks + 12_000, "three seconds")
+    report = bench.status()
+    assert report["state"] == "running", report
+    assert abs(report["rate_hz"] - 4000.0) < 40.0, report
+    return Measured(note=f"started at {first / 1e9:.0f} s of a stepping clock")
+
+
+FAULTS = (Fault("clock steps ±1 h", "nothing notices", steps, environment=stepping_clock),)

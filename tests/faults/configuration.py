@@ -1,0 +1,92 @@
+"""Configurations of the fault suite: the paper's law, slower, with slew limits that bound every step of the outputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = (ROOT / "deploy" / "paper.toml").read_text(encoding="utf-8")
+LAW = PAPER[PAPER.index("[axis.feedforward]") : PAPER.index("# [axis.prefilter]")]
+"""Feed-forward, controller and model."""
+BOARD_RATE_HZ, CARD_RATE_HZ = 4000.0, 2000.0
+SLEW_V_PER_S, TRIP_SLEW_V_PER_S = 1000.0, 500.0
+
+BOARD = """
+[loop]
+rate_hz = 4000
+[driver]
+kind = "shm"
+file = "{folder}/board"
+board_rate_hz = 8000
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[driver.plant.sensor]
+um_per_v = 10.0
+noise_um = 0.010
+resolution_um = 0.010
+"""
+CARD = """
+[loop]
+rate_hz = 2000
+enable_input = "enable"
+[driver]
+kind = "plain_card"
+file = "{folder}/card"
+[driver.channels.x]
+input = "in"
+output = "out"
+um_per_v = 10.0
+"""
+CARD_LAW = """
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.controller]
+form = "zpk"
+gain = 200.0
+poles = [[0.0, 0.0]]
+[axis.model]
+form = "zpk"
+gain = 200.0
+poles = [[-200.0, 0.0]]
+"""
+LIMITS = f"""
+[axis.limits]
+slew_v_per_s = {SLEW_V_PER_S}
+trip_slew_v_per_s = {TRIP_SLEW_V_PER_S}
+[axis.interlocks]
+position_um = 60.0
+sample_age_us = 50000.0
+tracking_error_um = 5.0
+tracking_ticks = 200
+frozen_ticks = 100
+oscillation_swings = 8
+[axis.reference]
+kind = "sine"
+amplitude = 8.0
+offset = 20.0
+frequency_hz = 5.0
+[recording]
+folder = "{{folder}}/recordings"
+min_free_mib = 0.0
+"""
+
+
+def on_a_board(folder: Path, *changes: tuple[str, str]) -> str:
+    """The paper's law on a rig that is a process of its own; the drive stays between 2 V and 8 V."""
+    return _changed(BOARD + '[[axis]]\nname = "x"\n' + LAW + LIMITS, folder, changes)
+
+
+def on_a_card(folder: Path, *changes: tuple[str, str]) -> str:
+    """A first-order plant behind a third party's driver in plain Python."""
+    return _changed(CARD + '[[axis]]\nname = "x"\n' + CARD_LAW + LIMITS, folder, changes)
+
+
+def _changed(text: str, folder: Path, changes: tuple[tuple[str, str], ...]) -> str:
+    text = text.replace("{folder}", str(folder))
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    return text

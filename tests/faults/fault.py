@@ -1,0 +1,116 @@
+"""One row of the table: a fault on real processes, what must happen, and what was measured."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.faults.account import Account, account
+from tests.faults.bench import Bench
+from tests.faults.configuration import BOARD_RATE_HZ, CARD_RATE_HZ
+
+FULL_SCALE_V = 10.0
+
+
+class NotPossible(Exception):
+    """This host does not permit the fault; the message says why."""
+
+
+@dataclass
+class Measured:
+    """What a fault is judged by. A step may be exempt where the board itself, and no command, made it."""
+
+    safe_ms: float | None = None
+    lost_allowed: bool = False
+    step_exempt: str = ""
+    exit_code: int = 0
+    note: str = ""
+    extra: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """`inject` raises AssertionError where what must happen does not."""
+
+    name: str
+    must: str
+    inject: Callable[[Bench], Measured]
+    changes: tuple[tuple[str, str], ...] = ()
+    card: bool = False
+    environment: Callable[[Path], dict[str, str]] = lambda _: {}
+    around: Callable[[Path], AbstractContextManager[None]] | None = None
+    drives: bool = True
+    """Whether the loop drives before the fault comes."""
+
+
+@dataclass
+class Row:
+    """A row of the table, with the verdict: no problems."""
+
+    fault: Fault
+    measured: Measured = field(default_factory=Measured)
+    account: Account = Account(0, 0, 0, [])
+    largest_v: float = 0.0
+    step_v: float = 0.0
+    bound_v: float = 0.0
+    problems: list[str] = field(default_factory=list)
+    skipped: str = ""
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the loop."""
+        return CARD_RATE_HZ if self.fault.card else BOARD_RATE_HZ
+
+
+def measure(fault: Fault) -> Row:
+    """Bring a fault about on a bench of its own and judge what came of it."""
+    row = Row(fault)
+    with tempfile.TemporaryDirectory(prefix="rtloop-fault-") as name, _surroundings(fault, Path(name)):
+        try:
+            environment = fault.environment(Path(name))
+            with Bench(Path(name), *fault.changes, card=fault.card, environment=environment) as bench:
+                if fault.drives:
+                    bench.await_drive()
+                _judge(row, bench)
+        except NotPossible as reason:
+            row.skipped = str(reason)
+        except AssertionError as error:
+            row.problems.append(str(error))
+    return row
+
+
+@contextmanager
+def _surroundings(fault: Fault, folder: Path) -> Iterator[None]:
+    if fault.around is None:
+        yield
+    else:
+        with fault.around(folder):
+            yield
+
+
+def _judge(row: Row, bench: Bench) -> None:
+    row.measured = measured = row.fault.inject(bench)
+    row.problems += measured.extra
+    code = bench.stop()
+    if code != measured.exit_code:
+        row.problems.append(f"exit code {code}, not {measured.exit_code}; {bench.log()[-600:]}")
+    bench.witness()
+    row.largest_v = max(seen.largest_v for seen in bench.witnessed)
+    row.step_v, row.bound_v = max(zip((s.largest_step_v for s in bench.witnessed),
+                                      (bench.step_bound_v(row.rate_hz, s) for s in bench.witnessed), strict=True),
+                                  key=lambda pair: pair[0] - pair[1])  # fmt: skip
+    if bench.seen().last_v != 0.0:
+        row.problems.append(f"the output is at {bench.seen().last_v:.3f} V in the end")
+    if row.largest_v > FULL_SCALE_V:
+        row.problems.append(f"a drive of {row.largest_v:.3f} V")
+    if row.step_v > row.bound_v and not measured.step_exempt:
+        row.problems.append(f"a step of {row.step_v:.3f} V, allowed {row.bound_v:.3f} V")
+    row.account = account(bench.folder / "recordings", bench.blocks)
+    row.problems += row.account.problems
+    if row.account.lost and not measured.lost_allowed:
+        row.problems.append(f"{row.account.lost} ticks lost")
+    if "Traceback" in bench.log():
+        row.problems.append(f"a traceback: {bench.log()[-1500:]}")

@@ -1,0 +1,119 @@
+"""Faults of what hangs on the outputs and inputs: the board, a card behind plain Python, the plant."""
+
+from __future__ import annotations
+
+import signal
+
+from hil import board
+from hil.board import LSB_V
+from tests.faults import plain_card
+from tests.faults.bench import Bench, wait_for
+from tests.faults.fault import Fault, Measured
+
+STALE_MS, FROZEN_MS, AT_ONCE_MS, STALL_MS = 150.0, 250.0, 60.0, 400.0
+STUCK_S = 3.0
+STUCK = "the output itself refuses; let go, it goes to the code of 0 V at once"
+
+
+def board_killed(bench: Bench) -> Measured:
+    assert bench.board is not None
+    process = bench.board
+    bench.strike(process.kill)
+    process.wait()
+    bench.await_state("tripped", "stale")
+    wait_for(lambda: bench.memory.dac_codes[0] == 0, "a code of 0 V")
+    bench.witness()
+    bench.start_board()
+    bench.recover()
+    return Measured(note="code at 0 V; no output to look at")
+
+
+def board_paused(bench: Bench) -> Measured:
+    assert bench.board is not None
+    process = bench.board
+    bench.strike(lambda: process.send_signal(signal.SIGSTOP))
+    bench.await_state("tripped", "stale")
+    wait_for(lambda: bench.memory.dac_codes[0] == 0, "a code of 0 V")
+    process.send_signal(signal.SIGCONT)
+    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    bench.recover()
+    return Measured(note="code at 0 V while it slept")
+
+
+def input_frozen(bench: Bench) -> Measured:
+    bench.strike(lambda: bench.ask_for(board.FROZEN_INPUT))
+    took_ms = bench.await_safe(FROZEN_MS)
+    trips = bench.await_state("tripped")["trip"]
+    assert {"frozen", "stale"} & set(trips), trips
+    bench.ask_for(board.NO_FAULT)
+    bench.recover()
+    return Measured(took_ms, note=trips[0])
+
+
+def output_stuck(bench: Bench) -> Measured:
+    bench.strike(lambda: bench.ask_for(board.STUCK_OUTPUT))
+    bench.await_state("tripped", "tracking", timeout_s=STUCK_S)
+    wait_for(lambda: abs(int(bench.memory.dac_codes[0])) * LSB_V == 0.0, "a code of 0 V")
+    bench.witness()
+    bench.ask_for(board.NO_FAULT)
+    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    bench.recover()
+    return Measured(step_exempt=STUCK, note="code at 0 V; " + STUCK)
+
+
+def on_the_card(fault: int, safe_ms: float, *causes: str, new_loop: bool):
+    """A fault of the card that trips; with `new_loop` the loop's process ends too."""
+
+    def inject(bench: Bench) -> Measured:
+        bench.strike(lambda: bench.ask_for(fault))
+        took_ms = bench.await_safe(safe_ms)
+        if new_loop:
+            bench.ask_for(plain_card.NONE)
+            bench.await_restart()
+        bench.await_state("tripped", *causes)
+        bench.ask_for(plain_card.NONE)
+        bench.recover()
+        return Measured(took_ms)
+
+    return inject
+
+
+def blocks_once(bench: Bench) -> Measured:
+    ticks = bench.ticks
+    bench.strike(lambda: bench.ask_for(plain_card.BLOCK_50_MS))
+    wait_for(lambda: bench.ticks > ticks + 2000, "another second")
+    report = bench.status()
+    assert report["state"] == "running", report
+    assert report["periods_missed"] >= 90, report
+    return Measured(note=f"{report['periods_missed']} periods missed")
+
+
+def unstable(bench: Bench) -> Measured:
+    """The rig's resonance lies 5 % higher than the model's, from the beginning."""
+    report = bench.await_state("tripped", "oscillation")
+    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    largest_um = float(bench.memory.seen[0]["largest_position_um"])
+    assert largest_um < 45.0, largest_um
+    return Measured(note=f"|x| ≤ {largest_um:.1f} µm; {', '.join(report['trip'])}")
+
+
+SHIFTED = (("[driver.plant.sensor]", "[driver.plant.dynamics]\nresonance_shift = 0.05\n[driver.plant.sensor]"),)
+FAULTS = (
+    Fault("board SIGKILL", "trip: stale; goes on with another board", board_killed),
+    Fault("board SIGSTOP", "trip: stale; code to 0 V", board_paused),
+    Fault("input frozen", "trip: frozen or stale", input_frozen),
+    Fault("output stuck", "trip: tracking; code to 0 V", output_stuck),
+    Fault("input NaN", "held, then trip: non_finite",
+          on_the_card(plain_card.NAN, AT_ONCE_MS, "non_finite", new_loop=False), card=True),
+    Fault("driver raises in read", "trip, ramp, another loop",
+          on_the_card(plain_card.RAISE_IN_READ, AT_ONCE_MS, new_loop=True), card=True),
+    Fault("driver raises in write", "trip, ramp by further writes, another loop",
+          on_the_card(plain_card.RAISE_IN_WRITE, AT_ONCE_MS, new_loop=True), card=True),
+    Fault("driver blocks 50 ms", "goes on; missed periods said", blocks_once,
+          changes=(("[recording]", "[service]\nstall_ms = 200.0\n[recording]"),), card=True),
+    Fault("driver blocks for good", "loop killed, parked, another loop",
+          on_the_card(plain_card.BLOCK, STALL_MS, new_loop=True), card=True),
+    Fault("enable input opens", "trip: enable",
+          on_the_card(plain_card.ENABLE_OPEN, AT_ONCE_MS, "enable", new_loop=False), card=True),
+    Fault("unstable loop (resonance +5 %)", "trip: oscillation, |x| < 45 µm", unstable, changes=SHIFTED, drives=False),
+)  # fmt: skip

@@ -1,0 +1,80 @@
+"""A third party's driver in plain Python, and its card: a small file that outlives every process.
+
+The card holds what was written last, keeps what its output did, and brings about the fault that a test asks for.
+It is copied into a package of its own and found there by its entry point.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from drivers.base import Channel, Facts
+from drivers.python import PythonDriver
+from hil.options import Options
+
+NONE, NAN, RAISE_IN_READ, RAISE_IN_WRITE, BLOCK_50_MS, BLOCK, ENABLE_OPEN = range(7)
+MEMORY = np.dtype(
+    [("fault", np.int64), ("position_um", np.float64), ("last_v", np.float64), ("lowest_v", np.float64),
+     ("highest_v", np.float64), ("largest_step_v", np.float64), ("moved_ns", np.int64)]
+)  # fmt: skip
+UM_PER_V, LAG = 4.3, 0.1
+
+
+class CardOptions(Options):
+    file: str
+
+
+class PlainCard(PythonDriver):
+    kind = "plain_card"
+    options_model = CardOptions
+
+    @property
+    def facts(self) -> Facts:
+        return Facts((Channel("in"), Channel("enable")), (Channel("out"),), max_rate_hz=2000.0)
+
+    def start(self) -> None:
+        self.memory = np.memmap(self.options.file, MEMORY, "r+", shape=(1,))[0]
+
+    def read(self) -> tuple[float, float]:
+        memory, fault = self.memory, int(self.memory["fault"])
+        memory["position_um"] += LAG * (UM_PER_V * memory["last_v"] - memory["position_um"])
+        if fault in (NAN, RAISE_IN_READ, BLOCK_50_MS):
+            memory["fault"] = NONE  # these happen once
+        if fault == RAISE_IN_READ:
+            raise OSError("the card does not answer")
+        if fault == BLOCK_50_MS:
+            time.sleep(0.05)
+        if fault == BLOCK:
+            time.sleep(3600.0)
+        volts = float("nan") if fault == NAN else float(memory["position_um"]) / 10.0
+        return volts, 0.0 if fault == ENABLE_OPEN else 5.0
+
+    def write(self, volts: list[float]) -> None:
+        memory = self.memory
+        if memory["fault"] == RAISE_IN_WRITE:
+            memory["fault"] = NONE
+            raise OSError("the card refuses")
+        step_v = abs(volts[0] - memory["last_v"])
+        if step_v:
+            memory["moved_ns"] = time.monotonic_ns()
+        memory["largest_step_v"] = max(memory["largest_step_v"], step_v)
+        memory["lowest_v"] = min(memory["lowest_v"], volts[0])
+        memory["highest_v"] = max(memory["highest_v"], volts[0])
+        memory["last_v"] = volts[0]
+
+    def stop(self) -> None:
+        pass
+
+
+def install(folder) -> None:
+    """Put this driver into `folder` as a package that declares it."""
+    from pathlib import Path
+
+    (folder / "plain_card.py").write_text(Path(__file__).read_text())
+    metadata = folder / "plain_card-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: plain-card\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[rtloop.drivers]\nplain_card = plain_card:PlainCard\n")
+    (folder / "card").write_bytes(bytes(MEMORY.itemsize))

@@ -1,0 +1,144 @@
+"""Faults that come as requests: reloads, floods, nonsense, a second instance, an operator in a hurry."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+from pathlib import Path
+
+from rtloop.errors import RtloopError
+from tests.faults.bench import Bench, wait_for
+from tests.faults.fault import Fault, Measured
+
+RELOADS, CLIENTS, REQUESTS = 100, 8, 60
+AT_ONCE_MS = 60.0
+BAD = (
+    b"",
+    b"nonsense\r\n\r\n",
+    b"POST /mode HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n{\"mode\":1",
+    b"POST /setpoint HTTP/1.1\r\nHost: x\r\nContent-Length: 37\r\n\r\n{\"axis\": \"x\", \"value\": 1e300, \"a\": 0}",
+    b"POST /tune HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999999\r\n\r\n" + b"x" * (5 << 20),
+    b"GET /../../etc HTTP/1.1\r\nHost: x\r\n\r\n",
+    b"POST /mode HTTP/1.1\r\nContent-Length: -1\r\n\r\n",
+    bytes(range(256)) * 16,
+)  # fmt: skip
+
+
+def reload_storm(bench: Bench) -> Measured:
+    """SIGHUP a hundred times, the file good and bad by turns."""
+    good = bench.config.read_text()
+    variants = (good.replace("position_um = 60.0", "position_um = 59.0"), good.replace("rate_hz", "rat_hz"), good)
+    bench.strike()
+    for number in range(RELOADS):
+        bench.config.write_text(variants[number % len(variants)])
+        os.kill(bench.pid("service"), signal.SIGHUP)
+        threading.Event().wait(0.02)
+    bench.config.write_text(good)
+    bench.client.post("/reload")
+    assert bench.status()["state"] == "running"
+    refused = bench.log().count("reload refused")
+    assert refused > 0
+    return Measured(note=f"{refused} refused")
+
+
+def flood(bench: Bench) -> Measured:
+    """Clients that ask and change without a pause, and some that send nonsense."""
+    answered, refused = [0] * CLIENTS, [0] * CLIENTS
+
+    def ask(number: int) -> None:
+        for count in range(REQUESTS):
+            try:
+                if count % 3:
+                    bench.client.get("/status")
+                else:
+                    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 60.0}})
+                answered[number] += 1
+            except RtloopError:
+                refused[number] += 1
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(CLIENTS)]
+    bench.strike()
+    for thread in threads:
+        thread.start()
+    for data in BAD * 3:
+        send_raw(bench.client.path, data)
+    for thread in threads:
+        thread.join()
+    assert bench.await_state("running")["mode"] == "closed_loop"
+    assert sum(answered) > CLIENTS * REQUESTS // 2, (answered, refused)
+    return Measured(note=f"{sum(answered)} requests answered, {sum(refused)} refused, {3 * len(BAD)} malformed")
+
+
+def send_raw(path: Path, data: bytes) -> None:
+    """Bytes to the socket, and whatever comes back is read; a service that hangs up is right."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(0.5)
+        connection.connect(str(path))
+        try:
+            connection.sendall(data)
+            connection.recv(4096)
+        except OSError:
+            return
+
+
+def second_instance(bench: Bench) -> Measured:
+    """Once under the same name, once under another on the same board: both are refused."""
+    other = bench.folder / "other.toml"
+    other.write_text(bench.config.read_text().replace("[recording]", "[service]\nrestarts = 0\n[recording]")
+                     .replace("/recordings", "/others"))  # fmt: skip
+    bench.strike()
+    codes = [bench.rtloop("serve", config).wait(120.0) for config in (bench.config, other)]
+    assert codes == [69, 69], codes
+    assert "another service listens there" in bench.log()
+    assert "another controller drives this board" in bench.log()
+    assert bench.rtloop("park", bench.config).wait(60.0) != 0
+    assert bench.status()["state"] == "running"
+    assert bench.status()["restarts"] == 0
+    return Measured()
+
+
+def trip_and_reset(bench: Bench) -> Measured:
+    """An interlock tightened until it trips; start, mode and arm are refused until the reset; twice."""
+    took_ms = 0.0
+    for _ in range(2):
+        bench.strike(lambda: tune(bench, position_um=5.0))
+        took_ms = max(took_ms, bench.await_safe(AT_ONCE_MS))
+        bench.await_state("tripped", "position")
+        for path, body in (("/start", {}), ("/mode", {"mode": "raw"}), ("/arm", {})):
+            assert is_refused(bench, path, body), path
+        tune(bench, position_um=60.0)
+        bench.recover()
+    return Measured(took_ms)
+
+
+def tune(bench: Bench, **values: float) -> None:
+    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": values})
+
+
+def is_refused(bench: Bench, path: str, body: dict) -> bool:
+    try:
+        bench.client.post(path, body)
+    except RtloopError:
+        return True
+    return False
+
+
+def stopped_under_drive(bench: Bench) -> Measured:
+    """SIGTERM while the loop is closed: down by the ramp, and the recording is whole."""
+    assert bench.service is not None
+    service = bench.service
+    bench.strike(service.terminate)
+    took_ms = bench.await_safe(2 * AT_ONCE_MS)
+    wait_for(lambda: service.poll() is not None, "an end")
+    return Measured(took_ms)
+
+
+FAULTS = (
+    Fault("reload storm", "good ones taken, bad ones refused", reload_storm),
+    Fault("API flood and nonsense", "answered or refused; the loop goes on", flood),
+    Fault("two instances", "the second is refused, twice", second_instance),
+    Fault("operator trips and resets", "refused until the reset", trip_and_reset),
+    Fault("SIGTERM under drive", "ramp, whole recording, exit 0", stopped_under_drive),
+)
