@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench soak-recordings check install uninstall test-systemd clean
+.PHONY: run test bench faults soak-daemon soak-flood soak-recordings check install uninstall test-systemd clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -16,12 +16,27 @@ test: $(READY)
 	$(BIN)/lint-imports
 	$(BIN)/pytest
 
+# Some thirty faults on real processes, and a table of what came of them: ten minutes, as root for the full disk.
+faults: $(READY)
+	$(BIN)/python -m tests.faults
+
+# The control API under eight clients beside a paced run; the daemon on a board for an hour.
+soak-flood: $(READY)
+	$(BIN)/python -m tests.soak.api_flood
+
+soak-daemon: $(READY)
+	$(BIN)/python -m tests.soak.daemon
+
 bench: $(READY)
 	$(BIN)/python -m tests.benchmarks
 
 # Killed runs, damaged files, other processors, an hour at 10 kHz: about half an hour, 2 GB in the temporary folder.
 soak-recordings: $(READY)
 	$(BIN)/python -m tests.soak.recordings
+
+# Identification on 50 rigs drawn at random, three times: about ten minutes.
+soak-identification: $(READY)
+	$(BIN)/python -m tests.soak.identification
 
 check: $(READY)
 	$(BIN)/rtloop check deploy/paper.toml

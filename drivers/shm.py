@@ -22,7 +22,8 @@ from hil.options import RigOptions
 from hil.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype(
-    [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "adc_codes", "copied", "timespec")]
+    [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "adc_codes")]
+    + [(name, np.int64) for name in ("copied", "held", "held_ns", "timespec")]
 )
 TRIES = 1000
 NO_SAMPLE = 1
@@ -38,20 +39,25 @@ class ShmOptions(RigOptions):
 
 @cfunc(SIGNATURE)
 def shm_read(context, values):
-    """Volts of the newest sample and its age."""
+    """Volts of the newest sample and its age; those of the one before where the board stands still while it writes."""
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
     sample_ns = carray(address_pointer(card.sample_ns), 1, np.int64)
     codes = carray(address_pointer(card.adc_codes), MAX_CHANNELS, np.int64)
     copied = carray(address_pointer(card.copied), MAX_CHANNELS, np.int64)
+    held = carray(address_pointer(card.held), MAX_CHANNELS, np.int64)
     out = carray(values, card.channels + 1)
     taken_ns = latest_sample(words, sample_ns, codes, copied, card.channels, TRIES)
-    if taken_ns < 0:
+    if taken_ns >= 0:
+        card.held_ns = taken_ns
+        for i in range(card.channels):
+            held[i] = copied[i]
+    elif card.held_ns < 0:
         out[card.channels] = np.inf
         return NO_SAMPLE
     for i in range(card.channels):
-        out[i] = copied[i] * LSB_V
-    out[card.channels] = (monotonic_ns(card.timespec) - taken_ns) * 1e-3
+        out[i] = held[i] * LSB_V
+    out[card.channels] = (monotonic_ns(card.timespec) - card.held_ns) * 1e-3
     return 0
 
 
@@ -113,13 +119,18 @@ class ShmDriver(Driver):
             self._fd = None
             raise
         memory = self._memory = BoardMemory(self._fd)
-        copied, timespec = np.zeros(MAX_CHANNELS, np.int64), np.zeros(2, np.int64)
+        copied, held, timespec = (
+            np.zeros(MAX_CHANNELS, np.int64),
+            np.zeros(MAX_CHANNELS, np.int64),
+            np.zeros(2, np.int64),
+        )
         context = np.zeros(1, CONTEXT)
-        context["channels"] = len(self.wiring)
-        for name, array in (("words", memory.words), ("sample_ns", memory.sample_ns), ("dac_codes", memory.dac_codes),
-                            ("adc_codes", memory.adc_codes), ("copied", copied), ("timespec", timespec)):  # fmt: skip
+        context["channels"], context["held_ns"] = len(self.wiring), -1
+        arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "dac_codes": memory.dac_codes,
+                  "adc_codes": memory.adc_codes, "copied": copied, "timespec": timespec, "held": held}  # fmt: skip
+        for name, array in arrays.items():
             context[name] = array.ctypes.data
-        self._arrays = context, copied, timespec
+        self._arrays = context, copied, held, timespec
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
 
     def close(self) -> None:

@@ -4,7 +4,9 @@
     ├── ConfigError      78  the configuration, with every fault in it
     ├── UnavailableError 69  hardware or service not available
     ├── OutputError      73  the output cannot be written
+    ├── MissingExtra     78  an optional package is needed
     ├── RefusedError     77  refused by the host
+    ├── NoDesign          1  no controller does what is asked
     └── LoopFault         1  the loop tripped, lost data or failed
 
 Recordings add theirs in `rtloop.recording.errors`, drivers in `drivers.errors` (also 69).
@@ -42,6 +44,18 @@ class OutputError(RtloopError):
     """A file or folder cannot be written."""
 
     exit_code = 73
+
+
+class MissingExtra(RtloopError):
+    """An optional package is missing; the message names what to install."""
+
+    exit_code = 78
+
+
+class NoDesign(RtloopError):
+    """No controller does what is asked; the message says which condition fails and what would help."""
+
+    exit_code = 1
 
 
 class RefusedError(RtloopError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -86,3 +87,15 @@ def _numbers(text: str) -> npt.NDArray[np.float64]:
     """A number a line; empty lines and what follows a # do not count."""
     lines = (line.partition("#")[0].strip() for line in text.splitlines())
     return np.array([float(line) for line in lines if line])
+
+
+def reach(values: Sequence[float], samples: npt.NDArray[np.float64]) -> float:
+    """Largest magnitude that a generator can come to; 0 for an input, of which it is not known beforehand."""
+    kind = Generator(int(values[0]))
+    if kind is Generator.INPUT:
+        return 0.0
+    if kind is Generator.TABLE:
+        return float(np.max(np.abs(samples)))
+    if kind is Generator.HOLD:
+        return abs(values[1])
+    return abs(values[1]) + abs(values[5 if kind is Generator.CHIRP else 3])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sys
+import tempfile
+from pathlib import Path
 
 from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
@@ -15,6 +17,7 @@ def main() -> int:
     from rtloop.engine.rehearsal import rehearse
 
     rehearse()
+    _rehearse_others()
     if CACHE_IS_PERSISTENT:
         caches = sorted(CACHE_FOLDER.parent.iterdir(), key=lambda folder: folder.stat().st_mtime, reverse=True)
         for folder in caches[KEPT_CACHES:]:
@@ -22,6 +25,26 @@ def main() -> int:
                 shutil.rmtree(folder, ignore_errors=True)
     print(f"compiled into {CACHE_FOLDER}", file=sys.stderr)
     return 0
+
+
+def _rehearse_others() -> None:
+    """What recorder, service and board compile for themselves."""
+    import numpy as np
+
+    from drivers.shm import ShmOptions
+    from hil.board import serve
+    from rtloop.engine.commands import send
+    from rtloop.engine.memory import SharedBlock, Sizes
+    from rtloop.engine.messages import MESSAGE, Kind, message
+    from rtloop.engine.ring import drain
+    from rtloop.recording.recorder import Recorder
+
+    block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
+    Recorder(block)
+    drain(block.ring("events"), np.uint64(0), np.zeros(1, MESSAGE))
+    send(block, message(Kind.STOP))
+    with tempfile.TemporaryDirectory() as folder:
+        serve(Path(folder) / "board", ShmOptions(), ["x"], 1000.0, lambda: True)
 
 
 if __name__ == "__main__":

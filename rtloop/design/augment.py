@@ -79,7 +79,7 @@ def augmented(plant: Transfer, weights: Weights) -> GeneralisedPlant:
     g, w1, w2, w3 = (realised(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
     none_g, none_2, none_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
     error = np.concatenate([-g.c, 0 * w1.b, none_2, -w3.c])  # e without x_d and without the direct part of W3
-    a = block_diag(g.a, w1.a, w2.a, w3.a)
+    a = np.asarray(block_diag(g.a, w1.a, w2.a, w3.a), dtype=float)
     a[g.b.size : g.b.size + w1.b.size] += np.outer(w1.b, error)
     b1 = np.column_stack([
         np.concatenate([none_g, w1.b, none_2, none_3]),

@@ -10,13 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.signal import csd, welch
 
 from hil.linear import Complex, Real
 from rtloop.design.innovations import Innovations
 from rtloop.design.measured import UnsuitableData
 
-LEAST_COHERENCE = 0.99
+LEAST_COHERENCE = 0.95
 SEGMENT_S = 0.8
 """Length of a segment: a resolution of 1.25 Hz, narrower than a resonance of 595 Hz and damping 0.007."""
 
@@ -30,9 +31,9 @@ class FrequencyResponse:
     coherence: Real
 
     @property
-    def trusted(self) -> Real:
+    def trusted(self) -> npt.NDArray[np.bool_]:
         """Where the coherence suffices, (k,) of bool."""
-        return self.coherence >= LEAST_COHERENCE
+        return np.asarray(self.coherence >= LEAST_COHERENCE)
 
 
 @dataclass(frozen=True)
@@ -63,12 +64,12 @@ def frequency_response(u: Real, x: Real, period_s: float, segment_s: float = SEG
     inputs, outputs = welch(u, **settings)[1], welch(x, **settings)[1]
     inside = (hz > 0) & (inputs > 1e-12 * inputs.max())
     coherence = np.abs(cross[inside]) ** 2 / (inputs[inside] * np.maximum(outputs[inside], 1e-300))
-    return FrequencyResponse(hz[inside], cross[inside] / inputs[inside], coherence)
+    return FrequencyResponse(hz[inside], np.asarray(cross[inside] / inputs[inside], dtype=complex), coherence)
 
 
 def agreement(model: Innovations, found: FrequencyResponse) -> Agreement:
     """The model as it is sampled, against `found`. Raises UnsuitableData where no frequency can be trusted."""
-    kept = np.asarray(found.trusted)
+    kept = found.trusted
     if not np.any(kept):
         raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")
     hz, there = found.hz[kept], found.response[kept]

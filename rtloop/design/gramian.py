@@ -2,10 +2,11 @@
 
     A P + P Aᵀ + b bᵀ = 0,   P = L Lᵀ
 
-In modal coordinates P is a Cauchy matrix, P_ij = −βᵢ β̄ⱼ/(pᵢ + p̄ⱼ). Gaussian elimination keeps its form, so that each
-entry of L is a product of differences and sums of poles, accurate to a few units in the last place (Gohberg, Kailath &
-Olshevsky, Mathematics of Computation 64, 1995; Demmel, SIAM J. Matrix Anal. 21, 1999). Poles at −1 rad/s beside poles at
-−1e5 rad/s cost nothing there, where a Lyapunov solver and a Cholesky factorisation would lose the small Hankel values.
+In modal coordinates P is a Cauchy matrix, P_ij = −βᵢ β̄ⱼ/(pᵢ + p̄ⱼ). Gaussian elimination keeps its form, so that
+each entry of L is a product of differences and sums of poles, accurate to a few units in the last place (Gohberg,
+Kailath & Olshevsky, Mathematics of Computation 64, 1995; Demmel, SIAM J. Matrix Anal. 21, 1999). Poles at −1 rad/s
+beside poles at −1e5 rad/s cost nothing there, where a Lyapunov solver and a Cholesky factorisation would lose the small
+Hankel singular values.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def real_modal_system(modal: Modal) -> System:
             c.append([np.sqrt(2) * gamma.real, -np.sqrt(2) * gamma.imag])
     if not a:
         return System(np.empty((0, 0)), np.empty(0), np.empty(0), float(modal.direct[0]))
-    return System(block_diag(*a), np.concatenate(b), np.concatenate(c), float(modal.direct[0]))
+    return System(np.asarray(block_diag(*a), dtype=float), np.concatenate(b), np.concatenate(c), float(modal.direct[0]))
 
 
 def modal_vectors(modal: Modal) -> tuple[Complex, Complex]:
@@ -78,12 +79,13 @@ def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
 def _to_real(poles: Complex) -> Complex:
     """Unitary (n, n) from modal to real coordinates."""
     turn = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
-    return block_diag(*(np.eye(1) if pole.imag == 0 else turn for pole in poles if pole.imag >= 0)).astype(complex)
+    blocks = [np.eye(1) if pole.imag == 0 else turn for pole in poles if pole.imag >= 0]
+    return np.asarray(block_diag(*blocks), dtype=complex)
 
 
 def _one_root(wide: Real) -> Real:
     """L (n, n), lower triangular, with L Lᵀ = wide·wideᵀ."""
-    return np.linalg.qr(wide.T, mode="r").T
+    return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=float).T
 
 
 def _root_of(gramian: Real) -> Real:

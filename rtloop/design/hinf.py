@@ -1,8 +1,9 @@
 """H∞ synthesis: the controller that keeps the loop from w to z below γ, and the smallest γ for which there is one.
 
-The general formulas (D11 ≠ 0, D22 ≠ 0) of Glover & Doyle, Systems & Control Letters 11, 1988, as in Zhou, Doyle & Glover,
-Robust and Optimal Control, 1996, theorem 17.1; the state-space idea is Doyle, Glover, Khargonekar & Francis, IEEE TAC
-34, 1989. Two Riccati equations decide whether a γ can be reached, and bisection finds the smallest that can.
+The general formulas (D11 ≠ 0, D22 ≠ 0) of Glover & Doyle, Systems & Control Letters 11, 1988, as in Zhou, Doyle &
+Glover, Robust and Optimal Control, 1996, theorem 17.1; the state-space idea is that of Doyle, Glover, Khargonekar &
+Francis, IEEE TAC 34, 1989. Two Riccati equations decide whether a γ can be reached, and bisection finds the smallest
+that can.
 
 At γ_opt itself I − γ⁻²·Y·X is singular, and the controller has a pole that runs off to infinity: ask for a little more.
 """
@@ -121,7 +122,7 @@ def _solve(normal: Normalised, gamma: float) -> _Solutions:
         raise NoController(f"coupling: the spectral radius of X∞·Y∞ must stay below γ² ({radius:.6g} ≥ {gamma**2:.6g})")
     f = -np.linalg.solve(r, d_row.T @ c1 + b.T @ x)
     injection = -np.linalg.solve(r_dual.T, (b1 @ d_column.T + y @ c.T).T).T
-    return _Solutions(x, y, f, injection)
+    return _Solutions(x, y, np.asarray(f, float), np.asarray(injection, float))
 
 
 def _corner(gamma: float, count: int, size: int) -> Real:

@@ -46,7 +46,7 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     time.plot(time_s, (fit.model.output(run.input) + offset)[:count], color="0.15", linewidth=0.8, label="model")
     _label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
     if measured is not None:
-        kept = np.asarray(measured.trusted)
+        kept = measured.trusted
         shown = np.abs(measured.response[kept])
         frequency.loglog(measured.hz[kept], shown, ".", color="tab:blue", markersize=3, label="measured")
     hz = np.geomspace(1.0, 0.5 / run.period_s, 4000)

@@ -50,7 +50,7 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[
         f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
         f"drive up to {fit.drive_v:.6g} V",
         f"error {fit.rms_error_um:.3g} µm rms, at most {100 * fit.max_error_um / fit.range_um:.3g} % "
-        f"of {fit.range_um:.4g} µm; h/H {fit.measured_loop.percent:.2f} % measured, {fit.model_loop.percent:.2f} % model",
+        f"of {fit.range_um:.4g} µm; h/H {fit.measured_loop.percent:.2f} %, of the model {fit.model_loop.percent:.2f} %",
     ]
 
 

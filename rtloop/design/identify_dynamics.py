@@ -16,36 +16,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from hil.linear import Complex, Modal, Real
+from hil.linear import Real
 from rtloop.design.innovations import Innovations
-from rtloop.design.markov import HANKEL_ROWS, Guesses, impulse_response, with_residues
+from rtloop.design.inverse_hold import held_from
 from rtloop.design.measured import UnsuitableData
+from rtloop.design.prediction_error import LARGEST_ORDER, WORTH, Excitation, excited_order, fitted_models, rms_error
 from rtloop.design.realisation import system_of
 from rtloop.design.residuals import ResidualTests, residual_tests
 from rtloop.design.transfer import Transfer
 from rtloop.design.zeros import zeros_and_gain
 
 Criterion = Literal["aic", "validation"]
-
-LARGEST_ORDER = 8
-WORTH = 0.01
-"""A higher order must lower the rms prediction error by more than this part; noise never fits exactly equally."""
-LEAST_EXCITATION = 1e-7
-"""Singular value of the lagged inputs, relative to the largest, below which a direction was not excited."""
-EVALUATIONS = 20
-USELESS = 1e6
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """Input (µm, or V) and position (µm) at equal intervals, each (samples,), from rest."""
-
-    name: str
-    input: Real
-    position_um: Real
-    period_s: float
 
 
 @dataclass(frozen=True)
@@ -107,105 +89,19 @@ def identify_dynamics(
         )
     centred = replace(run, position_um=run.position_um - run.position_um[0])
     orders = [order] if order else range(1, min(largest_order, excited) + 1)
-    fitted = _fitted(centred, orders)
+    fitted = fitted_models(centred, orders)
     if not fitted:
-        raise UnsuitableData(f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed")
+        raise UnsuitableData(
+            f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed"
+        )
     candidates = [_candidate(model, centred, validation) for model in fitted]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
     best = _chosen(candidates, score, by_aic=criterion == "aic")
     return _described(fitted[best], centred, tuple(candidates))
 
 
-def excited_order(run: Excitation) -> int:
-    """Poles that the input can tell apart: half the directions of its lagged copies (Ljung 1999, section 13.2)."""
-    lags = 2 * LARGEST_ORDER + 2
-    lagged = np.array([np.concatenate([np.zeros(i), run.input[: run.input.size - i]]) for i in range(lags)])
-    sizes = np.linalg.svd(lagged @ lagged.T, compute_uv=False)
-    return int((sizes > LEAST_EXCITATION**2 * sizes[0]).sum()) // 2
-
-
-def continuous_modes(discrete: Modal, period_s: float) -> Modal:
-    """The sum in s whose zero-order hold `discrete` is. Raises ValueError for a mode at z ≤ 0, which has none."""
-    if np.any((discrete.poles.imag == 0) & (discrete.poles.real <= 0)):
-        raise ValueError("a real mode at z ≤ 0 has no counterpart in continuous time")
-    rates = np.log(discrete.poles) / period_s
-    return held_from(rates, discrete.residues, discrete.direct, period_s)
-
-
-def held_from(rates: Complex, residues: Complex, direct: Real, period_s: float) -> Modal:
-    """The sum in s with poles `rates` (n,) whose zero-order hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
-    x = rates * period_s
-    held = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
-    return Modal(rates, residues / (period_s * held), direct)
-
-
-def _fitted(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
-    """Models of increasing order, until two more poles in turn do not pay."""
-    guesses = Guesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
-    found: list[Innovations] = []
-    errors: list[float] = []
-    for order in orders:
-        start = guesses.model(order)
-        if start is None and found and found[-1].order == order - 1:
-            start = _grown(found[-1])
-        model = start and _refined(with_residues(start, run.input, run.position_um), run)
-        if model is None:
-            continue
-        found.append(model)
-        errors.append(_rms(model, run))
-        if len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
-            break
-    return found
-
-
-def _grown(model: Innovations) -> Innovations:
-    """One fast real pole more."""
-    return Innovations(
-        model.period_s,
-        np.append(model.rates, -1 / model.period_s),
-        np.append(model.residues, 0.0),
-        np.append(model.noise_gains, 0.0),
-        model.offset,
-    )
-
-
-def _refined(model: Innovations, run: Excitation) -> Innovations | None:
-    """The nearest least sum of squared prediction errors: first without noise model, then with; None if unstable."""
-    for noise in (False, True):
-        model = _descended(model, run, noise=noise)
-    return model if np.all(model.rates.real < 0) and _has_counterpart(model) else None
-
-
-def _descended(model: Innovations, run: Excitation, *, noise: bool) -> Innovations:
-    def errors(values: Real) -> Real:
-        tried = model.unpack(values, noise=noise)
-        if np.any(np.abs(tried.images) >= 1) or (found := tried.errors(run.input, run.position_um)) is None:
-            return np.full(run.input.size, USELESS)
-        return np.clip(np.nan_to_num(found, nan=USELESS), -USELESS, USELESS)
-
-    def jacobian(values: Real) -> Real:
-        tried = model.unpack(values, noise=noise)
-        return tried.sensitivities(run.input, errors(values), noise=noise).T
-
-    found = least_squares(
-        errors, model.pack(noise=noise), jacobian, x_scale="jac", xtol=1e-8, ftol=1e-8, gtol=1e-15, max_nfev=EVALUATIONS
-    )
-    return model.unpack(found.x, noise=noise)
-
-
-def _has_counterpart(model: Innovations) -> bool:
-    """Rates stay below half the sampling rate, so that log(z) finds them again."""
-    return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
-
-
-def _rms(model: Innovations, run: Excitation) -> float:
-    errors = model.errors(run.input, run.position_um)
-    assert errors is not None
-    return float(np.sqrt(np.mean(errors**2)))
-
-
 def _candidate(model: Innovations, run: Excitation, validation: Sequence[Excitation]) -> Candidate:
-    rms = _rms(model, run)
+    rms = rms_error(model, run)
     unknowns = model.pack(noise=True).size
     return Candidate(
         model.order, rms, 2 * np.log(rms) + 2 * unknowns / run.input.size, _validation_rms(model, validation)
@@ -251,7 +147,7 @@ def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate,
 
 
 def _modes(model: Innovations, run: Excitation, errors: Real) -> tuple[Mode, ...]:
-    """Poles with their standard deviations: σ²(ΨΨᵀ)⁻¹ (Ljung 1999, section 9.4), by derivatives of |s| and −Re s/|s|."""
+    """Poles with their standard deviations: σ²(ΨΨᵀ)⁻¹ (Ljung 1999, section 9.4), for |s| and −Re s/|s|."""
     rows = model.sensitivities(run.input, errors, noise=True)
     scale = np.linalg.norm(rows, axis=1)
     scale[scale == 0] = 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -34,22 +35,19 @@ def loop_shape(drive: Real, output: Real) -> LoopShape:
     if turns.size < 2:
         return LoopShape(np.nan, float(np.ptp(output)))
     ends = [*turns.tolist(), drive.size - 1]
-    branches = [slice(start, end + 1) for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    branches = [slice(start, end + 1) for start, end in pairwise(ends)]
     whole = [part for part in branches if np.ptp(drive[part]) > 0.98 * span]
     last = whole[-2:] if len(whole) >= 2 else branches[-2:]
     edges = np.linspace(drive.min(), drive.max(), BINS + 1)
-    first, second = (_means(drive[part], output[part], edges) for part in last)
-    inner = slice(1, -1)
-    return LoopShape(float(np.nanmax(np.abs(first - second)[inner])), float(np.nanmax(output) - np.nanmin(output)))
+    first, second = (_branch(drive[part], output[part], edges) for part in last)
+    whole_loop = output[last[0].start : last[-1].stop]
+    return LoopShape(float(np.abs(first - second)[1:-1].max()), float(np.ptp(whole_loop)))
 
 
-def _means(drive: Real, output: Real, edges: Real) -> Real:
-    """Mean output at each bin's centre: the drive's own mean in the bin is corrected by the branch's slope."""
+def _branch(drive: Real, output: Real, edges: Real) -> Real:
+    """Output at the bins' edges, straight between the means of the bins: on a straight piece these lie on it."""
     bins = np.clip(np.digitize(drive, edges) - 1, 0, BINS - 1)
-    counts = np.bincount(bins, minlength=BINS).astype(float)
-    counts[counts == 0] = np.nan
-    centres = 0.5 * (edges[:-1] + edges[1:])
-    means = np.bincount(bins, output, BINS) / counts
-    drives = np.bincount(bins, drive, BINS) / counts
-    slope = np.gradient(means, drives)
-    return means + slope * (centres - drives)
+    counts = np.bincount(bins, minlength=BINS)
+    kept = counts > 0
+    means, drives = (np.bincount(bins, values, BINS)[kept] / counts[kept] for values in (output, drive))
+    return np.interp(edges, drives, means)

@@ -10,7 +10,7 @@ few modes that its impulse response is made of.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import hankel, lstsq
+from scipy.linalg import hankel
 from scipy.signal import lfilter
 
 from hil.linear import Complex, Real
@@ -26,8 +26,7 @@ def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> R
     """g_1 … g_length of y = Σ g_i u_k−i, by least squares of an ARX model of order `order`, from rest."""
     delayed = np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in (y, u) for i in range(1, order + 1)])
     columns = np.vstack([delayed, np.ones(y.size)]).T
-    solution = lstsq(columns, y, cond=1e-12, lapack_driver="gelsy")[0]
-    assert solution is not None
+    solution, *_ = np.linalg.lstsq(columns, y, rcond=1e-12)
     pulse = np.zeros(length + 1)
     pulse[0] = 1.0
     return np.asarray(lfilter([0.0, *solution[order:-1]], [1.0, *-solution[:order]], pulse), dtype=float)[1:]
@@ -50,7 +49,7 @@ class Guesses:
         images = images[images.imag >= 0]
         images = np.where(np.abs(images) >= 1, images * (0.9999 / np.abs(images)), images)
         nothing = np.zeros(images.size, dtype=complex)
-        return Innovations(self._period_s, np.log(images) / self._period_s, nothing, nothing)
+        return Innovations(self._period_s, (np.log(images) / self._period_s).astype(complex), nothing, nothing)
 
     def _images(self, order: int) -> Complex:
         """Eigenvalues of the shift along the Hankel matrix's dominant column space."""

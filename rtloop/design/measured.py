@@ -115,16 +115,16 @@ def _refuse_trip(path: Path, flags: Real) -> None:
         return
     first = int(np.argmax(np.isin(flags, np.unique(flags)[tripped])))
     raise UnsuitableData(
-        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); a run to the end is needed: "
-        "a smaller drive, or interlocks that allow this one"
+        f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); one to the end is needed "
+        "(a smaller drive, or interlocks that allow this one)"
     )
 
 
 def _axis(recording: Recording, axis: str | None, path: Path) -> str:
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:
-        return axes[0]
-    if axis not in axes:
+        return str(axes[0])
+    if axis is None or axis not in axes:
         raise RecordingError(f"{path}: axis {axis!r}; it holds {', '.join(axes) or 'none'}: --axis says which")
     return axis
 

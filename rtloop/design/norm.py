@@ -1,8 +1,8 @@
 """The H∞ norm of a stable system: the largest singular value of its frequency response.
 
-Bruinsma & Steinbuch 1990 (after Boyd, Balakrishnan & Kabamba 1989): γ is exceeded somewhere if and only if a Hamiltonian
-matrix has eigenvalues on the imaginary axis, and those are the frequencies at which a singular value crosses γ. Between
-two of them lies a higher point; a few rounds find the peak, however narrow.
+Bruinsma & Steinbuch 1990 (after Boyd, Balakrishnan & Kabamba 1989): γ is exceeded somewhere if and only if a
+Hamiltonian matrix has eigenvalues on the imaginary axis, and those are the frequencies at which a singular value
+crosses γ. Between two of them lies a higher point; a few rounds find the peak, however narrow.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
 
 
 def _gains(system: Matrices, omega: Real) -> Peak:
-    values = np.linalg.norm(system.response(1j * omega), 2, axis=(1, 2))
+    values = np.linalg.norm(system.response((1j * omega).astype(complex)), 2, axis=(1, 2))
     return max(Peak(float(value), float(at)) for value, at in zip(values, omega, strict=True))
 
 

@@ -16,7 +16,7 @@ from rtloop.design.augment import GeneralisedPlant, Matrices
 
 
 class Normalised(NamedTuple):
-    """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back, with the `direct` part D22 left out."""
+    """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back, without the `direct` part D22."""
 
     a: Real
     b1: Real

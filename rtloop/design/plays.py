@@ -8,6 +8,8 @@ Krasnosel'skii & Pokrovskii, Systems with Hysteresis, 1989; Kuhnen, European Jou
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import numpy.typing as npt
 
@@ -20,15 +22,15 @@ def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike) -> Real:
 
     While the drive does not turn back, the formula holds for all samples at once with the state before the first.
     """
-    u, r = np.asarray(drive, dtype=float), np.asarray(thresholds, dtype=float)
+    u, r = np.concatenate([[0.0], np.asarray(drive, dtype=float)]), np.asarray(thresholds, dtype=float)
     outputs = np.empty((u.size, r.size))
     last = np.zeros(r.size)
     bounds = [0, *(_reversals(u) + 1).tolist(), u.size]
-    for start, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for start, end in pairwise(bounds):
         part = u[start:end, None]
         outputs[start:end] = np.maximum(part - r, np.minimum(part + r, last))
-        last = outputs[end - 1] if end else last
-    return outputs
+        last = outputs[end - 1]
+    return outputs[1:]
 
 
 def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
@@ -37,7 +39,7 @@ def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
 
 
 def turning_points(drive: Real, least: float) -> npt.NDArray[np.intp]:
-    """Where the drive turned back by at least `least`: its alternating highest and lowest samples."""
+    """Where the drive turned back by at least `least`: its alternating highest and lowest samples, not the first."""
     found: list[int] = []
     candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
     low = high = 0
@@ -50,7 +52,7 @@ def turning_points(drive: Real, least: float) -> npt.NDArray[np.intp]:
         elif drive[k] >= drive[low] + least:
             found += [low] if not found or drive[found[-1]] > drive[low] else []
             low = high = k
-    return np.array(found, dtype=np.intp)
+    return np.array([k for k in found if k], dtype=np.intp)
 
 
 def loading_slopes(model: PlayModel) -> Real:

@@ -5,7 +5,8 @@
 Moore, IEEE TAC 26, 1981, by the square-root method (Tombs & Postlethwaite, Int. J. Control 46, 1987). Of the balanced
 states the first are kept. Truncation leaves the others out, which keeps C(∞); residualisation lets them follow at once
 (Fernando & Nicholson, IEEE TAC 27, 1982), which keeps C(0), and is what a controller near an integrator needs. Both
-differ from the original by at most 2 Σ σ_k over the states left out, at any frequency (Glover, Int. J. Control 39, 1984).
+differ from the original by at most 2 Σ σ_k over the states left out, at any frequency (Glover, Int. J. Control 39,
+1984).
 """
 
 from __future__ import annotations
@@ -132,7 +133,4 @@ def _with_unstable(rest: System, unstable: Modal | None) -> Transfer:
     other = unstable.realise()
     n, m = rest.b.size, other.b.size
     a = np.block([[rest.a, np.zeros((n, m))], [np.zeros((m, n)), other.a]])
-    return Transfer.from_state_space(
-        a, np.concatenate([rest.b, other.b]), np.concatenate([rest.c, other.c[0]]), rest.d
-    )
-
+    return Transfer.from_state_space(a, np.concatenate([rest.b, other.b]), np.concatenate([rest.c, other.c[0]]), rest.d)

@@ -1,7 +1,7 @@
 """What is left over after a fit: is it white, and does it still hold something of the input?
 
     Q = N (N + 2) Σ r_k²/(N − k)     ~ χ²(lags − unknowns of the noise model)            Ljung & Box 1978
-    √N r_εu(k)                       ~ N(0, Σ_j r_ε(j) r_u(j)), bound at 99 %             Ljung 1999, section 16.6
+    √N r_εu(k)                       ~ N(0, Σ_j r_ε(j) r_u(j)), bound at 99 % for all lags together             Ljung 1999, section 16.6
 
 Both are strict: with many samples of little noise they find traces that no controller would notice. The sizes say more
 than the verdicts.
@@ -52,7 +52,7 @@ def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> Re
     n, k = errors.size, np.arange(1, lags + 1)
     ljung_box = n * (n + 2) * float(np.sum(own[1:] ** 2 / (n - k)))
     variance = max(1.0 + 2 * float(own[1:] @ inputs[1:]), 1e-3)
-    bound = float(norm.ppf(0.5 + LEVEL / 2)) * np.sqrt(variance / n)
+    bound = float(norm.ppf(1 - (1 - LEVEL) / (2 * lags))) * np.sqrt(variance / n)
     largest = float(np.abs(across).max())
     limit = float(chi2.ppf(LEVEL, max(lags - unknowns // 3, 1)))
     return ResidualTests(float(np.abs(own[1:]).max()), ljung_box / limit, largest, largest / bound)

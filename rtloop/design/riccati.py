@@ -2,8 +2,8 @@
 
     AᵀX + X A + X R X + Q = 0,     H = [A R; −Q −Aᵀ]
 
-X exists where H has no eigenvalue on the imaginary axis and its stable subspace is the graph of a matrix (Doyle, Glover,
-Khargonekar & Francis 1989, section II; Laub 1979 for the ordered Schur form). R and Q need not be definite.
+X exists where H has no eigenvalue on the imaginary axis and its stable subspace is the graph of a matrix (Doyle,
+Glover, Khargonekar & Francis 1989, section II; Laub 1979 for the ordered Schur form). R and Q need not be definite.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ class NoSolution(Exception):
 def stabilising_solution(hamiltonian: Real) -> Real:
     """X (n, n), symmetric and ≥ 0, of a Hamiltonian matrix (2n, 2n). Raises NoSolution.
 
-    The states are scaled by powers of two first, alike for X and its dual, so that H stays Hamiltonian: time constants of
-    a second beside some of ten microseconds are ordinary here.
+    The states are scaled by powers of two first, and their duals inversely, so that H stays Hamiltonian: time constants
+    of a second beside some of ten microseconds are ordinary here.
     """
     n = hamiltonian.shape[0] // 2
     scale = _scale(hamiltonian)
     both = np.concatenate([scale, 1 / scale])
     balanced = hamiltonian * both / both[:, None]
     try:
-        form, vectors, stable = schur(balanced, sort="lhp")
+        form, vectors, stable = schur(balanced, sort="lhp")  # pyright: ignore[reportAssignmentType]
     except np.linalg.LinAlgError:  # an eigenvalue that reordering pushes over the axis is on it
         raise NoSolution("imaginary axis") from None
     if stable != n or np.min(np.abs(np.diag(form)), initial=np.inf) <= 1e-14 * np.linalg.norm(balanced):

@@ -57,13 +57,13 @@ def with_damping_changed(plant: Transfer, percent: float) -> Transfer:
 
 def changes(plant: Transfer) -> dict[str, Change]:
     """What may move: the resonance, if there is one, its damping, the gain."""
-    found = {"gain": Change(with_gain_changed, 99.9, 900.0, 5.0)}
+    found = {"gain": Change(with_gain_changed, 99.9, 900.0, 10.0)}
     if np.any(plant.poles.imag > 0):
         pair = lightest_pair(plant)
         most = 100 * (0.999 * abs(pair) / -pair.real - 1) if pair.real < 0 else 0.0
         found = {
             "resonance": Change(with_resonance_shifted, 50.0, 50.0, 0.25),
-            "damping": Change(with_damping_changed, 99.9, min(900.0, most), 5.0),
+            "damping": Change(with_damping_changed, 99.9, min(900.0, most), 10.0),
             **found,
         }
     return found

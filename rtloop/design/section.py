@@ -16,7 +16,7 @@ _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced tru
 def controller_section(found: Synthesis, design: DesignOptions, source: str, text: str) -> str:
     """TOML, to be put below the [[axis]] it is for. `source` and `text` are the specification's name and content.
 
-    The numbers are written so that reading them gives the same bits; no date, so that the same input gives the same text.
+    Reading the numbers gives the same bits again; without a date, the same input gives the same text.
     """
     lines = [*provenance(found, design, source, text)]
     return "".join(f"# {line}\n" for line in lines) + _section(found.controller, design)
@@ -26,8 +26,9 @@ def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) 
     """Where the controller comes from, a line each."""
     hinf, w = found.hinf, found.weights
     order, full = found.controller.order, found.full.order
+    digest = hashlib.sha256(text.encode()).hexdigest()
     lines = [
-        f"Synthesised by rtloop {__version__} from {source} (SHA-256 {hashlib.sha256(text.encode()).hexdigest()[:16]}…)",
+        f"Synthesised by rtloop {__version__} from {source} (SHA-256 {digest[:16]}…)",
         *(f"plant: {_formula(plant.transfer())}" for plant in [design.plant] if plant),
         f"W1 = {_formula(w.tracking)}",
         f"W2 = {_formula(w.command)}",

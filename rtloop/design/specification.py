@@ -1,7 +1,7 @@
 """What a loop is asked to do, and the weights that follow from it: the models of SPEC.toml.
 
-    [plant]  [specification]  [specification.disturbance]  [specification.command]  [specification.claims]
-    [sensor]  [weights]  [synthesis]  [controller]
+[plant]  [specification]  [specification.disturbance]  [specification.command]  [specification.claims]
+[sensor]  [weights]  [synthesis]  [controller]
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class SpecificationOptions(Options):
     """|S| stays below 1/√2 up to here."""
     disturbance: DisturbanceOptions | None = None
     command: CommandOptions | None = None
-    claims: dict[str, str] = {}
+    claims: dict[str, str] = Field(default_factory=dict)
     """What the source of the controller says of it, by the name of a quantity: printed beside what was computed."""
 
     @model_validator(mode="after")
@@ -74,7 +74,6 @@ QUANTITIES = {
     "noise_x_nm": ("sensor noise in x, rms", "nm"),
     "noise_v_nm": ("sensor noise in v, rms", "nm"),
     "gamma": ("‖F_l(P, C)‖∞", ""),
-    "resonance_shift": ("resonance may move by", "%"),
 }
 """Label and unit of everything that is computed of a loop."""
 
@@ -155,7 +154,8 @@ def weights_of(design: DesignOptions) -> Weights:
     if given.command:
         command = given.command.transfer()
     else:
-        command = command_weight(tracking, asked.command.command_um / asked.command.reference_um if asked.command else 1)
+        moderation = asked.command.command_um / asked.command.reference_um if asked.command else 1.0
+        command = command_weight(tracking, moderation)
     if given.disturbance:
         disturbance = given.disturbance.transfer()
     else:

@@ -15,7 +15,7 @@ from rtloop.design.closedloop import realised
 from rtloop.design.hinf import Hinf, NoController, smallest_gamma, synthesise_hinf
 from rtloop.design.norm import hinf_norm
 from rtloop.design.normalised import normalised
-from rtloop.design.reduce import Reduced, ReductionMethod, hankel_singular_values, reduce_order
+from rtloop.design.reduce import ReductionMethod, hankel_singular_values, reduce_order
 from rtloop.design.specification import DesignOptions, weights_of
 from rtloop.design.transfer import Transfer
 from rtloop.design.weights import Weights
@@ -49,17 +49,18 @@ def synthesise(
     standard = augmented(plant, weights)
     found = synthesise_hinf(standard, backoff=backoff)
     full = Transfer.from_state_space(*found.controller)
-    orders = range(full.order + 1) if order is None else [order]
-    for candidate in orders:
-        reduced, achieved = _reduced(standard, full, candidate, reduction)
-        if order is not None or achieved <= (1 + largest_loss) * found.gamma:
-            break
-    if not np.isfinite(achieved):
+    allowed = np.inf if order is not None else (1 + largest_loss) * found.gamma
+    for candidate in range(full.order + 1) if order is None else [order]:
+        controller, achieved = _reduced(standard, full, candidate, reduction)
+        if np.isfinite(achieved) and achieved <= allowed:
+            return Synthesis(controller, full, achieved, weights, found, hankel_singular_values(full))
+    if order is not None:
         raise ValueError(
             f"order: {order} leaves an unstable loop with method {reduction!r}; "
             "a higher one, or none so that the lowest good one is found, would help"
         )
-    return Synthesis(reduced.transfer, full, achieved, weights, found, hankel_singular_values(full))
+    achieved = weighted_norm(standard, full)
+    return Synthesis(full, full, achieved, weights, found, hankel_singular_values(full))
 
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
@@ -68,13 +69,13 @@ def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
     return hinf_norm(standard.closed_with(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
 
-def _reduced(
-    standard: GeneralisedPlant, full: Transfer, order: int, method: ReductionMethod
-) -> tuple[Reduced, float]:
-    if order >= full.order and order <= full.order:
-        return Reduced(full, np.empty(0), 0.0), weighted_norm(standard, full)
-    reduced = reduce_order(full, order, method)
-    return reduced, weighted_norm(standard, reduced.transfer)
+def _reduced(standard: GeneralisedPlant, full: Transfer, order: int, method: ReductionMethod) -> tuple[Transfer, float]:
+    """The controller of this order, and the norm of the weighted loop with it; infinite where there is none."""
+    try:
+        controller = full if order == full.order else reduce_order(full, order, method).transfer
+        return controller, weighted_norm(standard, controller)
+    except np.linalg.LinAlgError:
+        return full, np.inf
 
 
 def synthesise_design(design: DesignOptions) -> Synthesis:

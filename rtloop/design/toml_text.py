@@ -25,7 +25,7 @@ def section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) 
             continue
         for item in value:
             lines.append("\n" + section(path, item).replace(f"[{path}]", f"[[{path}]]", 1))
-    return "".join(lines)
+    return "".join(lines).replace("\n\n\n", "\n\n")
 
 
 def text(value: Any) -> str:

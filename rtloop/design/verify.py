@@ -94,7 +94,10 @@ class Verification(NamedTuple):
 def verify(
     controller: Transfer, discrete: DiscreteController, plant: Transfer, design: DesignOptions, delay_ticks: int = 0
 ) -> Verification:
-    """Judge C(s), and C(z) behind `delay_ticks` samples, on a plant. Raises ValueError for one with direct feedthrough."""
+    """Judge C(s), and C(z) behind `delay_ticks` samples, on a plant.
+
+    Raises ValueError for a plant with direct feedthrough.
+    """
     asked, sensed = design.specification, design.sensor.seen_through(plant)
     continuous, running = continuous_loop(controller, plant), discrete_loop(discrete, sensed, delay_ticks)
     weights = _weights(design)
@@ -133,18 +136,17 @@ def _robustness(
 ) -> Robustness:
     on_paper, runs = maker(controller), maker(discrete, delay_ticks)
     met = {row.name: row.limit for row in rows if row.limit is not None and row.met(row.running)}
-    ranges = {
-        name: {
+    ranges: dict[str, dict[str, Range | None]] = {}
+    shifts: dict[str, Range] = {}
+    for name, change in changes(plant).items():
+        ranges[name] = {
             "continuous": until_unstable(on_paper, plant, change),
             "running": until_unstable(runs, sensed, change),
             "running_missed": until_missed(runs, sensed, change, design.specification, met) if met else None,
         }
-        for name, change in changes(plant).items()
-    }
-    shifts = {}
-    if (move := changes(plant).get("resonance")) is not None:
-        shifts["continuous"] = until_unstable(on_paper, plant, move)
-        shifts |= {f"{ticks}": until_unstable(maker(discrete, ticks), sensed, move) for ticks in DELAYS}
+        if name == "resonance":
+            shifts = {str(ticks): until_unstable(maker(discrete, ticks), sensed, change) for ticks in DELAYS}
+            shifts = {"continuous": until_unstable(on_paper, plant, change), **shifts}
     more = delay_ticks_tolerated(discrete, sensed) - delay_ticks
     return Robustness(ranges, shifts, delay_margin_us(on_paper(plant)), more)
 

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from html import escape
 
 from rtloop.design.verify import Verification
-from rtloop.design.verify_text import HEADINGS, NOTE, answer, robustness, shifts, table
+from rtloop.design.verify_text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
 
 STYLE = """
 :root { color-scheme: light dark }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem }
 table { border-collapse: collapse; margin: 1rem 0 }
-th, td { padding: .2rem .8rem .2rem 0; text-align: left; border-bottom: 1px solid #8884; font-variant-numeric: tabular-nums }
+th, td { padding: .2rem .8rem .2rem 0; text-align: left; border-bottom: 1px solid #8884 }
+td { font-variant-numeric: tabular-nums }
 .MISSED, .NO { color: #d33; font-weight: 600 } .met { color: #2a2 }
 img { max-width: 100%; background: white; margin: .5rem 0 }
 """
@@ -32,8 +33,7 @@ def _axis(name: str, found: Verification, drawn: dict[str, bytes]) -> str:
     parts = [f"<h2>axis {escape(name)}</h2>\n<p><b>{escape(answer(found))}.</b></p>\n", _table(HEADINGS, table(found))]
     if found.robustness.shifts:
         parts += ["<h3>The resonance may move by</h3>\n", _table(("", ""), shifts(found))]
-    headings = ("may move by", "continuous, until unstable", "as it runs, until unstable", "until what is met is missed")
-    parts += [f"<h3>Robustness</h3>\n<p>{escape(NOTE)}</p>\n", _table(headings, robustness(found))]
+    parts += [f"<h3>Robustness</h3>\n<p>{escape(NOTE)}</p>\n", _table(ROBUSTNESS_HEADINGS, robustness(found))]
     parts += [f"<p>Warning: {escape(warning)}.</p>\n" for warning in found.warnings]
     parts += [_picture(label, content) for label, content in drawn.items()]
     return "".join(parts)

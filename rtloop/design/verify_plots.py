@@ -1,7 +1,7 @@
 """Pictures of a verification: the open loop, the sensitivities against their templates, the step.
 
-The only module of the design that draws. Templates ("gabarits" in the paper) are 1/W1 for |S| and 1/W2 for |CS|, eq (14):
-as specified, and relaxed by the factor γ that the controller reaches.
+The only module of the design that draws. Templates ("gabarits" in the paper) are 1/W1 for |S| and 1/W2 for |CS|, eq
+(14): as specified, and relaxed by the factor γ that the controller reaches.
 """
 
 from __future__ import annotations
@@ -18,15 +18,9 @@ from rtloop.design.specification import SpecificationOptions
 from rtloop.design.step import step_response
 from rtloop.design.transfer import Transfer
 from rtloop.design.verify import Verification
-from rtloop.errors import RtloopError
+from rtloop.errors import MissingExtra
 
 PAPER_TIME, RUN_TIME, TEMPLATE = "tab:blue", "tab:red", "0.35"
-
-
-class MissingExtra(RtloopError):
-    """An optional package is missing; the message names what to install."""
-
-    exit_code = 78
 
 
 def pictures(found: Verification, asked: SpecificationOptions, title: str) -> dict[str, bytes]:
@@ -59,10 +53,10 @@ def _loops(found: Verification) -> list[tuple[str, Loop, str]]:
 
 
 def _frequencies(loop: Loop, found: Verification) -> Real:
-    """From a thousandth of the crossover to ten times the sampling rate."""
+    """From 0.01 Hz to ten times the sampling rate, or to just below half of it, where C(z) has its zeros."""
     hz = loop.frequencies
-    top = 10 / found.running.period_s if found.running.period_s else math.inf
-    return hz[(hz >= 1e-2) & (hz <= top)]
+    period_s = found.running.period_s or 1e-12
+    return hz[(hz >= 1e-2) & (hz <= (10 if loop.period_s is None else 0.49) / period_s)]
 
 
 def _bode(panels: Any, found: Verification, _: SpecificationOptions) -> None:

@@ -9,6 +9,9 @@ from rtloop.design.robustness import Range
 from rtloop.design.verify import Row, Verification
 
 HEADINGS = ("", "required", "continuous C(s)", "", "as it runs C(z)", "", "its source says")
+ROBUSTNESS_HEADINGS = (
+    "may move by", "continuous, until unstable", "as it runs, until unstable", "until what is met is missed",
+)  # fmt: skip
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
 NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
@@ -28,7 +31,7 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 
 def required(row: Row) -> str:
-    """"≤ 0.1 %", "everywhere", or nothing."""
+    """ "≤ 0.1 %", "everywhere", or nothing."""
     limit: Limit | None = row.limit
     if limit is None:
         return ""
@@ -78,7 +81,7 @@ def shifts(found: Verification) -> list[tuple[str, str]]:
 
 
 def span(found: Range | None) -> str:
-    """"−3.9 … +2.4 %"; an end that was not found is left open."""
+    """ "−3.9 … +2.4 %"; an end that was not found is left open."""
     if found is None:
         return "nothing is met"
     if found == Range(0.0, 0.0):

@@ -6,9 +6,10 @@
     1/(W1 W2) = v_max/x_max                                                                    eqs (16), (17)
     1/(W1 W3) = e_max/Ω_max                                                                          eq (18)
 
-Two of the rules do not do what they seem to. With (16), W1·W2 = 1: the bound on |CS| is as high as 1/|S| may be, and says
-nothing about the peak of the command. And (19) of the paper inverts (18): as printed, W3 = (e_max/Ω_max)/W1 is nearly
-without effect; as (18) implies, W3 = (Ω_max/e_max)/W1 asks for |S| < 0.03 at every frequency, which no controller gives.
+Two of the rules do not do what they seem to. With (16), W1·W2 = 1: the bound on |CS| is as high as 1/|S| may be, and
+says nothing about the peak of the command. And (19) of the paper inverts (18): as printed, W3 = (e_max/Ω_max)/W1 is
+nearly without effect; as (18) implies, W3 = (Ω_max/e_max)/W1 asks for |S| < 0.03 at every frequency, which no
+controller gives.
 """
 
 from __future__ import annotations

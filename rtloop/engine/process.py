@@ -8,7 +8,9 @@ time it ramps down and closes the driver first.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import pickle
 import signal
 import sys
@@ -32,13 +34,15 @@ EXIT_CODES = {
     Outcome.DRIVER_FAILED: UnavailableError.exit_code,
     Outcome.HEARTBEAT_LOST: LoopFault.exit_code,
 }
+STDOUT = 1
 START_DELAY_NS = 20_000_000
 GO_POLL_S = 0.001
 
 
 def report(kind: str, **facts: Any) -> None:
-    """One JSON line to the supervisor."""
-    print(json.dumps({"report": kind, **facts}), flush=True)
+    """One JSON line to the supervisor, if it still lives; unbuffered, so that nothing is left to fail at the exit."""
+    with contextlib.suppress(BrokenPipeError):
+        os.write(STDOUT, json.dumps({"report": kind, **facts}).encode() + b"\n")
 
 
 def main() -> int:

@@ -154,7 +154,7 @@ def application(service: Service) -> Starlette:
             while True:
                 answer = await _answer(service, SetpointBody, ACTIONS["/setpoint"][2], await socket.receive_text())
                 await socket.send_text(bytes(answer.body).decode())
-        except (WebSocketDisconnect, RuntimeError, OSError):
+        except (WebSocketDisconnect, RuntimeError, OSError, KeyError):  # the last for bytes instead of text
             return
 
     def post(body: type[Body] | None, action: Action) -> Callable[[Request], Any]:

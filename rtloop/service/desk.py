@@ -32,7 +32,7 @@ class Desk:
         self._identity = 0
 
     def submit(self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = ()) -> int:
-        """Send a command and wait until it took effect; returns the tick. Raises Refused."""
+        """Send a command and wait until its tick was executed, which it returns. Raises Refused."""
         with self._lock:
             self._identity += 1
             command = message(kind, axis=axis, origin=Origin.OPERATOR, values=values)
@@ -51,6 +51,12 @@ class Desk:
                 if event["identity"] == self._identity:
                     if event["kind"] == Kind.REFUSED:
                         raise Refused(f"{kind.name.lower()}: refused at tick {event['tick']}: tripped or stopping")
+                    self._await_tick(int(event["tick"]), deadline)
                     return int(event["tick"])
             time.sleep(POLL_S)
         raise Refused(f"{kind.name.lower()}: the loop did not answer within {ANSWER_TIMEOUT_S:g} s")
+
+    def _await_tick(self, tick: int, deadline: float) -> None:
+        """The event comes before its tick: what is read off the newest record is to show the command's effect."""
+        while int(self._block["ticks_head"][0]) <= tick and time.monotonic() < deadline:
+            time.sleep(POLL_S)

@@ -19,11 +19,13 @@ from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 from rtloop.prepare import Prepared, prepare
-from rtloop.references import TableOfSamples, generator_values
+from rtloop.references import TableOfSamples, generator_values, reach
 from rtloop.service.desk import Desk, Refused
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels")
 """Parts of a configuration that only a restart can change."""
+SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
+"""Of an axis, that may be tuned."""
 
 
 class LiveLaw:
@@ -38,9 +40,9 @@ class LiveLaw:
         self._places = [0] * len(prepared.plan.axes)
 
     def axis_number(self, name: str) -> int:
-        """Raises Refused for a name that is no axis."""
+        """Raises ConfigError for a name that is no axis."""
         if name not in self.prepared.plan.axes:
-            raise Refused(f"axis {name!r}: there are {', '.join(self.prepared.plan.axes)}")
+            raise _unsuitable(f"axis {name!r}: there are {', '.join(self.prepared.plan.axes)}")
         return self.prepared.plan.axes.index(name)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
@@ -48,8 +50,8 @@ class LiveLaw:
         with self._lock:
             number = self.axis_number(axis)
             options = self.prepared.configuration.axes[number]
-            if section not in ("controller", "limits", "interlocks", "prefilter", "model"):
-                raise Refused(f"section {section!r}: controller, limits, interlocks, prefilter and model may change")
+            if section not in SECTIONS:
+                raise _unsuitable(f"section {section!r}: {', '.join(SECTIONS)} may change")
             merged = options.model_dump(exclude_unset=True)
             merged[section] = {**(merged.get(section) or {}), **changes}
             return self._swap(number, _validated_axis(merged))
@@ -68,34 +70,18 @@ class LiveLaw:
             options = TypeAdapter(ReferenceOptions).validate_python(dict(reference))
         except ValidationError as error:
             raise ConfigError("reference", describe(error, "reference", reference)) from None
-        table = TableOfSamples()
-        configuration = self.prepared.configuration
-        try:
-            values = list(
-                generator_values(
-                    options, configuration.loop.rate_hz, self.prepared.facts.inputs, configuration.folder, table
-                )
-            )
-        except ValueError as error:
-            raise ConfigError("reference", [f"reference.{error}"]) from None
+        values, samples = self._generator(options)
         with self._lock:
-            number = self.axis_number(axis)
-            self._check_reach(number, values, table.samples)
-            if table.samples.size:
-                values[1] = self._store(number, table.samples)
-            return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
+            return self._play(self.axis_number(axis), values, samples)
 
     def set_waveform(self, axis: str, samples: list[float], hold_ticks: int, repeat: bool) -> int:
-        """Play samples, `hold_ticks` ticks each; returns the tick. Raises Refused."""
+        """Play samples, `hold_ticks` ticks each; returns the tick. Raises ConfigError, Refused."""
         data = np.asarray(samples, float)
         if data.size == 0 or not np.all(np.abs(data) < USABLE_MAGNITUDE):
-            raise Refused(f"waveform: {data.size} samples; at least one, and finite numbers only, are needed")
+            raise _unsuitable(f"waveform: {data.size} samples; at least one, and finite numbers only, are needed")
         with self._lock:
-            number = self.axis_number(axis)
             values = [Generator.TABLE, 0, data.size, hold_ticks, float(repeat)]
-            self._check_reach(number, values, data)
-            values[1] = self._store(number, data)
-            return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
+            return self._play(self.axis_number(axis), values, data)
 
     def play_raw(self, number: int, volts: np.ndarray[Any, Any]) -> int:
         """Play `volts` (n,) once, for raw mode; returns the tick. Raises Refused."""
@@ -124,14 +110,19 @@ class LiveLaw:
             fixed = [part for part in FIXED if getattr(old, part) != getattr(new, part)]
             if fixed or prepared.plan.axes != self.prepared.plan.axes:
                 raise Refused(f"{', '.join(fixed) or 'axes'}: changed, which needs a restart")
-            changed = []
-            for number, (before, after) in enumerate(zip(old.axes, new.axes, strict=True)):
+            pairs = list(enumerate(zip(old.axes, new.axes, strict=True)))
+            for _, (before, after) in pairs:
                 if before.feedforward != after.feedforward:
                     raise Refused(f"axis.{after.name}.feedforward: changed, which needs a restart")
+            references = {n: self._generator(after.reference) for n, (before, after) in pairs
+                          if before.reference != after.reference}  # fmt: skip
+            changed = [f"axis.{after.name}" for _, (before, after) in pairs if before != after]
+            for number, (before, after) in pairs:
                 if before != after:
                     self._stage(number, prepared)
-                    changed.append(f"axis.{after.name}")
             self.prepared = prepared
+            for number, (values, samples) in references.items():
+                self._play(number, values, samples)
             return changed
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
@@ -154,33 +145,39 @@ class LiveLaw:
         another = before.controller != after.controller
         return self._desk.submit(Kind.LOAD_LAW, axis=number, values=[float(another)])
 
-    def _check_reach(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> None:
-        """Raise Refused for a reference that lies beyond what the axis may be commanded."""
+    def _generator(self, options: ReferenceOptions) -> tuple[list[Any], np.ndarray[Any, Any]]:
+        """Kind and parameters of a generator, and the samples of its table. Raises ConfigError."""
+        table, configuration = TableOfSamples(), self.prepared.configuration
+        facts, rate_hz = self.prepared.facts, configuration.loop.rate_hz
+        try:
+            return list(generator_values(options, rate_hz, facts.inputs, configuration.folder, table)), table.samples
+        except ValueError as error:
+            raise ConfigError("reference", [f"reference.{error}"]) from None
+
+    def _play(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> int:
+        """Have a generator take over; its table's samples go where the loop finds them. Raises ConfigError, Refused."""
         limit = self.prepared.configuration.axes[number].limits.command_um
-        kind = Generator(int(values[0]))
-        if kind is Generator.TABLE:
-            reach = float(np.max(np.abs(samples)))
-        elif kind is Generator.HOLD:
-            reach = abs(values[1])
-        elif kind is Generator.CHIRP:
-            reach = abs(values[1]) + abs(values[5])
-        elif kind is Generator.INPUT:
-            return
-        else:
-            reach = abs(values[1]) + abs(values[3])
-        if not reach <= limit:
-            raise Refused(f"reference: reaches {reach:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+        if not (most := reach(values, samples)) <= limit:
+            raise _unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+        if samples.size:
+            values[1] = self._store(number, samples)
+        return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
 
     def _store(self, number: int, samples: np.ndarray[Any, Any]) -> int:
         """Index of `samples` in the shared table, in the one of the axis's two places that does not play now."""
         table, fixed, axes = self._block["table"], self._first_spare, len(self.prepared.plan.axes)
         room = (table.size - fixed) // (2 * axes)
         if samples.size > room:
-            raise Refused(f"waveform: {samples.size} samples; at most {room} are allowed")
+            raise _unsuitable(f"waveform: {samples.size} samples; at most {room} are allowed")
         self._places[number] = 1 - self._places[number]
         first = fixed + (2 * number + self._places[number]) * room
         table[first : first + samples.size] = samples
         return first
+
+
+def _unsuitable(message: str) -> ConfigError:
+    """The error of a request that could be granted in no state."""
+    return ConfigError("request", [message])
 
 
 def _validated_axis(raw: Mapping[str, Any]) -> AxisOptions:

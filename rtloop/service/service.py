@@ -74,6 +74,7 @@ class Service:
         self.live: LiveLaw | None = None
         self._desk: Desk | None = None
         self._ending, self._reload = threading.Event(), threading.Event()
+        self._reloading = threading.Lock()
         self._deaths_s: list[float] = []
         self._ready = False
 
@@ -150,12 +151,14 @@ class Service:
             try:
                 result = self._episode(resting)
             except (RtloopError, DriverError) as error:
+                if self._ending.is_set():
+                    return 0  # told to end before the loop began
                 if not self._may_restart(str(error)):
                     raise
                 continue
             self.results.append(result)
             if self._ending.is_set():
-                return 0 if result.exit_code == 0 else result.exit_code
+                return result.exit_code
             if not self._may_restart(result.error or f"the loop ended: {result.outcome}"):
                 raise LoopFault(f"the loop died too often: {'; '.join(self.faults)}")
             resting = True
@@ -190,7 +193,7 @@ class Service:
             if self._ending.is_set():
                 self.notifier.send(STOPPING=1, STATUS="ramping down")
                 supervisor.stop()
-            if self._reload.is_set():
+            if self._reload.is_set() and not self._reloading.locked():  # however many were asked for meanwhile
                 self._reload.clear()
                 self._aside(self._apply_reload)
             self._tell(supervisor)
@@ -272,12 +275,11 @@ class Service:
 
     def reload_now(self) -> dict[str, Any]:
         """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""
-        configuration = load(self.config)
-        prepared: Prepared = prepare(configuration)
-        if self.live is None:
+        with self._reloading:  # one after the other: the file that was read last is the one that stays
+            configuration = load(self.config)
+            prepared: Prepared = prepare(configuration)
+            live = self.live
+            changed = [] if live is None else live.replace_all(prepared)
             self.configuration = configuration
-            return {"changed": []}
-        changed = self.live.replace_all(prepared)
-        self.configuration = configuration
         log.info("reloaded: %s", ", ".join(changed) or "nothing changed")
         return {"changed": changed}

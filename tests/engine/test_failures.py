@@ -75,17 +75,26 @@ def test_a_read_that_fails_is_ramped_down_and_ends_the_run():
     assert str(driver.error) == "the cable is out"
 
 
-def test_a_write_that_fails_ends_the_run_at_once():
+@pytest.mark.parametrize("for_good", [False, True])
+def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
+    """Some card that refuses one value takes the next; one that refuses all of them has been asked."""
+    tries: list[int] = []
+
     def refuse(k: int) -> None:
-        if k == 25:
+        tries.append(k)
+        if len(tries) == 26 or (for_good and len(tries) > 26):
             raise OSError("no such device")
 
     driver = ScriptedDriver(lambda k: 0.0, refuse)
     bench = LoopBench(RAW, driver)
     rows = bench.run(FOR_EVER)
     assert bench.outcome is Outcome.DRIVER_FAILED
-    assert rows.shape[0] == 26  # the tick that failed is recorded
-    assert bench.events() == [(25, Kind.DRIVER_FAILED, -1.0, 1.0)]
+    drive = bench.column(rows, "x_drive_v")
+    assert np.all(drive[:26] == 3.0)  # the tick that failed is recorded
+    np.testing.assert_allclose(drive[26:], RAMP, rtol=0, atol=1e-12)
+    assert driver.written == (drive[:25].tolist() if for_good else [*drive[:25], *drive[26:]])
+    assert len(tries) == len(drive)
+    assert bench.events() == [(25, Kind.DRIVER_FAILED, -1.0, 1.0), (26, Kind.STOP, 0.0, 0.0)]
     assert str(driver.error) == "no such device"
 
 

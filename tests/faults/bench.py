@@ -59,11 +59,13 @@ class Bench:
         folder: Path,
         *changes: tuple[str, str],
         card: bool = False,
+        board: bool = True,
         text: str | None = None,
         name: str = "lab",
         environment: dict[str, str] | None = None,
     ) -> None:
         self.folder, self.card, self.config = folder, card, folder / f"{name}.toml"
+        self._with_board = board and not card
         self.config.write_text(text or (on_a_card if card else on_a_board)(folder, *changes))
         self.environment = os.environ | {
             "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}",
@@ -82,7 +84,7 @@ class Bench:
 
     def __enter__(self) -> Bench:
         try:
-            if not self.card:
+            if self._with_board:
                 self.start_board()
             self.start_service()
         except BaseException:
@@ -115,7 +117,9 @@ class Bench:
         self.board = self.rtloop("hil", "serve", self.config)
         path = self.folder / "board"
         wait_for(lambda: path.exists() and path.stat().st_size >= board.file_bytes(), "a board", START_TIMEOUT_S)
-        wait_for(lambda: self.memory.facts["magic"][0] == board.MAGIC, "a board that runs", START_TIMEOUT_S)
+        before = int(self.memory.words[board.SEQUENCE])  # of a board that was killed
+        running = lambda: self.memory.facts["magic"][0] == board.MAGIC and self.memory.words[board.SEQUENCE] != before
+        wait_for(running, "a board that runs", START_TIMEOUT_S)
 
     def start_service(self) -> None:
         """Start the service and wait until its loop runs."""
@@ -139,9 +143,10 @@ class Bench:
     def _end_child(self, pid: int) -> None:
         """End a loop or recorder of ours that still lives; its number may belong to somebody else by now."""
         with suppress(OSError):
-            if str(ROOT) in Path(f"/proc/{pid}/environ").read_text() and str(self.folder) in Path(
-                f"/proc/{pid}/environ"
-            ).read_text():
+            if (
+                str(ROOT) in Path(f"/proc/{pid}/environ").read_text()
+                and str(self.folder) in Path(f"/proc/{pid}/environ").read_text()
+            ):
                 os.kill(pid, signal.SIGKILL)
 
     # what the service says
@@ -162,7 +167,10 @@ class Bench:
             report = self.status()
             return report.get("state") == state and set(causes) <= set(report.get("trip", ()))
 
-        wait_for(there, f"{state} {causes}; there is {report or self.log()[-2000:]}", timeout_s)
+        try:
+            wait_for(there, f"{state} {' '.join(causes)}", timeout_s)
+        except AssertionError as error:
+            raise AssertionError(f"{error}; there is {report}; {self.log()[-1000:]}") from None
         return report
 
     def await_restart(self, count: int = 1) -> None:
@@ -172,7 +180,7 @@ class Bench:
 
     def await_drive(self) -> None:
         """Wait until the loop is closed and drives."""
-        wait_for(lambda: self.status().get("mode") == "closed_loop", "closed loop")
+        self.await_state("running")
         wait_for(lambda: abs(self.seen().last_v) > 1.0, "a drive")
         ticks = self.ticks
         wait_for(lambda: self.ticks > ticks + 1000, "a thousand ticks")
@@ -239,8 +247,8 @@ class Bench:
         self.witnessed.append(self.seen())
 
     def step_bound_v(self, rate_hz: float, seen: Seen) -> float:
-        """What the slew allows between two looks of the board: two periods of the loop, and the board's lateness."""
-        return SLEW_V_PER_S * (2 / rate_hz + seen.late_s) + LSB_V
+        """What the slew allows between two looks: a period where every write is seen, else two and the lateness."""
+        return SLEW_V_PER_S * (1 / rate_hz if self.card else 2 / rate_hz + seen.late_s) + LSB_V
 
     def stop(self) -> int:
         """SIGTERM to the service; its exit code."""

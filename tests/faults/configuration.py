@@ -58,7 +58,7 @@ slew_v_per_s = {SLEW_V_PER_S}
 trip_slew_v_per_s = {TRIP_SLEW_V_PER_S}
 [axis.interlocks]
 position_um = 60.0
-sample_age_us = 50000.0
+sample_age_us = 400000.0
 tracking_error_um = 5.0
 tracking_ticks = 200
 frozen_ticks = 100

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rtloop.errors import RtloopError
 from tests.faults.account import Account, account
 from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ, CARD_RATE_HZ
@@ -52,7 +53,7 @@ class Row:
 
     fault: Fault
     measured: Measured = field(default_factory=Measured)
-    account: Account = Account(0, 0, 0, [])
+    account: Account = field(default_factory=lambda: Account(0, 0, 0, []))
     largest_v: float = 0.0
     step_v: float = 0.0
     bound_v: float = 0.0
@@ -77,7 +78,7 @@ def measure(fault: Fault) -> Row:
                 _judge(row, bench)
         except NotPossible as reason:
             row.skipped = str(reason)
-        except AssertionError as error:
+        except (AssertionError, RtloopError) as error:
             row.problems.append(str(error))
     return row
 

@@ -1,0 +1,44 @@
+"""`rtloop design auto`: two recordings and a specification in, a configuration and its verification out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from rtloop.config import parse
+from rtloop.design.assumptions import NoController
+from rtloop.design.chain import configuration_text, designed
+from rtloop.design.identified import write_new
+from rtloop.design.measured import measured
+from rtloop.designing import verify_configuration
+from rtloop.errors import ConfigError, NoDesign
+from rtloop.prepare import prepare
+from rtloop.specifications import load_specification
+
+
+def design_from_recordings(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, as_json: bool
+) -> int:
+    """Write the configuration `out`, verify it, and return the verdict's exit code. Raises RtloopError."""
+    specification = load_specification(specs)
+    slow, fast = measured(hysteresis, axis), measured(step, axis)
+    try:
+        chain = designed(slow, fast, specification.design, order)
+    except NoController as error:
+        raise NoDesign(f"{specs}: {error}") from None
+    except ValueError as error:
+        raise ConfigError(str(specs), [str(error)]) from None
+    folder = out.resolve().parent
+    name = os.path.relpath(specs.resolve(), folder)
+    text = configuration_text(chain, slow, fast, axis, name, specification.text)
+    prepare(parse(text, out.stem, folder, str(out)))
+    write_new(out, text)
+    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in chain.dynamics.modes)
+    click.echo(
+        f"{out}: h/H {chain.hysteresis.model_loop.percent:.2f} %; {modes}; γ {chain.synthesis.achieved:.4g}, "
+        f"controller of order {chain.synthesis.controller.order}",
+        err=True,
+    )
+    return verify_configuration(out, None, None, as_json)

@@ -1,0 +1,50 @@
+"""Commands that make a controller, and judge one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+
+
+@click.group()
+def design() -> None:
+    """From specifications to a verified controller: synthesise, reduce, judge."""
+
+
+@design.command()
+@click.argument("spec", type=OUTPUT)
+@click.option("--out", type=OUTPUT, help="The file to write [stdout].")
+@click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (extra: slycot).")
+@JSON
+@fails_clearly
+def synthesise(spec: Path, out: Path | None, cross_check: bool, as_json: bool) -> int:
+    """Compute the H∞ controller that SPEC.toml asks for, reduce it, and write its section [axis.controller].
+
+    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. Exit 1 where no controller
+    does what is asked, with the condition that fails.
+    """
+    from rtloop.designing import synthesise_specification
+
+    return synthesise_specification(spec, out, cross_check, as_json)
+
+
+@design.command()
+@CONFIG
+@click.option("--spec", type=OUTPUT, help="The specification [each axis's key `specification`].")
+@click.option("--out", type=OUTPUT, help="Folder for verify.html, verify.json and pictures (extra: plot).")
+@JSON
+@fails_clearly
+def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
+    """Judge the loops of CONFIG: every specification with required, achieved and verdict; margins; robustness.
+
+    Exit 1, "the answer is no", where a loop as it will run is unstable or misses a specification; 0 where all are met.
+    """
+    from rtloop.designing import verify_configuration
+
+    return verify_configuration(config, spec, out, as_json)
+
+
+COMMANDS = (design,)

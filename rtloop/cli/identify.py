@@ -1,0 +1,161 @@
+"""Commands that make models of recordings: hysteresis, dynamics, and what compensation leaves of the first."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from rtloop.cli.design import design
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+
+RUNS = click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
+AXIS = click.option("--axis", help="Name of the axis [the only one].")
+OUT = click.option("--out", type=OUTPUT, help="The TOML file to write, never over an existing one.")
+PLOT = click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
+
+
+class Numbers(click.ParamType):
+    """Numbers separated by commas."""
+
+    name = "numbers"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
+        """The numbers; a usage error for anything else."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            return tuple(float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"{value}: numbers separated by commas are needed", param, ctx)
+
+
+@click.group()
+def identify() -> None:
+    """Make models of the actuator from recordings."""
+
+
+@identify.command()
+@RUNS
+@AXIS
+@click.option("--operators", default=15, show_default=True, type=click.IntRange(1, 64), help="Number of plays.")
+@click.option("--placement", default="chebyshev", show_default=True, type=click.Choice(["chebyshev", "uniform"]))
+@click.option("--thresholds", type=Numbers(), help="Thresholds in V instead: '0,0.5,1,2'.")
+@click.option(
+    "--weights", default="invertible", show_default=True, type=click.Choice(["invertible", "free"]),
+    help="Keep every partial sum above 0, so that an inverse exists, or not.",
+)  # fmt: skip
+@OUT
+@PLOT
+@JSON
+@fails_clearly
+def hysteresis(
+    runs: tuple[Path, ...], axis: str | None, operators: int, placement: Literal["chebyshev", "uniform"],
+    thresholds: tuple[float, ...] | None, weights: Literal["invertible", "free"], out: Path | None, plot: Path | None,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Thresholds and weights from recorded slow sines, each RUN from rest with its initial loading curve."""
+    from rtloop.identifying import hysteresis_report
+    from rtloop.report_identification import print_hysteresis
+
+    report = hysteresis_report(
+        runs,
+        axis=axis,
+        count=operators,
+        placement=placement,
+        thresholds_v=thresholds,
+        weights=weights,
+        out=out,
+        plot=plot,
+    )
+    _show(report, as_json, print_hysteresis)
+    return 0 if report["invertible"] or weights == "free" else 1
+
+
+@identify.command()
+@RUNS
+@AXIS
+@click.option("--hysteresis", type=OUTPUT, help="File with [axis.feedforward] [the recording's own configuration].")
+@click.option(
+    "--input", "how", default="hysteresis", show_default=True, type=click.Choice(["hysteresis", "command", "drive"]),
+    help="Input of the dynamics: output of the hysteresis model, recorded command v, or the drive itself.",
+)  # fmt: skip
+@click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
+@click.option("--largest-order", default=8, show_default=True, type=click.IntRange(1, 20))
+@click.option("--criterion", default="aic", show_default=True, type=click.Choice(["aic", "validation"]))
+@click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine: measured frequency response.")
+@OUT
+@PLOT
+@JSON
+@fails_clearly
+def dynamics(
+    runs: tuple[Path, ...], axis: str | None, hysteresis: Path | None, how: Literal["hysteresis", "command", "drive"],
+    order: int | None, largest_order: int, criterion: Literal["aic", "validation"], compare: Path | None,
+    out: Path | None, plot: Path | None, as_json: bool,
+) -> int:  # fmt: skip
+    """D(s) from the first RUN, a step or any other excitation from rest; further RUNs validate it."""
+    from rtloop.identifying import dynamics_report
+    from rtloop.report_identification import print_dynamics
+
+    report = dynamics_report(
+        runs, axis=axis, how=how, hysteresis=hysteresis, order=order, largest_order=largest_order,
+        criterion=criterion, compare=compare, out=out, plot=plot,
+    )  # fmt: skip
+    _show(report, as_json, print_dynamics)
+    return 0
+
+
+@design.command()
+@CONFIG
+@click.option("--actuator", type=OUTPUT, required=True, help="File with the identified [axis.feedforward].")
+@AXIS
+@click.option("--command-um", type=click.FloatRange(0, min_open=True), help="Largest |v| [limits.command_um].")
+@PLOT
+@JSON
+@fails_clearly
+def compensation(
+    config: Path, actuator: Path, axis: str | None, command_um: float | None, plot: Path | None, as_json: bool
+) -> int:
+    """What the inverse compensation of CONFIG leaves on the identified actuator: ρ, Ω and its bound ξ."""
+    from rtloop.identifying import compensation_report
+    from rtloop.report_identification import print_compensation
+
+    report = compensation_report(config, actuator, axis=axis, command_um=command_um, plot=plot)
+    _show(report, as_json, print_compensation)
+    return 0
+
+
+@design.command()
+@click.argument("hysteresis", metavar="HYST", type=OUTPUT)
+@click.argument("step", metavar="STEP", type=OUTPUT)
+@click.option("--specs", type=OUTPUT, required=True, help="What the loop is asked to do; its [plant] is not used.")
+@click.option("--out", type=OUTPUT, required=True, help="The configuration to write, never over an existing file.")
+@AXIS
+@click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
+@JSON
+@fails_clearly
+def auto(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, as_json: bool
+) -> int:
+    """Identify from two recordings, synthesise for a specification, write a configuration that runs, and verify it.
+
+    HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
+    the loop misses the specification; the configuration is written all the same.
+    """
+    from rtloop.chaining import design_from_recordings
+
+    return design_from_recordings(hysteresis, step, specs, out, axis, order, as_json)
+
+
+def _show(report: dict[str, Any], as_json: bool, for_people: Callable[[dict[str, Any]], None]) -> None:
+    if as_json:
+        click.echo(json.dumps(report))
+    else:
+        for_people(report)
+
+
+COMMANDS = (identify,)
+"""`compensation` and `auto` belong to `design`."""

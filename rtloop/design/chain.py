@@ -1,0 +1,103 @@
+"""From two recordings and a specification to a configuration that runs: the whole design in one call.
+
+    slow sine ──► hysteresis P̂ ─┬─► [axis.feedforward] ──────────┐
+    step ───────────────────────┴─► D(s), D(0) = 1 ─► [axis.model] ─► H∞, reduction ─► [axis.controller]
+
+Driver, limits and interlocks are those of the configuration that the step was recorded with.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rtloop.design.identified import (
+    dynamics_provenance,
+    feedforward_section,
+    hysteresis_provenance,
+    model_values,
+    with_gain,
+)
+from rtloop.design.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.measured import Measured, UnsuitableData
+from rtloop.design.plays import model_output
+from rtloop.design.section import controller_section
+from rtloop.design.specification import DesignOptions
+from rtloop.design.synthesise import Synthesis, synthesise_design
+from rtloop.design.toml_text import section
+from rtloop.law.hysteresis import PlayModel
+from rtloop.law.options import ModelOptions
+
+AT_REST = {"kind": "hold", "value": 0.0}
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What every step found; `actuator` is the hysteresis with the static gain of the dynamics in it."""
+
+    hysteresis: HysteresisFit
+    dynamics: DynamicsFit
+    actuator: PlayModel
+    design: DesignOptions
+    synthesis: Synthesis
+
+
+def designed(hysteresis: Measured, step: Measured, design: DesignOptions, order: int | None = None) -> Chain:
+    """Identify from two recordings and synthesise for `design`, whose plant is replaced by the identified one.
+
+    Raises UnsuitableData where a recording cannot serve, NoController and ValueError as the synthesis does.
+    """
+    if not step.even:
+        raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
+    shape = identify_hysteresis([hysteresis])
+    excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
+    dynamics = identify_dynamics(excitation, order)
+    plant = ModelOptions.model_validate(model_values(dynamics))
+    asked = design.model_copy(update={"plant": plant})
+    return Chain(shape, dynamics, with_gain(shape.model, dynamics.static_gain), asked, synthesise_design(asked))
+
+
+def configuration_text(
+    chain: Chain, hysteresis: Measured, step: Measured, axis: str | None, spec_name: str, spec_text: str
+) -> str:
+    """A complete configuration: that of `step` with what was found in axis `axis` (the first), in closed loop, at rest.
+
+    `spec_name` is the specification's file relative to the configuration's. Raises UnsuitableData for weights without
+    an inverse.
+    """
+    raw = tomllib.loads(step.configuration)
+    raw["loop"] = {key: value for key, value in raw["loop"].items() if key != "mode"}
+    raw.pop("schedule", None)
+    written = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
+    comments = [line.removeprefix("# ") for line in written.splitlines() if line.startswith("#")]
+    parts = {
+        "feedforward": _section(feedforward_section(chain.actuator, ()), "feedforward"),
+        "controller": _section(written, "controller"),
+        "model": model_values(chain.dynamics),
+        "specification": spec_name,
+        "reference": AT_REST,
+    }
+    raw["axis"] = [_replaced(one, parts) if one is _chosen(raw["axis"], axis) else one for one in raw["axis"]]
+    heading = [
+        *hysteresis_provenance(chain.hysteresis, [hysteresis]),
+        *dynamics_provenance(chain.dynamics, step, "hysteresis"),
+        *comments,
+    ]
+    return section("", raw, heading)
+
+
+def _section(content: str, name: str) -> Any:
+    return tomllib.loads(content)["axis"][name]
+
+
+def _chosen(axes: list[Any], name: str | None) -> Any:
+    return next(one for one in axes if name in (None, one["name"]))
+
+
+def _replaced(axis: Mapping[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain keys first: TOML has no way back from a table to its parent."""
+    merged = {**axis, **parts}
+    return dict(sorted(merged.items(), key=lambda item: isinstance(item[1], Mapping)))

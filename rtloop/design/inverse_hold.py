@@ -1,0 +1,28 @@
+"""Back from sampled modes to continuous ones: the inverse of the zero-order hold, exact for each mode.
+
+    s = log(z)/T,     r_s = r_z s/(e^sT − 1)
+
+Mode by mode nothing is lost however many there are and however far apart they lie; the principal logarithm puts every
+pole below half the sampling rate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hil.linear import Complex, Modal, Real
+
+
+def continuous_modes(discrete: Modal, period_s: float) -> Modal:
+    """The sum in s whose zero-order hold `discrete` is. Raises ValueError for a mode at z ≤ 0, which has none."""
+    if np.any((discrete.poles.imag == 0) & (discrete.poles.real <= 0)):
+        raise ValueError("a real mode at z ≤ 0 has no counterpart in continuous time")
+    rates = (np.log(discrete.poles) / period_s).astype(complex)
+    return held_from(rates, discrete.residues, discrete.direct, period_s)
+
+
+def held_from(rates: Complex, residues: Complex, direct: Real, period_s: float) -> Modal:
+    """The sum in s with poles `rates` (n,) whose zero-order hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
+    x = rates * period_s
+    held = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
+    return Modal(rates, residues / (period_s * held), direct)

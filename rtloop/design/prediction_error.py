@@ -1,0 +1,115 @@
+"""Models of each order that predict a recording best: minimise Σ ε_k² (Ljung 1999, sections 7.2 and 10.2).
+
+From a first guess of the modes: first as if all noise were the sensor's (H = 1), then with H free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hil.linear import Real
+from rtloop.design.innovations import Innovations
+from rtloop.design.markov import HANKEL_ROWS, Guesses, impulse_response, with_residues
+from rtloop.design.measured import noise_of
+
+LARGEST_ORDER = 8
+WORTH = 0.01
+"""A higher order must lower the rms prediction error by more than this part; noise never fits exactly equally."""
+LEAST_EXCITATION = 1e-7
+"""Singular value of the lagged inputs, relative to the largest, below which a direction was not excited, whatever the
+noise."""
+EVALUATIONS = 20
+USELESS = 1e6
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Input (µm, or V) and position (µm) at equal intervals, each (samples,), from rest."""
+
+    name: str
+    input: Real
+    position_um: Real
+    period_s: float
+
+
+def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
+    """Models of increasing order, until two more poles in turn do not pay."""
+    guesses = Guesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
+    found: list[Innovations] = []
+    errors: list[float] = []
+    for order in orders:
+        start = guesses.model(order)
+        if start is None and found and found[-1].order == order - 1:
+            start = _grown(found[-1])
+        model = start and _refined(with_residues(start, run.input, run.position_um), run)
+        if model is None:
+            continue
+        found.append(model)
+        errors.append(rms_error(model, run))
+        if len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
+            break
+    return found
+
+
+def _grown(model: Innovations) -> Innovations:
+    """One fast real pole more."""
+    return Innovations(
+        model.period_s,
+        np.append(model.rates, -1 / model.period_s),
+        np.append(model.residues, 0.0),
+        np.append(model.noise_gains, 0.0),
+        model.offset,
+    )
+
+
+def _refined(model: Innovations, run: Excitation) -> Innovations | None:
+    """The nearest least sum of squared prediction errors: first without noise model, then with; None if unstable."""
+    for noise in (False, True):
+        model = _descended(model, run, noise=noise)
+    return model if np.all(model.rates.real < 0) and _has_counterpart(model) else None
+
+
+def _descended(model: Innovations, run: Excitation, *, noise: bool) -> Innovations:
+    def errors(values: Real) -> Real:
+        tried = model.unpack(values, noise=noise)
+        if np.any(np.abs(tried.images) >= 1) or (found := tried.errors(run.input, run.position_um)) is None:
+            return np.full(run.input.size, USELESS)
+        return np.clip(np.nan_to_num(found, nan=USELESS), -USELESS, USELESS)
+
+    def jacobian(values: Real) -> Real:
+        tried = model.unpack(values, noise=noise)
+        return tried.sensitivities(run.input, errors(values), noise=noise).T
+
+    settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
+    found = least_squares(errors, model.pack(noise=noise), jacobian, **settings)  # pyright: ignore[reportArgumentType]
+    return model.unpack(found.x, noise=noise)
+
+
+def _has_counterpart(model: Innovations) -> bool:
+    """Rates stay below half the sampling rate, so that log(z) finds them again."""
+    return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
+
+
+def rms_error(model: Innovations, run: Excitation) -> float:
+    """Of the one-step-ahead prediction of a model that was fitted, µm."""
+    errors = model.errors(run.input, run.position_um)
+    assert errors is not None
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def excited_order(run: Excitation) -> int:
+    """Poles that the input can tell apart: half the directions of its lagged copies (Ljung 1999, section 13.2).
+
+    A direction counts where its share of the position, with the gain that the spans suggest, stands out of the noise.
+    """
+    lags = 2 * LARGEST_ORDER + 2
+    lagged = np.array([np.concatenate([np.zeros(i), run.input[: run.input.size - i]]) for i in range(lags)])
+    sizes = np.linalg.svd(lagged @ lagged.T, compute_uv=False)
+    gain = np.ptp(run.position_um) / max(np.ptp(run.input), 1e-300)
+    noise = noise_of(run.position_um) / max(gain, 1e-300) * np.sqrt(lags)
+    return int((sizes > max(LEAST_EXCITATION**2 * sizes[0], noise**2)).sum()) // 2

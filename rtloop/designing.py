@@ -1,0 +1,137 @@
+"""What `rtloop design` does: from files to files and words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.config import Configuration, load
+from rtloop.design.assumptions import NoController
+from rtloop.design.augment import augmented
+from rtloop.design.discretise import discretise
+from rtloop.design.section import controller_section
+from rtloop.design.specification import DesignOptions
+from rtloop.design.synthesise import Synthesis, synthesise_design
+from rtloop.design.verify import Verification, as_dict, verify
+from rtloop.design.verify_page import page
+from rtloop.errors import ConfigError, NoDesign, OutputError
+from rtloop.law.options import AxisOptions
+from rtloop.report_design import print_synthesis, print_verification
+from rtloop.specifications import load_specification
+
+
+def synthesise_specification(spec: Path, out: Path | None, cross_check: bool, as_json: bool) -> int:
+    """Write [axis.controller] to `out` or stdout. Raises ConfigError, NoDesign, OutputError, MissingExtra."""
+    path, text, design = load_specification(spec)
+    try:
+        found = synthesise_design(design)
+    except NoController as error:
+        raise NoDesign(f"{spec}: {error}") from None
+    except ValueError as error:
+        raise ConfigError(str(spec), [str(error)]) from None
+    other = _slicot(found, design) if cross_check else None
+    section = controller_section(found, design, path.name, text)
+    if out is not None:
+        _write(out, section.encode())
+    if as_json:
+        click.echo(json.dumps(_as_dict(found, other, out)))
+        return 0
+    print_synthesis(found, other)
+    click.echo(section if out is None else f"{out}: put it below the [[axis]] that it is for", nl=out is not None)
+    return 0
+
+
+def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
+    """Judge every axis that has a controller; 1 where one misses its specification. Raises ConfigError, OutputError."""
+    configuration = load(config)
+    judged = {axis.name: _verified(configuration, axis, spec) for axis in configuration.axes if axis.controller}
+    if not judged:
+        raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
+    meets = all(found.meets for found, _ in judged.values())
+    report: dict[str, Any] = {
+        "name": configuration.name,
+        "meets": meets,
+        "axes": [{"name": name, **as_dict(found)} for name, (found, _) in judged.items()],
+    }
+    files = [] if out is None else _write_report(out, configuration.name, judged, report)
+    if as_json:
+        click.echo(json.dumps({**report, "files": [str(file) for file in files]}, allow_nan=False))
+    else:
+        for name, (found, _) in judged.items():
+            print_verification(name, found)
+        for file in files:
+            click.echo(file, err=True)
+    return 0 if meets else 1
+
+
+def _slicot(found: Synthesis, design: DesignOptions) -> float:
+    from rtloop.design.slicot import slicot_gamma
+
+    assert design.plant is not None
+    return slicot_gamma(augmented(design.plant.transfer(), found.weights), 10 * found.hinf.gamma_opt)[0]
+
+
+def _as_dict(found: Synthesis, other: float | None, out: Path | None) -> dict[str, Any]:
+    controller = found.controller
+    return {
+        "gamma_opt": found.hinf.gamma_opt,
+        "gamma": found.hinf.gamma,
+        "achieved": found.hinf.achieved,
+        "limiting": found.hinf.limiting,
+        "gamma_opt_slicot": other,
+        "full_order": found.full.order,
+        "hankel": found.hankel.tolist(),
+        "order": controller.order,
+        "achieved_reduced": found.achieved,
+        "gain": controller.gain,
+        "zeros": [[root.real, root.imag] for root in controller.zeros],
+        "poles": [[root.real, root.imag] for root in controller.poles],
+        "output": None if out is None else str(out),
+    }
+
+
+def _verified(configuration: Configuration, axis: AxisOptions, spec: Path | None) -> tuple[Verification, DesignOptions]:
+    assert axis.controller is not None
+    if spec is None and axis.specification is not None:
+        spec = configuration.folder / axis.specification
+    design = DesignOptions() if spec is None else load_specification(spec).design
+    model, options, where = axis.model or design.plant, axis.controller, f"axis.{axis.name}"
+    if model is None:
+        raise ConfigError(configuration.name, [f"{where}.model: missing; there is no plant to verify against"])
+    try:
+        controller = options.transfer()
+        discrete = discretise(controller, 1 / configuration.loop.rate_hz, options.method, options.prewarp_hz)
+        return verify(controller, discrete, model.transfer(), design, model.delay_ticks), design
+    except ValueError as error:
+        raise ConfigError(configuration.name, [f"{where}: {error}"]) from None
+
+
+def _write_report(
+    folder: Path, name: str, judged: dict[str, tuple[Verification, DesignOptions]], report: dict[str, Any]
+) -> list[Path]:
+    """verify.json, verify.html and the pictures of each axis."""
+    from rtloop.design.verify_plots import pictures
+
+    drawn = {
+        axis: pictures(found, design.specification, f"{name}, axis {axis}") for axis, (found, design) in judged.items()
+    }
+    html = page(f"{name}: verification", [(axis, found, drawn[axis]) for axis, (found, _) in judged.items()])
+    contents = {
+        "verify.json": json.dumps(report, indent=2, allow_nan=False).encode(),
+        "verify.html": html.encode(),
+        **{f"{axis}-{label}.png": png for axis, files in drawn.items() for label, png in files.items()},
+    }
+    for file, content in contents.items():
+        _write(folder / file, content)
+    return [folder / file for file in contents]
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror}") from None

@@ -1,0 +1,230 @@
+"""`rtloop identify` and `rtloop design compensation`: from files to reports, sections and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hil.linear import Real
+from rtloop.config import load as load_configuration
+from rtloop.design.compensation import compensated, residual_operator
+from rtloop.design.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
+from rtloop.design.identified import (
+    dynamics_provenance,
+    feedforward_of,
+    feedforward_section,
+    hysteresis_provenance,
+    model_section,
+    read_feedforward,
+    with_gain,
+    write_new,
+)
+from rtloop.design.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identify_hysteresis import Placement, Weights, identify_hysteresis
+from rtloop.design.measured import Measured, UnsuitableData, measured
+from rtloop.design.plays import model_output
+from rtloop.errors import ConfigError
+from rtloop.law.hysteresis import PlayModel
+
+Input = Literal["hysteresis", "command", "drive"]
+RANDOM_COMMANDS = 20_000
+
+
+def hysteresis_report(
+    paths: Sequence[Path],
+    *,
+    axis: str | None = None,
+    count: int = 15,
+    placement: Placement = "chebyshev",
+    thresholds_v: Sequence[float] | None = None,
+    weights: Weights = "invertible",
+    out: Path | None = None,
+    plot: Path | None = None,
+) -> dict[str, Any]:
+    """Identify, write what was asked for, and report. Raises RtloopError."""
+    runs = [measured(path, axis) for path in paths]
+    try:
+        fit = identify_hysteresis(runs, count, placement, thresholds_v, weights)
+    except ValueError as fault:
+        raise ConfigError("identify hysteresis", [str(fault)]) from None
+    if out is not None:
+        write_new(out, feedforward_section(fit.model, hysteresis_provenance(fit, runs)))
+    if plot is not None:
+        from rtloop.design.identification_plots import plot_hysteresis
+
+        plot_hysteresis(fit, runs[0], plot)
+    return plain(
+        {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs]}
+        | _as_dict(fit)
+        | {
+            "max_error_percent": 100 * fit.max_error_um / fit.range_um,
+            "measured_h_percent": fit.measured_loop.percent,
+            "model_h_percent": fit.model_loop.percent,
+            "invertible": fit.invertible,
+            "output": out,
+            "plot": plot,
+        }
+    )
+
+
+def excitation(run: Measured, how: Input, feedforward: PlayModel | None) -> Excitation:
+    """The input to D and its output. `feedforward` is the actuator's model, needed for "hysteresis"."""
+    if not run.even:
+        raise UnsuitableData(
+            f"{run.name}: ticks are missing or late by a period; dynamics need a record at equal intervals: record "
+            "again, unpaced or with real-time scheduling"
+        )
+    if how == "hysteresis":
+        assert feedforward is not None
+        return Excitation(run.name, model_output(feedforward, run.drive_v), run.position_um, run.period_s)
+    return Excitation(run.name, run.drive_v if how == "drive" else run.command_um, run.position_um, run.period_s)
+
+
+def dynamics_report(
+    paths: Sequence[Path],
+    *,
+    axis: str | None = None,
+    how: Input = "hysteresis",
+    hysteresis: Path | None = None,
+    order: int | None = None,
+    largest_order: int = 8,
+    criterion: Criterion = "aic",
+    compare: Path | None = None,
+    out: Path | None = None,
+    plot: Path | None = None,
+) -> dict[str, Any]:
+    """Identify from the first recording, judge with the others, write what was asked for. Raises RtloopError."""
+    runs = [measured(path, axis) for path in paths]
+    actuator = _actuator(runs[0], hysteresis, axis) if how == "hysteresis" else None
+    inputs = [excitation(run, how, actuator) for run in runs]
+    try:
+        fit = identify_dynamics(inputs[0], order, largest_order, criterion, inputs[1:])
+    except ValueError as fault:
+        raise ConfigError("identify dynamics", [str(fault)]) from None
+    found, compared = None, None
+    if compare is not None:
+        found, compared = _compared(fit, excitation(measured(compare, axis), how, actuator))
+    if out is not None:
+        write_new(out, _sections(fit, runs[0], how, actuator))
+    if plot is not None:
+        from rtloop.design.identification_plots import plot_dynamics
+
+        plot_dynamics(fit, inputs[0], found, plot)
+    tests = {"white": fit.tests.white, "independent": fit.tests.independent}
+    return plain(
+        {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs], "input": how}
+        | {key: value for key, value in _as_dict(fit).items() if key != "model"}
+        | {"order": fit.model.order, "tests": _as_dict(fit.tests) | tests}
+        | {"frequency_response": compared, "output": out, "plot": plot}
+    )
+
+
+def compensation_report(
+    config: Path,
+    identified: Path,
+    *,
+    axis: str | None = None,
+    command_um: float | None = None,
+    plot: Path | None = None,
+) -> dict[str, Any]:
+    """P∘P̂⁻¹ of the identified actuator and the compensator of `config`, with ρ and ξ, simulated. Raises RtloopError."""
+    compensator = read_feedforward(config, axis)
+    if command_um is None:
+        axes = load_configuration(config).axes
+        command_um = next(one for one in axes if axis in (None, one.name)).limits.command_um
+    actuator, (_, inverse) = actuator_model(read_feedforward(identified, axis)), compensator.models()
+    try:
+        residual = residual_operator(actuator, inverse, command_um)
+    except ValueError as fault:
+        raise ConfigError(str(config), [f"axis.feedforward: {fault}"]) from None
+    commands = {
+        "sine": command_um * np.sin(np.linspace(0, 5 * np.pi, RANDOM_COMMANDS)),
+        "random": np.random.default_rng(0).uniform(-command_um, command_um, RANDOM_COMMANDS),
+    }
+    gains = {"eq_2": residual.gain, "best": residual.best_gain, "unity": 1.0}
+    rows = []
+    for name, gain in gains.items():
+        worst = {"worst_case": residual.worst_commands_um(gain)}
+        simulated = {key: _largest(actuator, inverse, v, gain) for key, v in (commands | worst).items()}
+        rows.append({"gain": name, "rho": gain, "xi_um": residual.bound_um(gain), "simulated_um": simulated})
+    if plot is not None:
+        from rtloop.design.identification_plots import plot_compensation
+
+        plot_compensation(residual, actuator, inverse, plot)
+    return plain(
+        {
+            "config": config,
+            "identified": identified,
+            "command_um": command_um,
+            "thresholds_um": residual.operator.thresholds,
+            "weights": residual.operator.weights,
+            "bounds": rows,
+            "eq_3_um": residual.printed_bound_um,
+            "triangle_bound_um": residual.safe_bound_um,
+            "dead_band": compensator.dead_band,
+            "plot": plot,
+        }
+    )
+
+
+def actuator_model(options: Any) -> PlayModel:
+    """The forward model as it was identified, its dead band included."""
+    if options.thresholds_v:
+        return PlayModel(np.array(options.thresholds_v), np.array(options.weights_um_per_v))
+    return options.models()[0]
+
+
+def _actuator(run: Measured, hysteresis: Path | None, axis: str | None) -> PlayModel:
+    """From the file given, else from the configuration that the recording was made with."""
+    if hysteresis is not None:
+        return actuator_model(read_feedforward(hysteresis, axis))
+    return actuator_model(feedforward_of(run.configuration, f"{run.name}: configuration", axis))
+
+
+def _compared(fit: DynamicsFit, run: Excitation) -> tuple[FrequencyResponse, Agreement]:
+    found = frequency_response(run.input, run.position_um - run.position_um[0], run.period_s)
+    return found, agreement(fit.model, found)
+
+
+def _sections(fit: DynamicsFit, run: Measured, how: Input, actuator: PlayModel | None) -> str:
+    content = model_section(fit, dynamics_provenance(fit, run, how))
+    if actuator is None:
+        return content
+    comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below put into it"]
+    return feedforward_section(with_gain(actuator, fit.static_gain), comments) + "\n" + content
+
+
+def _largest(actuator: PlayModel, inverse: PlayModel, command: Real, gain: float) -> float:
+    return float(np.abs(compensated(actuator, inverse, command) - gain * command).max())
+
+
+def _as_dict(fit: Any) -> dict[str, Any]:
+    """A dataclass's fields; asdict would copy what has no fields of its own wrongly."""
+    return {name: getattr(fit, name) for name in fit.__dataclass_fields__}
+
+
+def plain(value: Any) -> Any:
+    """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite."""
+    if isinstance(value, PlayModel):
+        return {"thresholds_v": plain(value.thresholds), "weights_um_per_v": plain(value.weights)}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return plain(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(_as_dict(value))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    if isinstance(value, complex | np.complexfloating):
+        return [float(value.real), float(value.imag)]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, int | np.integer):
+        return int(value)
+    return str(value) if isinstance(value, Path) else value

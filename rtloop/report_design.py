@@ -1,0 +1,51 @@
+"""What the terminal shows of a design. No numbers are made here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from rtloop.design.synthesise import Synthesis
+from rtloop.design.verify import Verification
+from rtloop.design.verify_text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+
+RED = {"MISSED", "NO"}
+
+
+def print_synthesis(found: Synthesis, slicot: float | None) -> None:
+    """γ, orders and norms, on stderr: stdout is for the section itself."""
+    hinf = found.hinf
+    click.echo(f"γ_opt {hinf.gamma_opt:.6g}; just below it fails: {hinf.limiting}", err=True)
+    if slicot is not None:
+        click.echo(f"SLICOT's SB10AD: {slicot:.6g}, {100 * (slicot / hinf.gamma_opt - 1):+.5f} %", err=True)
+    click.echo(
+        f"order {found.full.order} at γ = {hinf.gamma:.6g} achieves {hinf.achieved:.6g}; "
+        f"order {found.controller.order} achieves {found.achieved:.6g}",
+        err=True,
+    )
+
+
+def print_verification(name: str, found: Verification) -> None:
+    """Every table of one axis, and the answer."""
+    console = Console(highlight=False, width=None if Console().is_terminal else 160)
+    console.print(f"[bold]axis {name}[/]")
+    console.print(_table(HEADINGS, table(found)))
+    if found.robustness.shifts:
+        console.print("\nThe resonance may move by")
+        console.print(_table(("", ""), shifts(found)))
+    console.print()
+    console.print(_table(ROBUSTNESS_HEADINGS, robustness(found)))
+    console.print(NOTE)
+    console.print(f"\n[bold]{answer(found)}[/]")
+    for warning in found.warnings:
+        click.echo(f"warning: {warning}", err=True)
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    shown = Table(*headings, box=None, show_header=any(headings), pad_edge=False, padding=(0, 3, 0, 0))
+    for row in rows:
+        shown.add_row(*(f"[red]{cell}[/]" if cell in RED else cell for cell in row))
+    return shown

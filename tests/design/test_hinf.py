@@ -1,0 +1,191 @@
+"""The Glover-Doyle solver: the paper's γ, textbook answers, SLICOT where it is installed, and why there is no answer."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from rtloop.design.assumptions import NoController
+from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.design.hinf import synthesise_hinf
+from rtloop.design.norm import hinf_norm
+from rtloop.design.paper import PAPER_D
+from rtloop.design.transfer import Transfer
+from rtloop.design.weights import PAPER_WEIGHTS
+from tests.design.plants import dense_norm, hamiltonian_norm, random_plant
+
+NORMALISED_D = Transfer(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain / PAPER_D.dc_gain)
+
+
+@pytest.mark.parametrize(("plant", "gamma_opt"), [(PAPER_D, 1.6761), (NORMALISED_D, 1.6802)])
+def test_the_papers_problem(plant, gamma_opt) -> None:
+    """γ_opt of eqs (5), (15), (17), (19), recomputed independently; the controller has order 11, as the paper says."""
+    standard = augmented(plant, PAPER_WEIGHTS)
+    found = synthesise_hinf(standard)
+    assert found.gamma_opt == pytest.approx(gamma_opt, abs=2e-3)
+    assert found.gamma == pytest.approx(1.004 * found.gamma_opt)
+    assert found.controller.a.shape == (11, 11)
+    assert found.limiting.startswith("coupling")
+    loop = standard.closed_with(found.controller)
+    for norm in (dense_norm(*loop), hamiltonian_norm(*loop)):
+        assert norm <= 1.002 * found.gamma
+        assert norm == pytest.approx(found.achieved, rel=1e-4)
+
+
+def scalar_plant(a: float) -> GeneralisedPlant:
+    """x' = a x + w1 + u, z = (x, u), y = x + w2 (Doyle, Glover, Khargonekar & Francis 1989, section II, in one state)."""
+    one = np.ones((1, 1))
+    return GeneralisedPlant(
+        a * one, np.array([[1.0, 0.0]]), one, np.array([[1.0], [0.0]]), one,
+        np.zeros((2, 2)), np.array([[0.0], [1.0]]), np.array([[0.0, 1.0]]), 0 * one,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("a", [-30.0, -1.0, 0.0, 0.5, 4.0])
+def test_a_scalar_plant_in_closed_form(a) -> None:
+    """X = Y = (a + √(a² + 1 − γ⁻²))/(1 − γ⁻²) and X·Y = γ² at γ_opt; √2 for a = 0."""
+
+    def gap(gamma: float) -> float:
+        slope = 1 - gamma**-2
+        return (a + math.sqrt(a * a + slope)) / slope / gamma - 1
+
+    expected = math.sqrt(2) if a == 0 else brentq(gap, 1 + 1e-9, 100, xtol=1e-12) if gap(1 + 1e-9) > 0 else None
+    found = synthesise_hinf(scalar_plant(a))
+    if expected is not None:
+        assert found.gamma_opt == pytest.approx(expected, rel=1e-6)
+    assert dense_norm(*scalar_plant(a).closed_with(found.controller)) <= 1.002 * found.gamma
+
+
+def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
+    """With free commands, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
+    plant = Transfer.from_zpk([20.0], [-5.0, -40.0], -1.0)
+    w1 = Transfer.from_zpk([-9.0], [-0.01], 0.5)
+    free = augmented(plant, PAPER_WEIGHTS._replace(
+        tracking=w1, command=Transfer.from_zpk([], [], 1e-5), disturbance=Transfer.from_zpk([], [], 0.0)
+    ))  # fmt: skip
+    assert synthesise_hinf(free).gamma_opt == pytest.approx(0.5 * 29 / 20.01, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 4, 5, 6, 8, 13, 23, 29, 30])
+def test_random_plants_keep_their_promise(seed) -> None:
+    """Two independent norms of the loop stay below γ, with any number of inputs, D11 and D22 not zero, unstable modes."""
+    plant = random_plant(seed)
+    found = synthesise_hinf(plant)
+    loop = plant.closed_with(found.controller)
+    assert dense_norm(*loop) <= 1.002 * found.gamma
+    assert hamiltonian_norm(*loop) <= 1.002 * found.gamma
+
+
+def slicot(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
+    slycot = pytest.importorskip("slycot")
+    m2, p2 = plant.b2.shape[1], plant.c2.shape[0]
+    b, c = np.hstack([plant.b1, plant.b2]), np.vstack([plant.c1, plant.c2])
+    d = np.block([[plant.d11, plant.d12], [plant.d21, np.zeros((p2, m2))]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # slycot warns of rounding close to γ_opt
+        gamma, *controller = slycot.sb10ad(
+            len(plant.a), b.shape[1], c.shape[0], m2, p2, start, plant.a, b, c, d, job=1
+        )[:5]
+    return gamma, Matrices(*controller)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 6, 7, 9, 14, 16, 18, 19, 25, 27])
+def test_random_plants_as_slicot(seed) -> None:
+    """γ_opt of SLICOT's SB10AD, for orders 2 to 20."""
+    plant = random_plant(seed)
+    found = synthesise_hinf(plant)
+    gamma, controller = slicot(plant, 2 * found.gamma_opt)
+    bare = plant._replace(d22=0 * plant.d22)
+    assert dense_norm(*bare.closed_with(controller)) <= 1.001 * gamma  # SLICOT's own promise, kept here
+    assert found.gamma_opt == pytest.approx(gamma, rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", [5, 8, 13, 28])
+def test_where_slicot_promises_too_much(seed) -> None:
+    """Where bisection steps over a limit that a Riccati equation sets, SB10AD's controller misses SB10AD's γ."""
+    plant = random_plant(seed)
+    found = synthesise_hinf(plant)
+    gamma, controller = slicot(plant, 2 * found.gamma_opt)
+    reached = dense_norm(*plant._replace(d22=0 * plant.d22).closed_with(controller))
+    assert reached > 1.1 * gamma
+    assert gamma < found.gamma_opt <= reached * (1 + 1e-4)
+
+
+@pytest.mark.parametrize("plant", [PAPER_D, NORMALISED_D])
+def test_the_papers_problem_as_slicot(plant) -> None:
+    standard = augmented(plant, PAPER_WEIGHTS)
+    found = synthesise_hinf(standard)
+    assert found.gamma_opt == pytest.approx(slicot(standard, 2 * found.gamma_opt)[0], rel=1e-4)
+
+
+def test_no_smaller_gamma_will_do() -> None:
+    with pytest.raises(NoController, match=r"gamma: 1.676 cannot be reached; 1.676.* can. coupling"):
+        synthesise_hinf(augmented(PAPER_D, PAPER_WEIGHTS), gamma=1.676)
+
+
+def changed(**parts) -> GeneralisedPlant:
+    return scalar_plant(1.0)._replace(**{name: np.array(value, dtype=float) for name, value in parts.items()})
+
+
+@pytest.mark.parametrize(
+    ("plant", "says"),
+    [
+        (changed(b2=[[0]]), r"stabilisability: u does not move the mode at s = 1 rad/s"),
+        (changed(c2=[[0]]), r"detectability: y does not show the mode at s = 1 rad/s"),
+        (changed(d12=[[0], [0]]), r"rank: D12 has rank 0 of 1.*every u must cost something"),
+        (changed(d21=[[0, 0]]), r"rank: D21 has rank 0 of 1.*every y must be disturbed"),
+        (changed(b2=[[0]], c2=[[0]]), r"stabilisability.*; detectability"),
+        (changed(c1=[[1], [1]], d12=[[1], [1]], d11=[[0, 0], [0, 0]]), None),
+        (scalar_plant(0.0)._replace(c1=np.zeros((2, 1))), r"imaginary-axis zero: the path from u to z .* ω = 0 rad/s"),
+        (scalar_plant(0.0)._replace(b1=np.zeros((1, 2))), r"imaginary-axis zero: the path from w to y .* ω = 0 rad/s"),
+    ],
+)
+def test_the_condition_that_fails_is_named(plant, says) -> None:
+    if says is None:
+        assert synthesise_hinf(plant).achieved < math.inf
+        return
+    with pytest.raises(NoController, match=says):
+        synthesise_hinf(plant)
+
+
+@pytest.mark.parametrize(
+    ("plant", "gamma", "says"),
+    [
+        (scalar_plant(0.0), 1.2, "coupling"),
+        (scalar_plant(0.0), 0.9, "Riccati equation of the state feedback"),
+        (scalar_plant(0.0)._replace(d11=np.array([[2.0, 0.0], [0.0, 0.0]])), 1.9, "direct part D11"),
+    ],
+)
+def test_what_limits_gamma_is_named(plant, gamma, says) -> None:
+    with pytest.raises(NoController, match=says):
+        synthesise_hinf(plant, gamma=gamma)
+
+
+def test_an_integrating_weight_is_refused_by_name() -> None:
+    """W1 with a pole at 0: the error's integral is a mode that y does not show."""
+    integrating = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0], 1.0))
+    with pytest.raises(NoController, match="detectability: y does not show the mode at s = 0 rad/s"):
+        synthesise_hinf(augmented(PAPER_D, integrating))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000), st.floats(-3, 3))
+def test_the_norm_is_that_of_a_dense_grid(seed, exponent) -> None:
+    plant = random_plant(seed)
+    stable = plant.a - (max(np.linalg.eigvals(plant.a).real.max(), 0) + 10**exponent) * np.eye(len(plant.a))
+    system = Matrices(stable, plant.b1, plant.c1, plant.d11)
+    assert hinf_norm(system).norm == pytest.approx(dense_norm(*system), rel=1e-5)
+
+
+def test_the_norm_of_an_undamped_and_of_a_narrow_resonance() -> None:
+    """1/(s² + 2ζs + 1) has 1/(2ζ√(1 − ζ²)); an unstable system has no norm."""
+    for damping in (1e-2, 1e-5):
+        system = Matrices(
+            np.array([[0.0, 1.0], [-1.0, -2 * damping]]), np.array([[0.0], [1.0]]), np.eye(2)[:1], np.zeros((1, 1))
+        )
+        assert hinf_norm(system).norm == pytest.approx(1 / (2 * damping * math.sqrt(1 - damping**2)), rel=1e-5)
+    assert hinf_norm(system._replace(a=-system.a)).norm == math.inf

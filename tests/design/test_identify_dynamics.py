@@ -1,0 +1,198 @@
+"""Dynamics from steps and chirps: against the rig's poles, against mpmath, and what is refused."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+
+from hil.linear import Modal, modal_sum
+from rtloop.design.frequency_response import agreement, frequency_response
+from rtloop.design.identify_dynamics import identify_dynamics
+from rtloop.design.innovations import Innovations
+from rtloop.design.inverse_hold import continuous_modes
+from rtloop.design.measured import UnsuitableData
+from rtloop.design.paper import PAPER_D
+from rtloop.design.prediction_error import Excitation, excited_order
+from rtloop.design.residuals import residual_tests
+from tests.design.rigs import EQ_4, FAST_S, chirp_drive, closeness, drawn, excited, identified, step_drive
+
+PAIR_AND_REAL = Innovations(
+    FAST_S,
+    np.array([-200 + 3000j, -500 + 0j]),
+    np.array([0.02 - 0.01j, 0.03 + 0j]),
+    np.array([0.05 + 0.02j, 0.1 + 0j]),
+    0.3,
+)
+
+
+@pytest.mark.parametrize("seed", [201, 202, 203])
+def test_a_drawn_rig_comes_out_of_a_slow_sine_and_a_step(seed: int) -> None:
+    rig = drawn(seed)
+    found = closeness(rig, *identified(rig))
+    print(f"seed {seed}: {found}")
+    assert found.loop_percent <= 1.0
+    assert abs(found.resonance_percent) <= 0.5
+    assert abs(found.damping_percent) <= 20.0
+    assert abs(found.gain_percent) <= 1.0
+
+
+def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
+    rig = drawn(204)
+    model = type(EQ_4)(rig.thresholds, rig.weights)
+    chirp, step = (excited(model, rig.measure(drive, FAST_S)) for drive in (chirp_drive(), step_drive()))
+    fit = identify_dynamics(chirp, largest_order=5, criterion="validation", validation=[step])
+    light = min(fit.modes, key=lambda mode: mode.damping)
+    assert light.frequency_hz == pytest.approx(rig.resonance_hz, rel=0.005)
+    assert light.damping == pytest.approx(rig.damping, rel=0.2)
+    assert abs(light.frequency_hz - rig.resonance_hz) < 0.5
+    assert fit.static_gain == pytest.approx(rig.d0, rel=0.01)
+    assert fit.transfer.dc_gain == pytest.approx(1.0, abs=1e-12)
+    assert min(c.validation_rms_um for c in fit.candidates) < 0.2
+
+
+def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:
+    rig = drawn(205)
+    model = type(EQ_4)(rig.thresholds, rig.weights)
+    fit = identify_dynamics(excited(model, rig.measure(step_drive(), FAST_S)), order=4)
+    chirp = excited(model, rig.measure(chirp_drive(duration_s=4.0), FAST_S))
+    found = agreement(fit.model, frequency_response(chirp.input, chirp.position_um, FAST_S))
+    assert found.median_deviation < 0.02
+    assert found.from_hz < 20
+    assert found.to_hz > 900
+
+
+def test_standard_deviations_are_those_of_repeated_experiments() -> None:
+    """20 recordings with other noise: the spread of the estimates is the deviation that each of them reports."""
+    drive, random = step_drive(duration_s=0.4), np.random.default_rng(3)
+    clean = Innovations(FAST_S, PAIR_AND_REAL.rates, PAIR_AND_REAL.residues, np.zeros(2, complex)).output(drive)
+    runs = [Excitation("made", drive, clean + random.normal(0, 0.02, drive.size), FAST_S) for _ in range(20)]
+    fits = [identify_dynamics(run, order=3) for run in runs]
+    pairs = [min(fit.modes, key=lambda mode: mode.damping) for fit in fits]
+    size, damping = abs(PAIR_AND_REAL.rates[0]) / (2 * np.pi), 200 / abs(PAIR_AND_REAL.rates[0])
+    for values, deviations, true in (
+        ([one.frequency_hz for one in pairs], [one.frequency_std_hz for one in pairs], size),
+        ([one.damping for one in pairs], [one.damping_std for one in pairs], damping),
+    ):
+        assert np.std(values) == pytest.approx(np.mean(deviations), rel=0.6)
+        assert abs(np.mean(values) - true) < 4 * np.mean(deviations) / np.sqrt(20)
+
+
+def test_sensitivities_are_the_derivatives_of_the_errors() -> None:
+    random = np.random.default_rng(1)
+    u, y = random.normal(size=400), random.normal(size=400)
+    errors = PAIR_AND_REAL.errors(u, y)
+    assert errors is not None
+    rows = PAIR_AND_REAL.sensitivities(u, errors, noise=True)
+    values = PAIR_AND_REAL.pack(noise=True)
+    for i, row in enumerate(rows):
+        h = 1e-6 * max(abs(values[i]), 1.0)
+        sides = [
+            PAIR_AND_REAL.unpack(values + s * h * np.eye(values.size)[i], noise=True).errors(u, y) for s in (1, -1)
+        ]
+        assert np.allclose((sides[0] - sides[1]) / (2 * h), row, rtol=1e-5, atol=1e-6 * np.abs(row).max())
+
+
+def test_errors_are_those_of_the_armax_polynomials() -> None:
+    """ε from A y − B u = C ε with the polynomials multiplied out, which is fine for three poles."""
+    random = np.random.default_rng(2)
+    u, y = random.normal(size=50), random.normal(size=50)
+    images, pair = PAIR_AND_REAL.images, PAIR_AND_REAL.discrete()
+    a = np.poly([images[0], images[0].conj(), images[1]]).real
+
+    def numerator(residues: np.ndarray) -> np.ndarray:
+        rest = [np.poly(np.delete(pair.poles, i)) * r for i, r in enumerate(residues)]
+        return np.sum(rest, axis=0).real
+
+    gains = PAIR_AND_REAL.noise_gains
+    b = numerator(pair.residues[0])
+    c = a + np.concatenate([[0.0], numerator(np.array([gains[0], gains[1], gains[0].conj()]))])
+    centred, expected = y - PAIR_AND_REAL.offset, np.zeros(50)
+    past = lambda signal, k, i: signal[k - i] if k >= i else 0.0
+    for k in range(50):
+        expected[k] = centred[k] + sum(a[i] * past(centred, k, i) for i in (1, 2, 3))
+        expected[k] -= sum(b[i] * past(u, k, i + 1) for i in range(3))
+        expected[k] -= sum(c[i] * past(expected, k, i) for i in (1, 2, 3))
+    assert np.allclose(PAIR_AND_REAL.errors(u, y), expected, atol=1e-10)
+
+
+def exactly_held(modal: Modal, period_s: float) -> list[tuple[mpmath.mpc, mpmath.mpc]]:
+    """Poles and residues of the zero-order hold at 50 digits."""
+    found = []
+    for pole, residue in zip(modal.poles, modal.residues[0], strict=True):
+        p, r = mpmath.mpc(pole), mpmath.mpc(residue)
+        image = mpmath.exp(p * mpmath.mpf(period_s))
+        found.append((image, r * (image - 1) / p))
+    return found
+
+
+@pytest.mark.parametrize("case", ["eq 5 below 5 kHz", "order 20", "-1 beside -1e5 rad/s"])
+def test_the_inverse_hold_keeps_its_digits(case: str) -> None:
+    """Discrete modes computed by mpmath at 50 digits, rounded to double, come back to the continuous ones."""
+    random = np.random.default_rng(5)
+    if case == "order 20":
+        upper = -random.uniform(1, 500, 10) + 1j * np.geomspace(10, 2e4, 10)
+        modal = Modal(np.concatenate([upper, upper.conj()]), np.ones((1, 20), complex), np.zeros(1))
+    elif case == "eq 5 below 5 kHz":
+        full = modal_sum(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain)
+        kept = np.abs(full.poles.imag) < np.pi / FAST_S
+        modal = Modal(full.poles[kept], full.residues[:, kept], np.zeros(1))
+    else:
+        modal = Modal(np.array([-1.0 + 0j, -1e5 + 0j]), np.array([[2.0 + 0j, -3e4 + 0j]]), np.zeros(1))
+    with mpmath.workdps(50):
+        held = exactly_held(modal, FAST_S)
+    discrete = Modal(
+        np.array([complex(image) for image, _ in held]), np.array([[complex(r) for _, r in held]]), np.zeros(1)
+    )
+    back = continuous_modes(discrete, FAST_S)
+    # a pole in z near 1 holds −1 rad/s at 1e-4 s to 1e-16/1e-4 only: that is the recording's own limit
+    lost = 1e-15 / np.abs(modal.poles * FAST_S) + 1e-14
+    assert np.all(np.abs(back.poles / modal.poles - 1) < lost)
+    assert np.all(np.abs(back.residues[0] / modal.residues[0] - 1) < 4 * lost)
+
+
+def test_twenty_modes_and_slow_beside_fast_are_predicted_exactly() -> None:
+    """The output of a sum of 20 modes, slowest −1 and fastest −1e5 rad/s, against mpmath's own recursion."""
+    rates = np.concatenate([[-1.0 + 0j, -1e5 + 0j], -np.geomspace(5, 900, 9) + 1j * np.geomspace(20, 25e3, 9)])
+    residues = np.concatenate([[1e-4 + 0j, 0.5 + 0j], (0.01 + 0.02j) * np.ones(9)])
+    model = Innovations(FAST_S, rates, residues, np.zeros(11, complex))
+    assert model.order == 20
+    u = np.random.default_rng(4).normal(size=300)
+    with mpmath.workdps(50):
+        images = [mpmath.exp(mpmath.mpc(rate) * mpmath.mpf(FAST_S)) for rate in rates]
+        states, expected = [mpmath.mpc(0)] * 11, []
+        for value in u:
+            sums = [(2 if rate.imag else 1) * r * x for rate, r, x in zip(rates, residues, states, strict=True)]
+            expected.append(float(mpmath.fsum(sums).real))
+            states = [image * x + mpmath.mpf(float(value)) for image, x in zip(images, states, strict=True)]
+    assert np.allclose(model.output(u), expected, rtol=1e-11, atol=1e-12)
+
+
+def test_a_real_mode_at_negative_z_has_no_counterpart() -> None:
+    with pytest.raises(ValueError, match="no counterpart"):
+        continuous_modes(Modal(np.array([-0.5 + 0j]), np.ones((1, 1), complex), np.zeros(1)), FAST_S)
+
+
+def test_residual_tests_tell_white_from_coloured_and_dependent() -> None:
+    random = np.random.default_rng(6)
+    u, e = random.normal(size=5000), random.normal(size=5000)
+    assert residual_tests(u, e, 6).white
+    assert residual_tests(u, e, 6).independent
+    coloured = e + 0.5 * np.roll(e, 1)
+    assert not residual_tests(u, coloured, 6).white
+    assert not residual_tests(u, e + 0.3 * np.concatenate([[0, 0], np.diff(u)[:-1]]), 6).independent
+
+
+def test_a_slow_sine_is_too_little_for_dynamics() -> None:
+    time_s = FAST_S * np.arange(20_000)
+    slow = 10 * np.sin(2 * np.pi * 0.5 * time_s)
+    run = Excitation("slow", slow, 4 * slow + np.random.default_rng(1).normal(0, 0.01, slow.size), FAST_S)
+    assert excited_order(run) <= 1
+    with pytest.raises(UnsuitableData, match=r"too little excitation: the input can tell .* a step or a chirp"):
+        identify_dynamics(run, order=4)
+
+
+def test_validation_without_a_recording_to_validate_on_is_a_contradiction() -> None:
+    run = Excitation("made", step_drive(), step_drive(), FAST_S)
+    with pytest.raises(ValueError, match="criterion 'validation': another recording is needed"):
+        identify_dynamics(run, criterion="validation")

@@ -1,0 +1,165 @@
+"""Hysteresis from slow sines: against the rig's own plays, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.hysteresis import THRESHOLDS_V
+from rtloop.design.identified import feedforward_of, feedforward_section
+from rtloop.design.identify_hysteresis import identify_hysteresis, placed_thresholds
+from rtloop.design.loop_shape import loop_shape
+from rtloop.design.measured import Measured, UnsuitableData, require_usable
+from rtloop.design.plays import loading_curve, model_output, play_outputs, turning_points
+from rtloop.law.hysteresis import PlayModel
+from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
+
+DRIVES = st.lists(st.floats(-10, 10), min_size=1, max_size=60)
+
+
+def run_of(drive: np.ndarray, position: np.ndarray) -> Measured:
+    return Measured("made", SLOW_S, drive, position, position, True, "", "")
+
+
+def made_of(model: PlayModel, drive: np.ndarray, offset: float = 0.0) -> Measured:
+    """A recording without noise or dynamics: a tick's position was measured before its drive was written."""
+    return run_of(drive, offset + np.concatenate([[0.0], model_output(model, drive)[:-1]]))
+
+
+@given(DRIVES)
+def test_plays_over_a_recording_are_the_plays_sample_by_sample(drive: list[float]) -> None:
+    thresholds = (0.0, 0.3, 2.0, 11.0)
+    state, expected = np.zeros(4), []
+    for u in drive:
+        state = np.array([max(u - r, min(u + r, last)) for r, last in zip(thresholds, state, strict=True)])
+        expected.append(state)
+    assert np.array_equal(play_outputs(drive, thresholds), expected)
+
+
+@given(DRIVES)
+def test_turning_points_alternate_and_leave_no_turn_out(drive: list[float]) -> None:
+    u = np.array(drive)
+    turns = u[turning_points(u, 1.0)]
+    steps = np.diff(turns)
+    assert np.all(np.abs(steps) >= 1.0)
+    assert np.all(steps[1:] * steps[:-1] < 0)
+
+
+def test_chebyshev_thresholds_of_ten_volts_are_those_of_eq_4() -> None:
+    assert np.abs(placed_thresholds(15, 10.0, "chebyshev") - THRESHOLDS_V).max() < 0.05
+
+
+def test_h_over_h_of_eq_4() -> None:
+    """14.659 %, computed from the printed weights with plays stepped one by one."""
+    drive = slow_sine()
+    shape = loop_shape(drive, model_output(EQ_4, drive))
+    assert shape.percent == pytest.approx(14.659, abs=0.03)
+    assert shape.width == pytest.approx(2 * 43.01835, rel=2e-3)
+    assert loading_curve(EQ_4, 10.0) == pytest.approx(43.01835, abs=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.floats(0.3, 4.0), min_size=2, max_size=8), st.floats(-5, 5))
+def test_without_noise_the_weights_come_back(slopes: list[float], offset: float) -> None:
+    model = PlayModel(np.linspace(0.2, 8.0, len(slopes)), np.diff(slopes, prepend=0.0))
+    fit = identify_hysteresis([made_of(model, slow_sine(), offset)], thresholds_v=model.thresholds.tolist())
+    assert np.allclose(fit.model.weights, model.weights, atol=1e-8)
+    assert fit.offsets_um[0] == pytest.approx(offset, abs=1e-8)
+    assert fit.max_error_um < 1e-8
+
+
+@pytest.mark.parametrize("seed", [101, 102, 103])
+@pytest.mark.parametrize("placement", ["chebyshev", "uniform"])
+def test_a_drawn_rig_is_found_within_one_percent_of_its_range(seed: int, placement) -> None:
+    rig, drive = drawn(seed), slow_sine()
+    fit = identify_hysteresis([rig.measure(drive, SLOW_S)], placement=placement)
+    truth = rig.static_um(drive)
+    error = np.abs(model_output(fit.model, drive) - truth).max() / np.ptp(truth)
+    print(f"seed {seed}, {placement}: error {100 * error:.3f} % of range")
+    assert error <= 0.01
+    assert fit.invertible
+    assert fit.offsets_um[0] == pytest.approx(rig.options.plant.sensor.offset_um, abs=0.05)
+    assert fit.model_loop.percent == pytest.approx(fit.measured_loop.percent, abs=0.5)
+
+
+def test_several_recordings_share_the_weights_and_have_offsets_of_their_own() -> None:
+    runs = [made_of(EQ_4, slow_sine(), 1.0), made_of(EQ_4, slow_sine(5.0), -2.0)]
+    fit = identify_hysteresis(runs, thresholds_v=EQ_4.thresholds.tolist())
+    assert np.allclose(fit.model.weights, EQ_4.weights, atol=1e-8)
+    assert np.allclose(fit.offsets_um, (1.0, -2.0), atol=1e-8)
+
+
+def test_weights_that_no_inverse_has_are_found_free_and_kept_invertible_on_request() -> None:
+    true = PlayModel(np.array([0.1, 2.0, 5.0]), np.array([2.0, -2.5, 3.0]))
+    runs, given_v = [made_of(true, slow_sine())], true.thresholds.tolist()
+    free = identify_hysteresis(runs, thresholds_v=given_v, weights="free")
+    assert np.allclose(free.model.weights, true.weights)
+    assert not free.invertible
+    with pytest.raises(UnsuitableData, match=r"every partial sum must be above 0.*invertible"):
+        feedforward_section(free.model, [])
+    kept = identify_hysteresis(runs, thresholds_v=given_v)
+    assert np.all(np.cumsum(kept.model.weights) >= kept.least_slope_um_per_v * (1 - 1e-9))
+    kept.model.inverse()
+
+
+def test_a_section_reads_back_to_the_same_bits() -> None:
+    fit = identify_hysteresis([made_of(EQ_4, slow_sine())])
+    options = feedforward_of(feedforward_section(fit.model, ["from here"]), "made")
+    assert options.thresholds_v == tuple(fit.model.thresholds.tolist())
+    assert options.weights_um_per_v == tuple(fit.model.weights.tolist())
+
+
+def test_a_drive_that_does_not_turn_back_is_too_little() -> None:
+    with pytest.raises(UnsuitableData, match="too little excitation: the drive turns back 0 times; at least 2"):
+        identify_hysteresis([made_of(EQ_4, np.linspace(0, 10, 5000))])
+
+
+def test_a_drive_that_starts_elsewhere_is_refused() -> None:
+    with pytest.raises(UnsuitableData, match=r"starts at 10 V.*memory is not known"):
+        identify_hysteresis([made_of(EQ_4, 10 * np.cos(np.linspace(0, 15, 5000)))])
+
+
+def test_thresholds_that_were_never_reached_are_named() -> None:
+    with pytest.raises(UnsuitableData, match=r"thresholds from 6 V on are never reached by a drive of at most 5 V"):
+        identify_hysteresis([made_of(EQ_4, slow_sine(5.0))], thresholds_v=[0.0, 3.0, 6.0, 9.0])
+
+
+def test_operators_that_the_samples_cannot_tell_apart_are_refused() -> None:
+    coarse = np.array([0.0, *[10.0, -10.0] * 60])
+    with pytest.raises(UnsuitableData, match="15 weights cannot be told apart"):
+        identify_hysteresis([made_of(EQ_4, coarse)])
+
+
+@pytest.mark.parametrize("rail_um", [30.0, 42.0])
+def test_clipped_readings_are_refused(rail_um: float) -> None:
+    drive = slow_sine()
+    position = np.clip(
+        made_of(EQ_4, drive).position_um + np.random.default_rng(1).normal(0, 0.01, drive.size), -99, rail_um
+    )
+    with pytest.raises(UnsuitableData, match="saturated: the reading stands still"):
+        require_usable("made", drive, position, position / 10)
+
+
+def test_a_whole_recording_is_not_taken_for_clipped() -> None:
+    drive = slow_sine()
+    exact = made_of(EQ_4, drive).position_um
+    require_usable("made", drive, exact, exact / 10)
+    measured = drawn(7).measure(drive, SLOW_S).position_um
+    require_usable("made", drive, measured, measured / 10)
+
+
+def test_a_position_within_its_noise_is_too_little() -> None:
+    random = np.random.default_rng(1)
+    with pytest.raises(UnsuitableData, match="too little excitation: the position moves by"):
+        require_usable("made", slow_sine(0.001), noise := random.normal(0, 0.01, 25_000), noise)
+    with pytest.raises(UnsuitableData, match="the drive stays at 0 V"):
+        require_usable("made", np.zeros(25_000), noise, noise)
+
+
+def test_options_that_cannot_be_are_named() -> None:
+    with pytest.raises(ValueError, match="placement: 'random'; allowed are chebyshev, uniform"):
+        placed_thresholds(5, 10.0, "random")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="number of operators: 65; 1 to 64"):
+        placed_thresholds(65, 10.0, "uniform")

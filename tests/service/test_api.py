@@ -1,0 +1,256 @@
+"""The control API of a real service on a board: what it does, what it refuses, and what the recording says of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from websockets.sync.client import unix_connect
+
+import rtloop
+from rtloop.engine.memory import Word
+from tests.faults.account import account, runs_in
+from tests.faults.bench import Bench, wait_for
+from tests.service.http import answer, exchange
+
+GOOD_CONTROLLER = {
+    "form": "zpk",
+    "gain": 60.0,
+    "poles": [[-0.5, 0.0]],
+    "method": "tustin",
+}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """One service for all tests, outputs off until it is armed; each test leaves it stopped."""
+    changes = ("[recording]", "[service]\narm = true\n[recording]")
+    with Bench(tmp_path_factory.mktemp("api"), changes) as bench:
+        yield bench
+
+
+@pytest.fixture
+def running(bench: Bench) -> Iterator[Bench]:
+    """In closed loop."""
+    bench.client.post("/arm")
+    bench.client.post("/start")
+    bench.await_drive()
+    yield bench
+    bench.client.post("/stop")
+    bench.await_state("stopped")
+
+
+def events(bench: Bench, kind: str) -> list[dict[str, Any]]:
+    """Of this kind, in the recording as far as it is written."""
+    path = next((bench.folder / "recordings").glob("*.mcap.part"))
+    return [event for event in rtloop.load(path).events if event["kind"] == kind]
+
+
+def recorded(bench: Bench, kind: str, tick: int) -> dict[str, Any]:
+    """The event of a change, once it is written."""
+    found = wait_for(lambda: [e for e in events(bench, kind) if e["tick"] == tick], f"{kind} at {tick} in the file")
+    assert found[0]["who"] == "operator"
+    return found[0]
+
+
+def test_states_and_refusals(bench: Bench):
+    status = bench.client.get("/status")
+    assert (status["state"], status["armed"], status["mode"], status["trip"]) == ("stopped", False, "off", [])
+    for path, body in (("/start", {}), ("/mode", {"mode": "raw"})):
+        code, said = answer(bench, "POST", path, body)
+        assert code == 409
+        assert "not armed" in said["error"]
+    assert answer(bench, "POST", "/arm") == (200, {})
+    assert bench.client.get("/status")["state"] == "armed"
+    tick = bench.client.post("/start")["tick"]
+    assert bench.client.get("/status")["state"] == "running"
+    assert recorded(bench, "set_mode", tick)["what"]["mode"] == "closed_loop"
+    tick = bench.client.post("/stop")["tick"]
+    assert recorded(bench, "set_mode", tick)["what"]["mode"] == "off"
+    bench.await_state("stopped")
+    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+
+
+def test_a_trip_latches_until_the_reset(running: Bench):
+    tick = running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 5.0}})["tick"]
+    assert recorded(running, "load_law", tick)["axis"] == "x"
+    running.await_state("tripped", "position")
+    for path, body in (("/start", {}), ("/arm", {}), ("/mode", {"mode": "feedforward"})):
+        assert answer(running, "POST", path, body)[0] == 409
+    running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 60.0}})
+    tick = running.client.post("/reset")["tick"]
+    recorded(running, "reset_trip", tick)
+    assert running.client.get("/status")["state"] in ("stopped", "ramping")
+    assert answer(running, "POST", "/start")[0] == 409
+    running.client.post("/arm")
+
+
+def test_modes_and_references(running: Bench):
+    for reference in ({"kind": "hold", "value": 12.0}, {"kind": "triangle", "amplitude": 3.0, "frequency_hz": 2.0},
+                      {"kind": "steps", "levels": [1.0, 2.0], "dwell_s": 0.1}):  # fmt: skip
+        tick = running.client.post("/reference", {"axis": "x", "reference": reference})["tick"]
+        recorded(running, "set_reference", tick)
+    running.client.post("/setpoint", {"axis": "x", "value": 11.0})
+    assert running.client.get("/status")["axes"]["x"]["reference_um"] == 11.0
+    running.client.post("/mode", {"mode": "feedforward"})
+    assert running.client.get("/status")["mode"] == "feedforward"
+
+
+@pytest.mark.parametrize(("path", "body"), [
+    ("/setpoint", {"axis": "x", "value": 43.0}),
+    ("/setpoint", {"axis": "y", "value": 1.0}),
+    ("/setpoint", {"axis": "x", "value": "one"}),
+    ("/setpoint", {"axis": "x"}),
+    ("/reference", {"axis": "x", "reference": {"kind": "sine", "amplitude": 30.0, "frequency_hz": 1.0, "offset": 20}}),
+    ("/reference", {"axis": "x", "reference": {"kind": "sawtooth"}}),
+    ("/waveform", {"axis": "x", "samples": []}),
+    ("/waveform", {"axis": "x", "samples": [99.0]}),
+    ("/waveform", {"axis": "x", "samples": [0.0], "hold_ticks": 0}),
+    ("/tune", {"axis": "x", "section": "limits", "values": {"drive_v": 12.0}}),
+    ("/tune", {"axis": "x", "section": "limits", "values": {"drive": 9.0}}),
+    ("/tune", {"axis": "x", "section": "feedforward", "values": {"dead_band": "exact"}}),
+    ("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.16}}),
+    ("/tune", {"axis": "x", "section": "controller", "values": {"gain": 1e308}}),
+    ("/controller", {"axis": "x", "controller": GOOD_CONTROLLER | {"gain": 6e5}}),
+    ("/controller", {"axis": "x", "controller": {"form": "nonsense"}}),
+    ("/mode", {"mode": "fast"}),
+    ("/mode", {"mode": "off", "more": 1}),
+])  # fmt: skip
+def test_what_is_outside_the_envelope_changes_nothing(bench: Bench, path: str, body: dict[str, Any]):
+    commands = int(bench.blocks[-1].words[Word.COMMANDS_HEAD])
+    code, said = answer(bench, "POST", path, body)
+    assert code == 422, said
+    assert said["error"]
+    assert int(bench.blocks[-1].words[Word.COMMANDS_HEAD]) == commands
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"{", b"[]", b"null", b"\xff\xfe", b'{"mode": NaN}', b"[" * 100_000, b'{"mode":']
+)
+def test_malformed_json(bench: Bench, data: bytes):
+    code, said = exchange(bench.client.path, "POST", "/mode", data)
+    assert code == 422
+    assert json.loads(said)["error"]
+
+
+def test_unknown_too_large_and_wrong_method(bench: Bench):
+    assert answer(bench, "GET", "/nowhere")[0] == 404
+    assert answer(bench, "GET", "/mode")[0] == 405
+    assert answer(bench, "DELETE", "/status")[0] == 405
+    code, said = exchange(bench.client.path, "POST", "/waveform", b" " * (5 << 20))
+    assert code == 413
+    assert "bytes" in json.loads(said)["error"]
+    samples = [0.0] * 600_000
+    code, said = answer(bench, "POST", "/waveform", {"axis": "x", "samples": samples})
+    assert code == 422
+    assert "at most" in said["error"]
+
+
+def test_a_waveform_plays_once(running: Bench):
+    samples = (15.0 + 5.0 * np.sin(np.linspace(0.0, 2 * np.pi, 500))).tolist()
+    tick = running.client.post("/waveform", {"axis": "x", "samples": samples, "hold_ticks": 2})["tick"]
+    assert recorded(running, "set_reference", tick)["what"]["values"][2:5] == [500.0, 2.0, 0.0]
+    wait_for(lambda: running.ticks > tick + 1100, "its end")
+    assert running.client.get("/status")["axes"]["x"]["reference_um"] == samples[-1]
+
+
+def test_setpoints_are_streamed(running: Bench):
+    with unix_connect(str(running.client.path), "ws://localhost/setpoints") as stream:
+        ticks = []
+        for value in np.linspace(10.0, 12.0, 20):
+            stream.send(json.dumps({"axis": "x", "value": value}))
+            ticks.append(json.loads(stream.recv())["tick"])
+        stream.send("nonsense")
+        assert "error" in json.loads(stream.recv())
+        stream.send(json.dumps({"axis": "x", "value": 99.0}))
+        assert "beyond" in json.loads(stream.recv())["error"]
+    assert ticks == sorted(set(ticks))
+    assert running.client.get("/status")["axes"]["x"]["reference_um"] == 12.0
+    assert "Traceback" not in running.log()
+
+
+def test_watch_tells_the_newest_signals(bench: Bench):
+    lines = iter(bench.client.watch())
+    first, second = next(lines), next(lines)
+    assert first["state"] == "stopped"
+    assert second["tick"] > first["tick"]
+    assert set(first["axes"]["x"]) >= {"position_um", "drive_v"}
+
+
+def test_tune_and_swap(running: Bench):
+    for path, body in (
+        ("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}}),
+        ("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}}),
+        ("/controller", {"axis": "x", "controller": GOOD_CONTROLLER}),
+    ):
+        tick = running.client.post(path, body)["tick"]
+        assert recorded(running, "load_law", tick)["axis"] == "x"
+    assert answer(running, "POST", "/setpoint", {"axis": "x", "value": 41.0})[0] == 422
+    assert running.client.get("/status")["state"] == "running"
+    running.client.post("/reload")  # back to the file
+    assert answer(running, "POST", "/setpoint", {"axis": "x", "value": 20.0})[0] == 200
+
+
+def test_reload(running: Bench):
+    good = running.config.read_text()
+    try:
+        assert running.client.post("/reload") == {"changed": []}
+        running.config.write_text(good.replace("offset = 20.0", "offset = 18.0\nphase_deg = 90.0"))
+        assert running.client.post("/reload") == {"changed": ["axis.x"]}
+        wait_for(lambda: [e for e in events(running, "set_reference") if e["what"]["values"][3] == 18.0], "a reference")
+        for bad, code, word in (
+            (good.replace("rate_hz = 4000", "rate_hz = 5000"), 409, "restart"),
+            (good.replace("gain = 0.016", "gain = 0.16"), 422, "unstable"),
+            (good + "[nonsense", 422, "TOML"),
+        ):
+            running.config.write_text(bad)
+            assert answer(running, "POST", "/reload")[0] == code
+            assert word in answer(running, "POST", "/reload")[1]["error"]
+    finally:
+        running.config.write_text(good)
+    assert running.client.post("/reload") == {"changed": ["axis.x"]}
+
+
+def test_metrics_and_description(bench: Bench):
+    families = {family.name: family for family in text_string_to_metric_families(bench.client.get("/metrics"))}
+    states = {sample.labels["state"]: sample.value for sample in families["rtloop_state"].samples}
+    assert sum(states.values()) == 1.0
+    assert states["stopped"] == 1.0
+    assert families["rtloop_ticks"].samples[0].value > 0
+    assert families["rtloop_rate_hz"].samples[0].value == pytest.approx(4000.0, rel=0.05)
+    description = bench.client.get("/openapi.json")
+    assert description["openapi"].startswith("3.1")
+    assert {"/status", "/metrics", "/mode", "/tune", "/controller", "/waveform"} <= set(description["paths"])
+    schema = description["paths"]["/tune"]["post"]["requestBody"]["content"]["application/json"]["schema"]
+    assert schema["required"] == ["axis", "section", "values"]
+    assert schema["additionalProperties"] is False
+
+
+def test_the_socket_is_for_owner_and_group(bench: Bench):
+    mode = os.stat(bench.client.path).st_mode
+    assert stat.S_ISSOCK(mode)
+    assert stat.S_IMODE(mode) == 0o660
+
+
+def test_a_client_that_says_nothing_hinders_nobody(bench: Bench):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as silent:
+        silent.connect(str(bench.client.path))
+        silent.send(b"POST /mode HTTP/1.1\r\nContent-Length: 100\r\n\r\n{")
+        assert bench.client.get("/status")["state"] == "stopped"
+
+
+def test_the_end_is_whole_and_replays(bench: Bench):
+    """Last in this file: the service that all tests shared ends, and everything is in its recording."""
+    assert bench.stop() == 0
+    found = account(bench.folder / "recordings", bench.blocks)
+    assert found.problems == []
+    assert found.lost == 0
+    assert "Traceback" not in bench.log()
+    assert len(runs_in(bench.folder / "recordings")) == 1
