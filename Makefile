@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults soak-daemon soak-flood soak-recordings check install uninstall test-systemd clean soak-identification
+.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings check install uninstall test-systemd clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -20,9 +20,12 @@ test: $(READY)
 faults: $(READY)
 	$(BIN)/python -m tests.faults
 
-# The control API under eight clients beside a paced run; the daemon on a board for an hour.
+# The control API under eight clients beside a paced run; swaps through it; the daemon on a board for an hour.
 soak-flood: $(READY)
 	$(BIN)/python -m tests.soak.api_flood
+
+soak-swaps: $(READY)
+	$(BIN)/python -m tests.soak.swaps
 
 soak-daemon: $(READY)
 	$(BIN)/python -m tests.soak.daemon

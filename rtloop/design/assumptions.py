@@ -70,7 +70,8 @@ def _axis_zeros(which: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
         if value.imag < 0 or not on_axis:
             continue
         if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), unseen]).T):
-            faults.append(f"imaginary-axis zero: the path {which} has a zero at ω = {value.imag:.6g} rad/s")
+            place = f"the path {which} has a zero at ω = {value.imag:.6g} rad/s"
+            faults.append(f"imaginary-axis zero: {place}; a little damping would help")
     return faults
 
 

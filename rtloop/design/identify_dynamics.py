@@ -28,6 +28,8 @@ from rtloop.design.transfer import Transfer
 from rtloop.design.zeros import zeros_and_gain
 
 Criterion = Literal["aic", "validation"]
+LEAST_EXCITED = 4
+"""Poles that the input must be able to tell apart where the order is searched for."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def identify_dynamics(
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': another recording is needed to validate on")
     excited = excited_order(run)
-    wanted = order or 1
+    wanted = order or LEAST_EXCITED
     if excited < wanted:
         raise UnsuitableData(
             f"{run.name}: too little excitation: the input can tell {excited} poles apart, {wanted} are asked for; "

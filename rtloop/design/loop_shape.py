@@ -10,7 +10,7 @@ import numpy as np
 from hil.linear import Real
 from rtloop.design.plays import turning_points
 
-BINS = 200
+BINS = 1000
 
 
 class LoopShape(NamedTuple):

@@ -42,12 +42,16 @@ def synthesise(
     reduction: ReductionMethod = "residualise",
     backoff: float = 0.004,
     largest_loss: float = 0.1,
+    largest_gamma: float = np.inf,
 ) -> Synthesis:
     """The whole chain. `order` of the reduced controller, by default the lowest whose weighted loop has a norm of at
-    most (1 + `largest_loss`)·γ. Raises NoController, ValueError for an order that leaves no stable loop.
+    most (1 + `largest_loss`)·γ. Raises NoController, also where γ_opt exceeds `largest_gamma`, and ValueError for an
+    order that leaves no stable loop.
     """
     standard = augmented(plant, weights)
     found = synthesise_hinf(standard, backoff=backoff)
+    if found.gamma_opt > largest_gamma:
+        raise NoController(_contradiction(plant, weights, found.gamma_opt, largest_gamma))
     full = Transfer.from_state_space(*found.controller)
     allowed = np.inf if order is not None else (1 + largest_loss) * found.gamma
     for candidate in range(full.order + 1) if order is None else [order]:
@@ -86,13 +90,11 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
     plant, weights, how = design.plant.transfer(), weights_of(design), design.synthesis
     _check(plant, design)
-    found = synthesise(
+    return synthesise(
         plant, weights, order=how.order, reduction=how.reduction,
         backoff=how.backoff_percent / 100, largest_loss=how.largest_loss_percent / 100,
+        largest_gamma=how.largest_gamma,
     )  # fmt: skip
-    if found.hinf.gamma_opt > how.largest_gamma:
-        raise NoController(_contradiction(plant, weights, found.hinf.gamma_opt, how.largest_gamma))
-    return found
 
 
 def _check(plant: Transfer, design: DesignOptions) -> None:

@@ -128,7 +128,10 @@ class SharedBlock:
         return self._arrays["words"]
 
     def claim(self) -> None:
-        """Mark the calling process as the one that drives, for as long as it lives."""
+        """Mark the calling process as the one that drives, for as long as it lives.
+
+        The kernel drops the claim with the first descriptor of the file that the process closes: keep the block.
+        """
         self.words[Word.LOOP_PID] = os.getpid()
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
 

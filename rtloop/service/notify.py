@@ -28,6 +28,12 @@ class Notifier:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel, contextlib.suppress(OSError):
             channel.sendto(message.encode(), self._address)
 
+    def limit_watchdog(self, limit_s: float | None = None) -> None:
+        """Change how long the watchdog waits; back to what the unit says, by default."""
+        limit_s = limit_s or self.watchdog_s
+        if self.watchdog_s and limit_s:
+            self.send(WATCHDOG_USEC=round(limit_s * 1e6))
+
     def due(self, period_s: float) -> bool:
         """True once a period, for what is told again and again."""
         now_s = time.monotonic()

@@ -25,6 +25,7 @@ _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 SHORTEST_PERIOD_S = 0.0001
 """The ramp takes its steps at the loop's rate, like the loop's own, but no faster than an interpreter can."""
 POLL_S = 0.005
+KILL_S = 5.0
 MARGIN_S = 2.0
 """Beyond what a loop without its supervisor needs, before it is taken to stand still."""
 
@@ -77,7 +78,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
     while (pid := block.driven_by()) is not None:
         if int(block.words[Word.HEARTBEAT_NS]) != beat_ns:
             raise UnavailableError(f"process {pid} drives the outputs and its service is alive; stop that instead")
-        if time.monotonic() > kill_s + MARGIN_S:
+        if time.monotonic() > kill_s + KILL_S:
             raise DriverError(f"process {pid} drives the outputs and cannot be killed")
         if time.monotonic() > kill_s:
             with suppress(ProcessLookupError):

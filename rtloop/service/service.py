@@ -34,7 +34,7 @@ from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
 from rtloop.service.paths import block_path
 from rtloop.service.preparation import prepare_actuator
-from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.service.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 from rtloop.signals import Flag, Mode
 
 POLL_S = 0.005
@@ -218,6 +218,8 @@ class Service:
         if not self._ready and supervisor.ticks >= READY_TICKS:
             self._ready = True
             self.notifier.send(READY=1)
+        if self._told_ticks == 0 and supervisor.ticks:
+            self.notifier.limit_watchdog()
         if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4)):
             return
         if supervisor.ticks > self._told_ticks or supervisor.block.words[Word.STOP]:
@@ -242,6 +244,7 @@ class Service:
         if len(self._deaths_s) > options.restarts:
             return False
         self._told_ticks = 0
+        self.notifier.limit_watchdog(START_TIMEOUT_S)  # outputs are parked; the next loop has its own time limit
         time.sleep(RESTART_PAUSE_S)
         return True
 

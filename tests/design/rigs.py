@@ -147,9 +147,7 @@ def closeness(rig: Rig, shape: HysteresisFit, dynamics: DynamicsFit) -> Closenes
         100 * (mode.damping / rig.damping - 1),
         100 * float(model[top] / truth[top] - 1),
         dynamics.model.order,
-        *tightness(
-            rig, PlayModel(shape.model.thresholds, dynamics.static_gain * shape.model.weights), shape.max_error_um
-        ),
+        *tightness(rig, actuator, shape.max_error_um),
     )
 
 

@@ -1,4 +1,4 @@
-"""The Glover-Doyle solver: the paper's γ, textbook answers, SLICOT where it is installed, and why there is no answer."""
+"""The Glover-Doyle solver: the paper's γ, textbook answers, SLICOT where it is installed, or why there is none."""
 
 import math
 import warnings
@@ -37,7 +37,7 @@ def test_the_papers_problem(plant, gamma_opt) -> None:
 
 
 def scalar_plant(a: float) -> GeneralisedPlant:
-    """x' = a x + w1 + u, z = (x, u), y = x + w2 (Doyle, Glover, Khargonekar & Francis 1989, section II, in one state)."""
+    """x' = a x + w1 + u, z = (x, u), y = x + w2 (Doyle, Glover, Khargonekar & Francis 1989, one state)."""
     one = np.ones((1, 1))
     return GeneralisedPlant(
         a * one, np.array([[1.0, 0.0]]), one, np.array([[1.0], [0.0]]), one,
@@ -72,7 +72,7 @@ def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 4, 5, 6, 8, 13, 23, 29, 30])
 def test_random_plants_keep_their_promise(seed) -> None:
-    """Two independent norms of the loop stay below γ, with any number of inputs, D11 and D22 not zero, unstable modes."""
+    """Two independent norms of the loop stay below γ, with D11 and D22 not zero and unstable modes."""
     plant = random_plant(seed)
     found = synthesise_hinf(plant)
     loop = plant.closed_with(found.controller)

@@ -70,7 +70,7 @@ def test_without_noise_the_weights_come_back(slopes: list[float], offset: float)
     assert fit.max_error_um < 1e-8
 
 
-@pytest.mark.parametrize("seed", [101, 102, 103])
+@pytest.mark.parametrize("seed", [101, 102])
 @pytest.mark.parametrize("placement", ["chebyshev", "uniform"])
 def test_a_drawn_rig_is_found_within_one_percent_of_its_range(seed: int, placement) -> None:
     rig, drive = drawn(seed), slow_sine()

@@ -14,6 +14,9 @@ from tests.faults.fault import Row, measure
 FAULTS = (*processes.FAULTS, *hardware.FAULTS, *storage.FAULTS, *requests.FAULTS, *clock.FAULTS)
 COLUMNS = ("fault", "what must happen", "safe after", "lost / executed", "largest |drive|, step (allowed)", "verdict")
 
+LONGEST = 120
+"""Characters of a problem in the table; all of it goes to stderr."""
+
 
 def cells(row: Row) -> tuple[str, ...]:
     """A row as text."""
@@ -25,7 +28,7 @@ def cells(row: Row) -> tuple[str, ...]:
     verdict = f"not possible here: {row.skipped}" if row.skipped else ("holds" if not row.problems else "FAILS")
     notes = [measured.note] if measured.note else []
     return (row.fault.name, row.fault.must, safe, f"{ticks.lost} / {ticks.executed}", drive,
-            "; ".join([verdict, *notes, *row.problems]))  # fmt: skip
+            "; ".join([verdict, *notes, *(problem[:LONGEST] for problem in row.problems)]))  # fmt: skip
 
 
 def main() -> int:

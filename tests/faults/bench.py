@@ -6,52 +6,22 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from hil import board
-from hil.board import LSB_V, BoardMemory
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import RtloopError
 from rtloop.service.client import Client
 from tests.faults import plain_card
-from tests.faults.configuration import ROOT, SLEW_V_PER_S, on_a_board, on_a_card
+from tests.faults.configuration import ROOT, on_a_board, on_a_card
+from tests.faults.evidence import TIMEOUT_S, Evidence, wait_for
 
-START_TIMEOUT_S, TIMEOUT_S = 120.0, 20.0
-POLL_S = 0.002
-
-
-class Seen(NamedTuple):
-    """What the board says of its output; `late_s` is how late its own clock ever was."""
-
-    last_v: float
-    lowest_v: float
-    highest_v: float
-    largest_step_v: float
-    moved_ns: int
-    late_s: float
-
-    @property
-    def largest_v(self) -> float:
-        return max(-self.lowest_v, self.highest_v)
+START_TIMEOUT_S = 120.0
 
 
-def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = TIMEOUT_S) -> Any:
-    """The first true value of `condition`; a failure that names `what` once the time is over."""
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
-        if value := condition():
-            return value
-        time.sleep(POLL_S)
-    raise AssertionError(f"not within {timeout_s:g} s: {what}")
-
-
-class Bench:
+class Bench(Evidence):
     """`with Bench(folder) as bench`: a service that runs in closed loop on a board, or on a plain card."""
 
     def __init__(
@@ -64,7 +34,8 @@ class Bench:
         name: str = "lab",
         environment: dict[str, str] | None = None,
     ) -> None:
-        self.folder, self.card, self.config = folder, card, folder / f"{name}.toml"
+        super().__init__(folder, card)
+        self.config = folder / f"{name}.toml"
         self._with_board = board and not card
         self.config.write_text(text or (on_a_card if card else on_a_board)(folder, *changes))
         self.environment = os.environ | {
@@ -76,9 +47,7 @@ class Bench:
         self.board: subprocess.Popen[str] | None = None
         self.service: subprocess.Popen[str] | None = None
         self.blocks: list[SharedBlock] = []
-        self.witnessed: list[Seen] = []
         self._started: list[subprocess.Popen[str]] = []
-        self.struck_ns = 0
         if card:
             plain_card.install(folder)
 
@@ -170,7 +139,8 @@ class Bench:
         try:
             wait_for(there, f"{state} {' '.join(causes)}", timeout_s)
         except AssertionError as error:
-            raise AssertionError(f"{error}; there is {report}; {self.log()[-1000:]}") from None
+            there_is = {key: report.get(key) for key in ("state", "trip", "faults")}
+            raise AssertionError(f"{error}; there is {there_is}; {self.log()[-600:]}") from None
         return report
 
     def await_restart(self, count: int = 1) -> None:
@@ -199,56 +169,6 @@ class Bench:
     def log(self) -> str:
         """What all processes said."""
         return (self.folder / "log").read_text()
-
-    # what the board says
-
-    @property
-    def memory(self) -> BoardMemory:
-        """The board's memory."""
-        fd = os.open(self.folder / "board", os.O_RDWR | os.O_CLOEXEC)
-        try:
-            return BoardMemory(fd)
-        finally:
-            os.close(fd)
-
-    def seen(self) -> Seen:
-        """What the output did, read from the board."""
-        if self.card:
-            record = np.memmap(self.folder / "card", plain_card.MEMORY, "r", shape=(1,))[0]
-            late_s = 0.0
-        else:
-            memory = self.memory
-            record, late_s = memory.seen[0], float(memory.words[board.LONGEST_LATE_NS]) / 1e9
-        values = [record[name] for name in ("last_v", "lowest_v", "highest_v", "largest_step_v")]
-        return Seen(*map(float, values), int(record["moved_ns"]), late_s)
-
-    def ask_for(self, fault: int) -> None:
-        """A fault of the board or of the card."""
-        if self.card:
-            np.memmap(self.folder / "card", plain_card.MEMORY, "r+", shape=(1,))["fault"] = fault
-        else:
-            self.memory.words[board.FAULT] = fault
-
-    def strike(self, *faults: Callable[[], Any]) -> None:
-        """Bring about a fault, and remember when."""
-        self.struck_ns = time.monotonic_ns()
-        for fault in faults:
-            fault()
-
-    def await_safe(self, within_ms: float) -> float:
-        """ms from the fault until the output was at 0 V for good, by the board's own clock."""
-        wait_for(lambda: self.seen().last_v == 0.0, "a safe output")
-        took_ms = (self.seen().moved_ns - self.struck_ns) / 1e6
-        assert took_ms <= within_ms, f"safe after {took_ms:.0f} ms, allowed {within_ms:g} ms"
-        return took_ms
-
-    def witness(self) -> None:
-        """Keep what the board says now: a board that is started again forgets."""
-        self.witnessed.append(self.seen())
-
-    def step_bound_v(self, rate_hz: float, seen: Seen) -> float:
-        """What the slew allows between two looks: a period where every write is seen, else two and the lateness."""
-        return SLEW_V_PER_S * (1 / rate_hz if self.card else 2 / rate_hz + seen.late_s) + LSB_V
 
     def stop(self) -> int:
         """SIGTERM to the service; its exit code."""

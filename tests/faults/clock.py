@@ -10,7 +10,9 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from tests.faults.bench import Bench, wait_for
+from rtloop.engine.memory import Word
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 
 SOURCE = Path(__file__).with_name("stepping_clock.c")
@@ -27,7 +29,7 @@ def stepping_clock(folder: Path) -> dict[str, str]:
 
 
 def steps(bench: Bench) -> Measured:
-    first = int(bench.blocks[-1].words[10])
+    first = int(bench.blocks[-1].words[Word.START_UNIX_NS])
     ticks = bench.ticks
     bench.strike()
     wait_for(lambda: bench.ticks > ticks + 12_000, "three seconds")

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rtloop.engine.memory import Word
-from tests.faults.bench import Bench, wait_for
+from rtloop.engine.memory import ProcessState, Word
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 
 SMALL = "size=900k"
@@ -34,7 +35,11 @@ def small_disk(folder: Path) -> Iterator[None]:
 
 def disk_full(bench: Bench) -> Measured:
     bench.strike()
-    wait_for(lambda: int(bench.blocks[-1].words[Word.RECORDER_STATE]) == 4, "a recorder that cannot write", 60.0)
+    wait_for(
+        lambda: int(bench.blocks[-1].words[Word.RECORDER_STATE]) == ProcessState.FAILED,
+        "a recorder that cannot write",
+        60.0,
+    )
     ticks = bench.ticks
     wait_for(lambda: bench.ticks > ticks + 4000, "another second")
     assert bench.status()["state"] == "running"
@@ -58,7 +63,7 @@ def ring_overrun(bench: Bench) -> Measured:
         os.kill(last, signal.SIGCONT)
     wait_for(lambda: int(words[Word.RECORDER_CURSOR]) > bench.ticks - 4000, "a recorder that keeps up")
     assert bench.status()["state"] == "running"
-    return Measured(lost_allowed=True, note=f"{len(stopped)} recorders stopped in a row")
+    return Measured(lost_allowed=True, exit_code=1, note=f"{len(stopped)} recorders stopped in a row")
 
 
 FAULTS = (

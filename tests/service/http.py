@@ -11,6 +11,12 @@ from typing import Any
 from tests.faults.bench import Bench
 
 TIMEOUT_S = 20.0
+GOOD_CONTROLLER = {
+    "form": "zpk",
+    "gain": 60.0,
+    "poles": [[-0.5, 0.0]],
+    "method": "tustin",
+}
 
 
 def exchange(path: Path, method: str, resource: str, body: bytes = b"") -> tuple[int, bytes]:

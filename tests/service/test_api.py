@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-import stat
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,36 +11,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import unix_connect
 
 import rtloop
-from rtloop.engine.memory import Word
 from tests.faults.account import account, runs_in
-from tests.faults.bench import Bench, wait_for
-from tests.service.http import answer, exchange
-
-GOOD_CONTROLLER = {
-    "form": "zpk",
-    "gain": 60.0,
-    "poles": [[-0.5, 0.0]],
-    "method": "tustin",
-}
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """One service for all tests, outputs off until it is armed; each test leaves it stopped."""
-    changes = ("[recording]", "[service]\narm = true\n[recording]")
-    with Bench(tmp_path_factory.mktemp("api"), changes) as bench:
-        yield bench
-
-
-@pytest.fixture
-def running(bench: Bench) -> Iterator[Bench]:
-    """In closed loop."""
-    bench.client.post("/arm")
-    bench.client.post("/start")
-    bench.await_drive()
-    yield bench
-    bench.client.post("/stop")
-    bench.await_state("stopped")
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.service.http import GOOD_CONTROLLER, answer
 
 
 def events(bench: Bench, kind: str) -> list[dict[str, Any]]:
@@ -101,56 +71,6 @@ def test_modes_and_references(running: Bench):
     assert running.client.get("/status")["axes"]["x"]["reference_um"] == 11.0
     running.client.post("/mode", {"mode": "feedforward"})
     assert running.client.get("/status")["mode"] == "feedforward"
-
-
-@pytest.mark.parametrize(("path", "body"), [
-    ("/setpoint", {"axis": "x", "value": 43.0}),
-    ("/setpoint", {"axis": "y", "value": 1.0}),
-    ("/setpoint", {"axis": "x", "value": "one"}),
-    ("/setpoint", {"axis": "x"}),
-    ("/reference", {"axis": "x", "reference": {"kind": "sine", "amplitude": 30.0, "frequency_hz": 1.0, "offset": 20}}),
-    ("/reference", {"axis": "x", "reference": {"kind": "sawtooth"}}),
-    ("/waveform", {"axis": "x", "samples": []}),
-    ("/waveform", {"axis": "x", "samples": [99.0]}),
-    ("/waveform", {"axis": "x", "samples": [0.0], "hold_ticks": 0}),
-    ("/tune", {"axis": "x", "section": "limits", "values": {"drive_v": 12.0}}),
-    ("/tune", {"axis": "x", "section": "limits", "values": {"drive": 9.0}}),
-    ("/tune", {"axis": "x", "section": "feedforward", "values": {"dead_band": "exact"}}),
-    ("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.16}}),
-    ("/tune", {"axis": "x", "section": "controller", "values": {"gain": 1e308}}),
-    ("/controller", {"axis": "x", "controller": GOOD_CONTROLLER | {"gain": 6e5}}),
-    ("/controller", {"axis": "x", "controller": {"form": "nonsense"}}),
-    ("/mode", {"mode": "fast"}),
-    ("/mode", {"mode": "off", "more": 1}),
-])  # fmt: skip
-def test_what_is_outside_the_envelope_changes_nothing(bench: Bench, path: str, body: dict[str, Any]):
-    commands = int(bench.blocks[-1].words[Word.COMMANDS_HEAD])
-    code, said = answer(bench, "POST", path, body)
-    assert code == 422, said
-    assert said["error"]
-    assert int(bench.blocks[-1].words[Word.COMMANDS_HEAD]) == commands
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"{", b"[]", b"null", b"\xff\xfe", b'{"mode": NaN}', b"[" * 100_000, b'{"mode":']
-)
-def test_malformed_json(bench: Bench, data: bytes):
-    code, said = exchange(bench.client.path, "POST", "/mode", data)
-    assert code == 422
-    assert json.loads(said)["error"]
-
-
-def test_unknown_too_large_and_wrong_method(bench: Bench):
-    assert answer(bench, "GET", "/nowhere")[0] == 404
-    assert answer(bench, "GET", "/mode")[0] == 405
-    assert answer(bench, "DELETE", "/status")[0] == 405
-    code, said = exchange(bench.client.path, "POST", "/waveform", b" " * (5 << 20))
-    assert code == 413
-    assert "bytes" in json.loads(said)["error"]
-    samples = [0.0] * 600_000
-    code, said = answer(bench, "POST", "/waveform", {"axis": "x", "samples": samples})
-    assert code == 422
-    assert "at most" in said["error"]
 
 
 def test_a_waveform_plays_once(running: Bench):
@@ -231,19 +151,6 @@ def test_metrics_and_description(bench: Bench):
     schema = description["paths"]["/tune"]["post"]["requestBody"]["content"]["application/json"]["schema"]
     assert schema["required"] == ["axis", "section", "values"]
     assert schema["additionalProperties"] is False
-
-
-def test_the_socket_is_for_owner_and_group(bench: Bench):
-    mode = os.stat(bench.client.path).st_mode
-    assert stat.S_ISSOCK(mode)
-    assert stat.S_IMODE(mode) == 0o660
-
-
-def test_a_client_that_says_nothing_hinders_nobody(bench: Bench):
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as silent:
-        silent.connect(str(bench.client.path))
-        silent.send(b"POST /mode HTTP/1.1\r\nContent-Length: 100\r\n\r\n{")
-        assert bench.client.get("/status")["state"] == "stopped"
 
 
 def test_the_end_is_whole_and_replays(bench: Bench):

@@ -155,7 +155,7 @@ def await_running(timeout_s: float = 60.0) -> None:
 
 def acknowledge() -> None:
     """Reset what a check caused, and drive again."""
-    until(lambda: ctl("status").get("tick"), 60.0, "a new loop", 0.2)
+    until(lambda: ctl("status").get("tick"), 120.0, "a new loop", 0.2)
     status = ctl("status")
     require(status["state"] == "tripped", f"state {status['state']} after a fault; expected: tripped until it is reset")
     ctl("reset")
