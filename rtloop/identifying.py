@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +28,7 @@ from rtloop.design.measured import Measured, UnsuitableData, measured
 from rtloop.design.plays import model_output
 from rtloop.errors import ConfigError
 from rtloop.law.hysteresis import PlayModel
+from rtloop.plain import fields_of, plain
 
 Input = Literal["hysteresis", "command", "drive"]
 RANDOM_COMMANDS = 20_000
@@ -59,7 +59,7 @@ def hysteresis_report(
         plot_hysteresis(fit, runs[0], plot)
     return plain(
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs]}
-        | _as_dict(fit)
+        | fields_of(fit)
         | {
             "max_error_percent": 100 * fit.max_error_um / fit.range_um,
             "measured_h_percent": fit.measured_loop.percent,
@@ -117,8 +117,8 @@ def dynamics_report(
     tests = {"white": fit.tests.white, "independent": fit.tests.independent}
     return plain(
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs], "input": how}
-        | {key: value for key, value in _as_dict(fit).items() if key != "model"}
-        | {"order": fit.model.order, "tests": _as_dict(fit.tests) | tests}
+        | {key: value for key, value in fields_of(fit).items() if key != "model"}
+        | {"order": fit.model.order, "tests": fields_of(fit.tests) | tests}
         | {"frequency_response": compared, "output": out, "plot": plot}
     )
 
@@ -200,31 +200,3 @@ def _sections(fit: DynamicsFit, run: Measured, how: Input, actuator: PlayModel |
 
 def _largest(actuator: PlayModel, inverse: PlayModel, command: Real, gain: float) -> float:
     return float(np.abs(compensated(actuator, inverse, command) - gain * command).max())
-
-
-def _as_dict(fit: Any) -> dict[str, Any]:
-    """A dataclass's fields; asdict would copy what has no fields of its own wrongly."""
-    return {name: getattr(fit, name) for name in fit.__dataclass_fields__}
-
-
-def plain(value: Any) -> Any:
-    """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite."""
-    if isinstance(value, PlayModel):
-        return {"thresholds_v": plain(value.thresholds), "weights_um_per_v": plain(value.weights)}
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return plain(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain(_as_dict(value))
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(item) for item in value]
-    if isinstance(value, complex | np.complexfloating):
-        return [float(value.real), float(value.imag)]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, int | np.integer):
-        return int(value)
-    return str(value) if isinstance(value, Path) else value

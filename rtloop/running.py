@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.config import load
 from rtloop.errors import LoopFault, OutputError
 from rtloop.prepare import Prepared, prepare
@@ -29,7 +30,7 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
     """Run, record, report; returns the exit code."""
     with Processes() as processes:
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
-        for warning in prepared.warnings:
+        for warning in (*prepared.warnings, *_cache_warnings()):
             click.echo(f"warning: {warning}", err=True)
         path = recording_path(prepared, out)
         recover_leftovers(path.parent)
@@ -47,6 +48,13 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
     if summary["error"]:
         click.echo(f"rtloop: {summary['error']}", err=True)
     return result.exit_code or (LoopFault.exit_code if summary["trips"] else 0)
+
+
+def _cache_warnings() -> list[str]:
+    """What to say where compiled code cannot be kept."""
+    if CACHE_IS_PERSISTENT:
+        return []
+    return [f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is made anew when that is gone"]
 
 
 def run_summary(prepared: Prepared, result: RunResult) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def placed_thresholds(count: int, largest_v: float, placement: Placement) -> Rea
     """`count` thresholds in V below `largest_v`, the largest drive.
 
     "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
-    give those of eq (4). "uniform": R·i/n from 0 on, without a dead band.
+    give those of eq (4) within 0.02 V. "uniform": R·i/n from 0 on, without a dead band.
     """
     if placement not in get_args(Placement):
         raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")

@@ -15,9 +15,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hil.linear import Modal, Real
+from hil.linear import Modal, Real, RepeatedPoles, modal_sum
 from rtloop.design.gramian import modal_root, modal_vectors, real_modal_system, system_roots
-from rtloop.design.realisation import System, beside_imaginary_axis, cascade, scaled, well_conditioned_sum
+from rtloop.design.realisation import System, beside_imaginary_axis, cascade, scaled
 from rtloop.design.transfer import Transfer
 
 ReductionMethod = Literal["residualise", "truncate"]
@@ -37,9 +37,11 @@ class Reduced(NamedTuple):
 
 
 class _Balanced(NamedTuple):
-    a: Real
-    b: Real
-    c: Real
+    """A stable part, and the change of coordinates x = forward·z, z = back·x that balances it; `hankel` falls."""
+
+    system: System
+    forward: Real
+    back: Real
     hankel: Real
 
 
@@ -75,23 +77,25 @@ def reduce_order(
             f"order: {order} of a controller of order {transfer.order} with {kept_always} modes that are not stable; "
             f"{kept_always} to {transfer.order} are allowed"
         )
-    direct = stable.d if isinstance(stable, System) else float(stable.direct[0])
     kept = min(keep, balanced.hankel.size)
     bound = 2 * float(balanced.hankel[kept:].sum())
-    rest = _cut(balanced, kept, direct, method)
+    rest = _cut(balanced, kept, method)
     return Reduced(_with_unstable(rest, unstable), balanced.hankel, bound)
 
 
 def _parts(transfer: Transfer) -> tuple[Modal | System, Modal | None]:
     """The stable part and, where there are any, the modes that are not stable."""
-    points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
-    modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)
+    try:
+        modal = modal_sum(transfer.zeros, transfer.poles, transfer.gain)
+    except RepeatedPoles:
+        modal = None
     if modal is not None:
         stable = modal.poles.real < 0
         rest = Modal(modal.poles[~stable], modal.residues[:, ~stable], np.zeros(1))
         return Modal(modal.poles[stable], modal.residues[:, stable], modal.direct), rest if rest.poles.size else None
     if not transfer.is_stable:
         raise ValueError("poles: repeated ones beside unstable ones; such a controller cannot be reduced")
+    points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
     return scaled(cascade(transfer.zeros, transfer.poles, transfer.gain), points), None
 
 
@@ -108,21 +112,25 @@ def _balanced(part: Modal | System) -> _Balanced:
     kept = int(np.sum(hankel > MINIMAL * hankel.max(initial=0.0)))
     u, hankel, v = u[:, :kept], hankel[:kept], vh[:kept].T
     forward, back = left @ v / np.sqrt(hankel), (right @ u / np.sqrt(hankel)).T
-    return _Balanced(back @ system.a @ forward, back @ system.b, system.c @ forward, hankel)
+    return _Balanced(system, forward, back, hankel)
 
 
-def _cut(balanced: _Balanced, keep: int, direct: float, method: ReductionMethod) -> System:
-    """The first `keep` states; the others left out, or at rest for good."""
-    a, b, c, _ = balanced
-    kept, rest = slice(0, keep), slice(keep, None)
-    if method == "truncate" or keep == b.size:
-        return System(a[kept, kept], b[kept], c[kept], direct)
-    follow = np.linalg.solve(a[rest, rest], np.column_stack([a[rest, kept], b[rest]]))
+def _cut(balanced: _Balanced, keep: int, method: ReductionMethod) -> System:
+    """The first `keep` states; the others left out, or at rest for good.
+
+    Only the states that are kept are ever computed: residualising G(s) is truncating G(1/s), which has the same
+    balanced coordinates. So the rounding in states that hardly exist stays out, and C(0) is that of the original.
+    """
+    (a, b, c, direct), forward, back = balanced.system, balanced.forward[:, :keep], balanced.back[:keep]
+    if method == "truncate":
+        return System(back @ a @ forward, back @ b, c @ forward, direct)
+    inverse = np.linalg.solve(a, np.column_stack([forward, b]))
+    slow, at_rest = back @ inverse, c @ inverse  # of G(1/s): A⁻¹, A⁻¹b, and −c A⁻¹
+    fast = np.linalg.inv(slow[:, :keep])
+    b_fast = fast @ slow[:, keep]
+    c_fast = at_rest[:keep] @ fast
     return System(
-        a[kept, kept] - a[kept, rest] @ follow[:, :-1],
-        b[kept] - a[kept, rest] @ follow[:, -1],
-        c[kept] - c[rest] @ follow[:, :-1],
-        direct - float(c[rest] @ follow[:, -1]),
+        np.asarray(fast, dtype=float), b_fast, c_fast, direct - float(at_rest[keep]) + float(c_fast @ slow[:, keep])
     )
 
 

@@ -97,8 +97,8 @@ def test_a_lag_has_half_its_gain() -> None:
 @given(st.integers(0, 10_000), st.integers(0, 8), st.sampled_from(["residualise", "truncate"]))
 def test_glovers_bound_and_what_each_method_keeps(seed, keep, method) -> None:
     rng = np.random.default_rng(seed)
-    poles = -(10 ** rng.uniform(0, 5, 8))
-    transfer = Transfer.from_zpk(-(10 ** rng.uniform(0, 5, 8)), poles, rng.uniform(0.1, 10))
+    poles = -(10 ** rng.uniform(0, 3, 8))
+    transfer = Transfer.from_zpk(-(10 ** rng.uniform(0, 3, 8)), poles, rng.uniform(0.1, 10))
     reduced = reduce_order(transfer, keep, method)
     s = 1j * np.concatenate([[0.0], np.geomspace(1e-2, 1e8, 300)])
     error = np.abs(reduced.transfer.response(s) - transfer.response(s))

@@ -1,0 +1,39 @@
+"""Results as plain values, for JSON."""
+
+from __future__ import annotations
+
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.law.hysteresis import PlayModel
+
+
+def fields_of(value: Any) -> dict[str, Any]:
+    """A dataclass's fields as they are."""
+    return {name: getattr(value, name) for name in value.__dataclass_fields__}
+
+
+def plain(value: Any) -> Any:
+    """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite."""
+    if isinstance(value, PlayModel):
+        return {"thresholds_v": plain(value.thresholds), "weights_um_per_v": plain(value.weights)}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return plain(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(fields_of(value))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    if isinstance(value, complex | np.complexfloating):
+        return [float(value.real), float(value.imag)]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, int | np.integer):
+        return int(value)
+    return str(value) if isinstance(value, Path) else value
