@@ -12,6 +12,10 @@ from rich.table import Table
 
 from rtloop.config import load
 from rtloop.design.loop import LoopAnalysis, Tolerance, resonance_shift_tolerated
+from rtloop.design.verify import Verification
+from rtloop.design.verify_text import answer
+from rtloop.designing import verified
+from rtloop.law.options import AxisOptions
 from rtloop.prepare import AxisCheck, Prepared, prepare
 
 ROWS = (
@@ -31,8 +35,9 @@ def check_configuration(config: Path, as_json: bool) -> int:
     """Check and print; raises ConfigError where the configuration cannot run."""
     prepared = prepare(load(config))
     shifts = {check.name: _shifts(check, prepared) for check in prepared.checks}
+    judged = {axis.name: _judged(prepared, axis) for axis in prepared.configuration.axes}
     if as_json:
-        click.echo(json.dumps(_report(prepared, shifts)))
+        click.echo(json.dumps(_report(prepared, shifts, judged)))
         return 0
     console = Console(highlight=False)
     plan, facts = prepared.plan, prepared.facts
@@ -49,9 +54,19 @@ def check_configuration(config: Path, as_json: bool) -> int:
             f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
         )
         _print_axis(console, check, shifts[check.name])
+        found = judged[axis.name]
+        if found is not None:
+            console.print(f"{axis.specification}: {answer(found)}; `rtloop design verify` shows it all")
     for warning in prepared.warnings:
         click.echo(f"warning: {warning}", err=True)
     return 0
+
+
+def _judged(prepared: Prepared, axis: AxisOptions) -> Verification | None:
+    """The axis against the specification that it names; None where there is nothing to judge."""
+    if axis.specification is None or axis.controller is None:
+        return None
+    return verified(prepared.configuration, axis, None)[0]
 
 
 def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Tolerance]) -> None:
@@ -91,7 +106,9 @@ def _tolerance(tolerance: Tolerance) -> str:
     return f"−{abs(tolerance.down_percent):.2f} … +{tolerance.up_percent:.2f} %"
 
 
-def _report(prepared: Prepared, shifts: dict[str, dict[str, Tolerance]]) -> dict[str, Any]:
+def _report(
+    prepared: Prepared, shifts: dict[str, dict[str, Tolerance]], judged: dict[str, Verification | None]
+) -> dict[str, Any]:
     plan = prepared.plan
     return {
         "name": plan.name,
@@ -106,6 +123,7 @@ def _report(prepared: Prepared, shifts: dict[str, dict[str, Tolerance]]) -> dict
                 "comparison": check.comparison and check.comparison.as_dict(),
                 "continuous": _analysis(check.continuous),
                 "running": _analysis(check.running),
+                "missed": None if (found := judged[check.name]) is None else [row.label for row in found.missed],
                 "resonance_shift_tolerated_percent": {name: list(value) for name, value in shifts[check.name].items()},
             }
             for check in prepared.checks

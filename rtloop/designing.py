@@ -47,7 +47,7 @@ def synthesise_specification(spec: Path, out: Path | None, cross_check: bool, as
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
     """Judge every axis that has a controller; 1 where one misses its specification. Raises ConfigError, OutputError."""
     configuration = load(config)
-    judged = {axis.name: _verified(configuration, axis, spec) for axis in configuration.axes if axis.controller}
+    judged = {axis.name: verified(configuration, axis, spec) for axis in configuration.axes if axis.controller}
     if not judged:
         raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
     meets = all(found.meets for found, _ in judged.values())
@@ -93,7 +93,8 @@ def _as_dict(found: Synthesis, other: float | None, out: Path | None) -> dict[st
     }
 
 
-def _verified(configuration: Configuration, axis: AxisOptions, spec: Path | None) -> tuple[Verification, DesignOptions]:
+def verified(configuration: Configuration, axis: AxisOptions, spec: Path | None) -> tuple[Verification, DesignOptions]:
+    """An axis against the specification at `spec`, else against its own. Raises ConfigError."""
     assert axis.controller is not None
     if spec is None and axis.specification is not None:
         spec = configuration.folder / axis.specification

@@ -14,10 +14,9 @@ import click
 
 from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.config import load
-from rtloop.errors import LoopFault, OutputError
+from rtloop.errors import LoopFault, OutputError, RtloopError
 from rtloop.prepare import Prepared, prepare
 from rtloop.progress import Counter
-from rtloop.recording.errors import RecordingError
 from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
 from rtloop.report import RunView, print_run
@@ -92,7 +91,7 @@ def recover_leftovers(folder: Path) -> None:
         try:
             with Counter("ticks recovered", sys.stderr) as counter:
                 report = recover(part, progress=counter.show)
-        except RecordingError as error:
+        except RtloopError as error:
             click.echo(f"warning: {error}", err=True)
             continue
         click.echo(f"{report['output']}: {report['ticks']:,} ticks recovered from {part.name}, which is kept", err=True)

@@ -14,9 +14,8 @@ from rtloop.design.identify_dynamics import DynamicsFit, Excitation
 from rtloop.design.identify_hysteresis import HysteresisFit
 from rtloop.design.measured import Measured
 from rtloop.design.plays import model_output
-from rtloop.errors import OutputError
+from rtloop.errors import MissingExtra, OutputError
 from rtloop.law.hysteresis import PlayModel
-from rtloop.recording.errors import MissingExtra
 
 POINTS = 20_000
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
+from rtloop.errors import OutputError
 from rtloop.recording.container import (
     CHUNK_HEAD,
     MAGIC,
@@ -24,7 +25,6 @@ from rtloop.recording.container import (
     pack_end,
     pack_records,
 )
-from rtloop.recording.errors import OutputError
 
 LEVEL = 3
 """zstd: at 10 kHz and one axis 0.70 µs and 73 bytes a tick; level 1: 0.52 µs, 85 bytes; level 5: 1.7 µs, 71 bytes."""

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.errors import MissingExtra, OutputError, RecordingError
+from rtloop.errors import MissingExtra, OutputError
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
 from rtloop.recording.parts import Files, find_files
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.errors import OutputError
 from rtloop.recording.bands import Band, Progress, drawn_signals, marks, read_bands, title
-from rtloop.recording.errors import OutputError
 from rtloop.recording.load import Recording, load
 from rtloop.recording.parts import Files, find_files
 

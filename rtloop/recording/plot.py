@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.bands import Band, Mark, Progress, drawn_signals, marks, read_bands, title
-from rtloop.recording.errors import MissingExtra, OutputError
 from rtloop.recording.load import load, unit_of
 from rtloop.recording.parts import Files, find_files
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.words import load_word, store_word
+from rtloop.errors import RtloopError
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.rings import RingReader
 from rtloop.recording.session import Options, Session
@@ -111,7 +112,7 @@ def run(fd: int) -> int:
         recorder.set_word(Word.RECORDER_STATE, ProcessState.RUNNING)
         result = recorder.record(session, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)
-    except RecordingError as error:
+    except RtloopError as error:
         totals = {"complete": False, "error": str(error)}
     totals["cpu_s"] = round(time.process_time(), 3)
     good = totals["error"] is None

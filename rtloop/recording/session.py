@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.engine.memory import SharedBlock, Word
+from rtloop.errors import OutputError
 from rtloop.recording import format
 from rtloop.recording.contents import Message
-from rtloop.recording.errors import OutputError
 from rtloop.recording.events import FINISHED, GAP, ROTATED, event_of, recorder_event
 from rtloop.recording.rings import RingReader
 from rtloop.recording.writer import Writer

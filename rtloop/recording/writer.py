@@ -13,11 +13,11 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
+from rtloop.errors import OutputError
 from rtloop.recording import format
 from rtloop.recording.chunkfile import ChunkFile, Content
 from rtloop.recording.container import PREFIX, pack_message, pack_records
 from rtloop.recording.contents import Message
-from rtloop.recording.errors import OutputError
 
 
 class Writer:

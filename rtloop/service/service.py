@@ -28,6 +28,7 @@ from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.prepare import Prepared, prepare
+from rtloop.recording.recover import leftovers, recover
 from rtloop.running import recording_path
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
@@ -146,6 +147,7 @@ class Service:
     def run(self) -> int:
         """Serve until told to end, or until the loop died too often; the exit code."""
         log.info("starting %s", self.configuration.name)
+        self._aside(self._recover_leftovers)
         resting = self.configuration.service.arm
         while not self._ending.is_set():
             try:
@@ -251,6 +253,16 @@ class Service:
     def _aside(self, work: Callable[[], None]) -> None:
         """Do slow work in a thread of its own: the watch goes on meanwhile."""
         threading.Thread(target=work, daemon=True).start()
+
+    def _recover_leftovers(self) -> None:
+        """Complete what killed services left among the recordings; what cannot be is said and stays."""
+        for part in leftovers(Path(self.configuration.recording.folder)):
+            try:
+                report = recover(part)
+            except RtloopError as error:
+                log.warning("%s", error)
+                continue
+            log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part.name)
 
     def _prepare_and_start(self) -> None:
         """Depolarise, tare, then the configured references and mode."""

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as StockWriter
 
+from rtloop.errors import OutputError, RtloopError
 from rtloop.recording import format
 from rtloop.recording.container import DATA_END_BYTES
 from rtloop.recording.contents import Message
-from rtloop.recording.errors import OutputError, RecordingError
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.reader import Reader
 from rtloop.recording.recover import recover
 from rtloop.recording.summary import summarise
@@ -46,7 +47,7 @@ def check(path: Path) -> int:
             blocks = list(reader.blocks())
             events, snapshots, problems = reader.events, list(reader.snapshots()), reader.problems
             header = reader.header
-    except RecordingError as error:
+    except RtloopError as error:
         said = str(error)
     if said:
         assert said.startswith(f"{path}: ")

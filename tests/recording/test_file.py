@@ -17,8 +17,8 @@ from mcap.records import MessageIndex
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
+from rtloop.errors import OutputError
 from rtloop.recording.contents import Message
-from rtloop.recording.errors import OutputError
 from rtloop.recording.format import EVENTS, TICKS, chunk_rows, tick_dtype, tick_schema
 from rtloop.recording.reader import Reader
 from rtloop.recording.writer import Writer

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.bands import read_bands
-from rtloop.recording.errors import MissingExtra, OutputError, RecordingError
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.export import export
 from rtloop.recording.histogram import Histogram
 from rtloop.recording.load import load, unit_of

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.errors import RtloopError
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.export import export
 from rtloop.recording.format import TICKS
@@ -41,7 +42,7 @@ class Judge:
         """Everything that can be read is as it was recorded; raises AssertionError otherwise."""
         try:
             whole = self._read(path)
-        except RecordingError as error:
+        except RtloopError as error:
             _require_named(path, error)
             self.outcomes["refused"] += 1
             return
@@ -76,7 +77,7 @@ class Judge:
         recording = load(path)
         try:
             report = replay(recording)
-        except RecordingError as error:
+        except RtloopError as error:
             _require_named(path, error)
             return
         assert report.identical or report.problems, report
