@@ -42,9 +42,14 @@ own clock ever was: between two looks at its outputs lay at most so much more th
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 SEEN = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("largest_step_v", np.float64), ("last_v", np.float64),
-     ("true_position_um", np.float64), ("largest_position_um", np.float64), ("moved_ns", np.int64)]
+     ("true_position_um", np.float64), ("largest_position_um", np.float64), ("moved_ns", np.int64),
+     ("looked_ns", np.int64), ("largest_rate_v_per_s", np.float64)]
 )  # fmt: skip
-"""What an output did; `moved_ns`: CLOCK_MONOTONIC when it last changed."""
+"""What an output did; `moved_ns`: CLOCK_MONOTONIC when it last changed.
+
+`largest_rate_v_per_s` is the largest step over the time since the board looked before and two periods more: a ramp
+that moves by its slew once a period never exceeds its slew here, however late board or controller are.
+"""
 
 
 class BoardMemory:
@@ -164,9 +169,10 @@ def _run(
         if fault != FROZEN_INPUT:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
+        look_ns = monotonic_ns(timespec)
         for i in range(coefficients.shape[0]):
             volts = seen[i].last_v if fault == STUCK_OUTPUT else dac_codes[i] * LSB_V
-            _witness(seen[i], volts, now_ns)
+            _witness(seen[i], volts, look_ns, period_ns)
             advance(coefficients[i], state[i], volts)
         index += 1
     return index
@@ -181,11 +187,15 @@ def _look(seen, state, index):
 
 
 @jit
-def _witness(seen, volts, now_ns):
+def _witness(seen, volts, now_ns, period_ns):
     """What the output did."""
     step_v = abs(volts - seen.last_v)
     if step_v > 0.0:
         seen.moved_ns = now_ns
+        rate_v_per_s = step_v / ((now_ns - seen.looked_ns) * 1e-9 + 2e-9 * period_ns)
+        if rate_v_per_s > seen.largest_rate_v_per_s:
+            seen.largest_rate_v_per_s = rate_v_per_s
+    seen.looked_ns = now_ns
     if step_v > seen.largest_step_v:
         seen.largest_step_v = step_v
     if volts < seen.lowest_v:
