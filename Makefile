@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings check install uninstall test-systemd clean soak-identification
+.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings soak-chain check install uninstall test-systemd clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -40,6 +40,10 @@ soak-recordings: $(READY)
 # Identification on 50 rigs drawn at random, three times: about ten minutes.
 soak-identification: $(READY)
 	$(BIN)/python -m tests.soak.identification
+
+# Recordings, identification, synthesis and a run on ten rigs drawn at random: about four minutes.
+soak-chain: $(READY)
+	$(BIN)/python -m tests.soak.chain
 
 check: $(READY)
 	$(BIN)/rtloop check deploy/paper.toml
