@@ -171,7 +171,9 @@ class Service:
         with Processes(block_path(self.configuration)) as processes:
             prepared = prepare(self.configuration)
             options = self.configuration.service
-            preparing = not resting and (options.tare_s > 0 or options.depolarise is not None)
+            # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
+            # schedule alone must have its first tick
+            preparing = not resting and not self.configuration.schedule
             if resting or preparing:
                 plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
                 prepared = replace(prepared, plan=plan)
