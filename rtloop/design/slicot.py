@@ -14,7 +14,7 @@ def slicot_gamma(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices
     Raises MissingExtra without slycot.
     """
     try:
-        import slycot
+        import slycot  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtra("the cross-check needs slycot: pip install 'rtloop[slycot]'") from None
     m2, p2 = plant.b2.shape[1], plant.c2.shape[0]
