@@ -12,6 +12,7 @@ from drivers.errors import DriverError
 from drivers.registry import driver_class, kinds
 from rtloop import signals
 from rtloop.prepare import Prepared
+from rtloop.progress import StatusLine
 from rtloop.recording.load import load
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
@@ -21,27 +22,17 @@ BAR = " ▁▂▃▄▅▆▇█"
 LONGEST_STEP_ANALYSIS_TICKS = 6_000_000
 
 
-class RunView:
+class RunView(StatusLine):
     """One line on a terminal while the loop runs, nothing where the stream is not a terminal."""
 
     def __init__(self, prepared: Prepared, stream: IO[str]) -> None:
+        super().__init__("starting", stream)
         self._plan = prepared.plan
-        self._console = Console(file=stream, highlight=False)
-        self._status = self._console.status("starting") if self._console.is_terminal else None
-
-    def __enter__(self) -> RunView:
-        if self._status:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._status:
-            self._status.stop()
 
     def show(self, supervisor: Supervisor) -> None:
         """Time, mode, lateness and the axes of the newest tick."""
         row = supervisor.latest() if self._status else None
-        if row is None or self._status is None:
+        if row is None:
             return
         parts = [_elapsed(row[signals.TICK] / self._plan.pacing.rate_hz, self._plan.ticks, self._plan.pacing.rate_hz)]
         parts.append(Mode(int(row[signals.MODE])).name.lower())
@@ -53,7 +44,7 @@ class RunView:
         for axis, name in enumerate(self._plan.axes[:4]):
             position, drive = (row[signals.axis_column(axis, which)] for which in (signals.POSITION, signals.DRIVE))
             parts.append(f"{name} {position:8.3f} µm {drive:7.3f} V")
-        self._status.update("   ".join(parts))
+        self.update("   ".join(parts))
 
 
 def _elapsed(time_s: float, ticks: int | None, rate_hz: float) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+
+from rtloop.terminal import console as _console
+from rtloop.terminal import table as _table
 
 
 def print_hysteresis(report: dict[str, Any]) -> None:
@@ -100,14 +102,3 @@ def _print_files(console: Console, report: dict[str, Any]) -> None:
 
 def _number(value: float | None, form: str = "{:.2f}") -> str:
     return "–" if value is None else form.format(value)
-
-
-def _console() -> Console:
-    return Console(highlight=False, soft_wrap=True)
-
-
-def _table(*headings: str) -> Table:
-    table = Table(*headings, box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    return table

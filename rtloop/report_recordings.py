@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from rtloop.recording.replay import ReplayReport
+from rtloop.terminal import console as _console
+from rtloop.terminal import table as _table
 
 METRICS = (
     ("rms_error_um", "rms error µm"),
@@ -104,14 +105,3 @@ def _print_problems(console: Console, problems: list[str]) -> None:
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4f}"
-
-
-def _console() -> Console:
-    return Console(highlight=False, soft_wrap=True)
-
-
-def _table(*headings: str) -> Table:
-    table = Table(*headings, box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    return table

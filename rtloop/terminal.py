@@ -1,0 +1,19 @@
+"""What the reports share: a console that does not wrap paths, a table without lines."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+
+def console() -> Console:
+    """The standard output, unhighlighted, long lines left to the terminal."""
+    return Console(highlight=False, soft_wrap=True)
+
+
+def table(*headings: str) -> Table:
+    """A table without lines: labels to the left, numbers to the right."""
+    empty = Table(*headings, box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for column in empty.columns[1:]:
+        column.justify = "right"
+    return empty
