@@ -14,7 +14,7 @@ from rtloop.engine.context import axes_of, event_ring, generators_of, messages, 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
-from rtloop.law.law import reset_trip, set_mode
+from rtloop.law.law import reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.reference import GENERATOR_PARAMETERS
 
@@ -112,7 +112,7 @@ def _load_law(loop, axis, another):
     staged, active = octets(loop.staged, size), octets(loop.coefficients, size)
     active[offset : offset + COEFFICIENT_BYTES] = staged[offset : offset + COEFFICIENT_BYTES]
     if another:
-        axes_of(loop)[axis].entering = 1
+        set_controller(axes_of(loop)[axis])
     loop.next_snapshot = loop.tick
 
 

@@ -98,7 +98,15 @@ def _controller(controller: DiscreteController | None) -> Mapping[str, object]:
         "d": controller.d,
         "tracking": placed(controller.antiwindup),
         "steady_state": placed(controller.steady_state_gain),
+        "resting_error": _resting_error(controller),
     }
+
+
+def _resting_error(controller: DiscreteController) -> float:
+    """Error per command that keeps C(z) at rest: 1/C(1). 0 with an integrator, and where C hardly passes 0 Hz."""
+    hz = np.geomspace(1e-3, 0.5, 200) / controller.period_s
+    at_rest, largest = abs(controller.dc_gain), np.abs(controller.response(hz)).max(initial=0.0)
+    return 1 / controller.dc_gain if at_rest > 1e-3 * largest else 0.0
 
 
 def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:

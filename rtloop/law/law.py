@@ -4,7 +4,9 @@
                         −▲ x
 
 Modes replace the left part: FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip
-ramp u to its safe value. Every change of mode continues from the drive in force.
+ramp u to its safe value. Every change of mode continues from the drive in force: what the new mode would do otherwise
+is taken off its input as an offset, which dies out with `limits.bump_s`. In closed loop that input is the error, so
+that no controller meets a large error as a step. Another controller continues from the command and the error in force.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ SLEW_LIMITED = int(Flag.SLEW_LIMITED)
 RAMPING = int(Flag.RAMPING)
 HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
 NEGLIGIBLE_BUMP = 1e-9
+ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
 
 
 @jit
@@ -30,7 +33,14 @@ def set_mode(axes, loop, mode, at_rest):
     """Change the mode; bumplessly, but from zero state `at_rest`, before anything was driven."""
     loop.mode = mode
     for a in range(axes.shape[0]):
-        axes[a].entering = 0 if at_rest else 1
+        axes[a].entering = 0 if at_rest else ANOTHER_MODE
+
+
+@jit
+def set_controller(state):
+    """Have an axis go on with another controller, whose coefficients have been put in place."""
+    if state.entering == 0:
+        state.entering = ANOTHER_CONTROLLER
 
 
 @jit
@@ -91,9 +101,11 @@ def _drive(coefficients, state, loop, reference):
         if mode == FEEDFORWARD:
             command_um = reference + _bump(coefficients, state, state.applied_command_um - reference)
         else:
+            resting_um = coefficients.resting_error * state.applied_command_um
+            met_um = error_um - _bump(coefficients, state, error_um - resting_um)
             if state.entering != 0:
-                controller_enter(coefficients, state, error_um, state.applied_command_um)
-            command_um = controller_output(coefficients, state, error_um)
+                controller_enter(coefficients, state, met_um, state.applied_command_um)
+            command_um = controller_output(coefficients, state, met_um)
         state.command_um = command_um
         limited_um = clip(command_um, -coefficients.command_limit_um, coefficients.command_limit_um)
         if limited_um != command_um:
@@ -113,7 +125,7 @@ def _drive(coefficients, state, loop, reference):
 @jit
 def _bump(coefficients, state, gap):
     """The decaying offset that makes a new mode continue from where the old one was."""
-    state.bump = gap if state.entering != 0 else state.bump * coefficients.bump_decay
+    state.bump = gap if state.entering == ANOTHER_MODE else state.bump * coefficients.bump_decay
     if -NEGLIGIBLE_BUMP < state.bump < NEGLIGIBLE_BUMP:
         state.bump = 0.0
     return state.bump
@@ -128,4 +140,4 @@ def update(coefficients, axes, loop):
         if loop.mode == CLOSED_LOOP:
             shortfall_um = state.applied_command_um - state.command_um
             tracked_um = coefficients[a].tracking_share * shortfall_um
-            controller_update(coefficients[a], state, state.error_um, tracked_um)
+            controller_update(coefficients[a], state, state.error_um - state.bump, tracked_um)

@@ -65,6 +65,7 @@ COEFFICIENTS = _whole_lines(
         ("unused", np.uint8, (5,)),  # no byte of a record may lie between its fields: copies would leave it undefined
         ("d", np.float64),
         ("tracking_share", np.float64),
+        ("resting_error", np.float64),  # error per command at which C stays where it is
         ("dead_band_v", np.float64),
         ("dead_band_threshold_v", np.float64),
         # sensor scale

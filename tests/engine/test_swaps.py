@@ -80,7 +80,7 @@ def test_a_thousand_swaps(folder: Path, record_property):
         f"whole run {steps_v[SETTLE_TICKS:].max():.4f} V; in the run without swaps {usual_v:.4f} V"
     )
     assert at_v <= 1.1 * usual_v
-    assert after_v <= 2.0 * usual_v  # a controller enters at rest, and makes up for the slope it did not know
+    assert after_v <= 1.3 * usual_v  # the tick of the swap stood still; the next one moves for both
     verdict = replay(recording)
     assert verdict.identical, verdict.first_difference
     assert verdict.ticks == SETTLE_TICKS + SWAPS * SPACING

@@ -53,10 +53,11 @@ def main() -> None:
             recording = rtloop.load(list((folder / "recordings").glob("*.mcap")))
         demand_v, exec_us = recording.read("x_demand_v", "exec_us")
         steps_v = np.abs(np.diff(demand_v))
-        quiet_v = steps_v[QUIET_TICKS // 3 : first - 1].max()
+        quiet_v, after_v = steps_v[QUIET_TICKS // 3 : first - 1].max(), steps_v[ticks].max()
         others_us = np.delete(exec_us[first : ticks[-1]], ticks[:-1] - first)
         print(
-            f"{given.swaps} swaps: largest |Δdemand| {steps_v[ticks - 1].max():.4f} V at a swap, {quiet_v:.4f} V before"
+            f"{given.swaps} swaps: largest |Δdemand| {steps_v[ticks - 1].max():.4f} V at a swap, {after_v:.4f} V in the "
+            f"tick after it, {quiet_v:.4f} V before"
         )
         for label, values in (("swap", exec_us[ticks]), ("other", others_us)):
             p50, p99 = np.quantile(values, [0.5, 0.99])

@@ -12,7 +12,7 @@ enum {
     TRIP_HEARTBEAT = 1 << 12, TRIP_STALE = 1 << 13, TRIP_FROZEN = 1 << 14, TRIP_TRACKING = 1 << 15,
     TRIP_OSCILLATION = 1 << 16, TRIP_LATE = 1 << 17, TRIP_ENABLE = 1 << 18,
 };
-enum { LANES = 4, BLOCK = 8 };
+enum { LANES = 4, BLOCK = 8, ANOTHER_MODE = 1 };
 
 typedef const struct law_coefficients *restrict law_c;
 typedef struct law_state *restrict law_s;
@@ -121,7 +121,7 @@ static inline double toward(double value, double target, double step) {
 }
 
 static inline double bump(law_c c, law_s s, double gap) {
-    s->bump = s->entering ? gap : s->bump * c->bump_decay;
+    s->bump = s->entering == ANOTHER_MODE ? gap : s->bump * c->bump_decay;
     if (-1e-9 < s->bump && s->bump < 1e-9) s->bump = 0;
     return s->bump;
 }
@@ -151,8 +151,10 @@ static inline int64_t drive_of(law_c c, law_s s, loop_s loop, double reference) 
         if (loop->mode == FEEDFORWARD) {
             s->command_um = reference + bump(c, s, s->applied_command_um - reference);
         } else {
-            if (s->entering) controller_enter(c, s, s->error_um, s->applied_command_um);
-            s->command_um = controller_output(c, s, s->error_um);
+            double resting_um = c->resting_error * s->applied_command_um;
+            double met_um = s->error_um - bump(c, s, s->error_um - resting_um);
+            if (s->entering) controller_enter(c, s, met_um, s->applied_command_um);
+            s->command_um = controller_output(c, s, met_um);
         }
         double limited = clip(s->command_um, -c->command_limit_um, c->command_limit_um);
         if (limited != s->command_um) flags |= COMMAND_LIMITED;
@@ -251,6 +253,6 @@ static inline void update(law_c c, law_s s, loop_s loop, int64_t axes) {
     for (int64_t a = 0; a < axes; a++) {
         double applied_um = s[a].applied_command_um = follow_drive(&c[a], &s[a], s[a].drive_v);
         if (loop->mode == CLOSED_LOOP)
-            controller_update(&c[a], &s[a], s[a].error_um, c[a].tracking_share * (applied_um - s[a].command_um));
+            controller_update(&c[a], &s[a], s[a].error_um - s[a].bump, c[a].tracking_share * (applied_um - s[a].command_um));
     }
 }
