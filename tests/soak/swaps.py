@@ -56,8 +56,8 @@ def main() -> None:
         quiet_v, after_v = steps_v[QUIET_TICKS // 3 : first - 1].max(), steps_v[ticks].max()
         others_us = np.delete(exec_us[first : ticks[-1]], ticks[:-1] - first)
         print(
-            f"{given.swaps} swaps: largest |Δdemand| {steps_v[ticks - 1].max():.4f} V at a swap, {after_v:.4f} V in the "
-            f"tick after it, {quiet_v:.4f} V before"
+            f"{given.swaps} swaps: largest |Δdemand| {steps_v[ticks - 1].max():.4f} V at a swap, "
+            f"{after_v:.4f} V in the tick after it, {quiet_v:.4f} V before"
         )
         for label, values in (("swap", exec_us[ticks]), ("other", others_us)):
             p50, p99 = np.quantile(values, [0.5, 0.99])
