@@ -9,6 +9,7 @@ The options keep results equal in bits from one machine to the next: no `fastmat
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -70,6 +71,8 @@ def _cache_folder() -> tuple[Path, bool]:
 
 
 CACHE_FOLDER, CACHE_IS_PERSISTENT = _cache_folder()
+with contextlib.suppress(OSError):
+    os.utime(CACHE_FOLDER)  # in use: the installation of another version drops those unused for longest
 numba_config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIssue]
 # Four equal operations written side by side become one vector operation, which reorders no sum. Loops are left as they
 # are: they run over an axis, five states or fifteen plays, and their vector forms cost more than they save.

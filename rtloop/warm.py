@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
-KEPT_CACHES = 4
+KEPT_CACHES = 8
 
 
 def main() -> int:
@@ -31,6 +31,7 @@ def _rehearse_others() -> None:
     """What recorder, service and board compile for themselves."""
     import numpy as np
 
+    import drivers.comedi  # noqa: F401  (compiled where it is imported)
     from drivers.shm import ShmOptions
     from hil.board import serve
     from rtloop.engine.commands import send

@@ -87,3 +87,12 @@ def _refined(function: Callable[[Real], Real], low: float, high: float) -> tuple
         best = max(best, (float(values[i]), float(hz[i])))
         low, high = float(hz[max(i - 1, 0)]), float(hz[min(i + 1, 20)])
     return best
+
+
+def delay_tolerated(loop: Loop) -> tuple[float, float]:
+    """The smallest further delay, in s, that takes a stable loop to its limit, and the crossover in Hz where it does.
+
+    L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ. inf, NaN: none does.
+    """
+    found = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in crossings(loop)]
+    return min(((left % 360 / (360 * f), f) for left, f in found), default=(math.inf, math.nan))

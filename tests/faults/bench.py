@@ -98,7 +98,9 @@ class Bench(Evidence):
 
     def follow(self) -> SharedBlock:
         """The shared block of the present loop, which stays readable after the loop's end."""
-        fd = os.open(self.folder / "run" / f"{self.config.stem}.block", os.O_RDWR | os.O_CLOEXEC)
+        path = self.folder / "run" / f"{self.config.stem}.block"
+        wait_for(lambda: path.stat().st_size, "a shared block", START_TIMEOUT_S)
+        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         self.blocks.append(SharedBlock(fd))
         return self.blocks[-1]
 

@@ -1,0 +1,81 @@
+"""The examination: the clock is measured first, and then every condition is looked at."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.doctor import machine, permissions, software
+from rtloop.doctor.findings import Finding
+from rtloop.doctor.host import Host
+from rtloop.engine import latency
+from rtloop.engine.plan import Pacing
+from rtloop.errors import RtloopError
+
+START_S = 60.0
+"""What the measuring process may take beside the measurement; the first time it is compiled."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Lateness in µs and missed periods of each tick (ticks,), and the seconds that a hypervisor stole meanwhile."""
+
+    pacing: Pacing
+    lateness_us: npt.NDArray[np.float64]
+    missed: npt.NDArray[np.float64]
+    stolen_s: float
+
+    @property
+    def period_us(self) -> float:
+        """Of the loop."""
+        return 1e6 / self.pacing.rate_hz
+
+    def quantile_us(self, share: float) -> float:
+        """The lateness that this share of the ticks does not exceed."""
+        return float(np.quantile(self.lateness_us, share))
+
+    @property
+    def late_share(self) -> float:
+        """Share of ticks later than a period, the median of windows of a second: a single stall does not count."""
+        late = self.lateness_us > self.period_us
+        window = max(1, round(self.pacing.rate_hz))
+        whole = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
+        return float(np.median(whole.mean(axis=1)))
+
+
+@dataclass(frozen=True)
+class Examination:
+    """All that was found."""
+
+    latency: Latency
+    findings: tuple[Finding, ...]
+
+
+def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examination:
+    """Measure for so many seconds, then look. Raises RtloopError where the measuring process fails."""
+    before_s = Host({}, root).stolen_s()
+    ran = subprocess.run(
+        [sys.executable, "-m", "rtloop.engine.latency"],
+        input=latency.order(pacing, max(1, round(seconds * pacing.rate_hz))),
+        capture_output=True,
+        timeout=START_S + 3 * seconds,
+        check=False,
+    )
+    if ran.returncode != 0:
+        last = (ran.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {ran.returncode}"])[-1]
+        raise RtloopError(f"the measurement of the clock failed: {last}")
+    granted, lateness_us, missed = latency.results(ran.stdout)
+    host = Host(granted, root)
+    measured = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
+    return Examination(measured, conditions(host, pacing))
+
+
+def conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
+    """Every condition on this host."""
+    checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
+    return tuple(check(host, pacing) for check in checks)

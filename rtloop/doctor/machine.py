@@ -1,0 +1,206 @@
+"""Kernel, processors, interrupts, power management: what stands between a timer and the loop."""
+
+from __future__ import annotations
+
+from rtloop.doctor.findings import Finding
+from rtloop.doctor.host import Host, cpu_list, cpu_text
+from rtloop.engine.plan import Pacing
+
+EXACT_CLOCKS = ("tsc", "arch_sys_counter")
+SHORT_IDLE_US = 10.0
+CPUS = "/sys/devices/system/cpu"
+
+
+def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
+    """Where the loop may run."""
+    return set(host.allowed_cpus) if pacing.cpu is None else {pacing.cpu}
+
+
+def kernel(host: Host, pacing: Pacing) -> Finding:
+    """PREEMPT_RT."""
+    good = host.read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in host.version
+    return Finding(
+        "kernel",
+        f"{host.release} {'PREEMPT_RT' if good else 'without PREEMPT_RT'}",
+        "PREEMPT_RT",
+        good,
+        10_000.0,
+        "kernel work that cannot be interrupted delays a tick by milliseconds",
+        "sudo apt install linux-image-rt-amd64, and restart",
+    )
+
+
+def virtualisation(host: Host, pacing: Pacing) -> Finding:
+    """A hypervisor may stop the whole machine."""
+    flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
+    virtual = "hypervisor" in flags.split()
+    value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if virtual else "none seen"
+    return Finding(
+        "virtualisation",
+        value,
+        "none",
+        not virtual,
+        300_000.0,
+        "the hypervisor may stop the machine for hundreds of ms, clock and all",
+        "no setting helps: a machine of its own",
+    )
+
+
+def processors(host: Host, pacing: Pacing) -> Finding:
+    """One for the loop, one for everything else."""
+    count = len(host.allowed_cpus)
+    return Finding(
+        "processors",
+        cpu_text(set(host.allowed_cpus)),
+        "two or more",
+        count >= 2,
+        10_000.0,
+        "recorder, service and loop share one",
+        "sudo taskset -cp 0-N $$, or a larger machine",
+    )
+
+
+def isolation(host: Host, pacing: Pacing) -> Finding:
+    """A processor where nothing else is scheduled."""
+    isolated = cpu_list(host.read(f"{CPUS}/isolated") or "")
+    cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
+    shown = f"isolated: {cpu_text(isolated) or 'none'}"
+    value = f"{shown}; loop.cpu: {'not set' if pacing.cpu is None else pacing.cpu}"
+    return Finding(
+        "isolated processor",
+        value,
+        "loop.cpu is isolated",
+        pacing.cpu in isolated,
+        1000.0,
+        "kernel threads and other real-time processes run between the ticks",
+        f"on the kernel's command line isolcpus=domain,managed_irq,{cpu} rcu_nocbs={cpu}, in [loop] cpu = {cpu}",
+    )
+
+
+def interrupts(host: Host, pacing: Pacing) -> Finding:
+    """Devices' interrupts on the loop's processor."""
+    mine, everywhere = loop_cpus(host, pacing), set(host.allowed_cpus)
+    lists = {path: cpu_list(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
+    here = [path for path, cpus in lists.items() if cpus & mine]
+    others = cpu_text(everywhere - mine)
+    name, wanted = "interrupts", "none on loop.cpu"
+    if not lists:
+        return Finding(name, "not shown", wanted, None, 0.0, "", "")
+    value = f"{len(here)} of {len(lists)} may come to processor {cpu_text(mine)}"
+    return Finding(
+        name,
+        value,
+        wanted,
+        not here,
+        50.0,
+        "each costs 5 to 50 µs of a tick",
+        f"for f in /proc/irq/*/smp_affinity_list; do echo {others or 0} | sudo tee $f; done",
+        {path: others for path in here} if others else {},
+    )
+
+
+def frequency(host: Host, pacing: Pacing) -> Finding:
+    """The frequency governor of the loop's processor."""
+    found = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
+    governors = {path: text for path in found if (text := host.read(path))}
+    name, wanted = "frequency governor", "performance"
+    if not governors:
+        return Finding(name, "not shown: firmware or host decides", wanted, None, 0.0, "", "")
+    bad = sorted(path for path, text in governors.items() if text != wanted)
+    return Finding(
+        name,
+        ", ".join(sorted(set(governors.values()))),
+        wanted,
+        not bad,
+        200.0,
+        "the first ticks after an idle phase run on a slow processor",
+        "sudo cpupower frequency-set -g performance",
+        dict.fromkeys(bad, wanted),
+    )
+
+
+def idle_states(host: Host, pacing: Pacing) -> Finding:
+    """How deep the processor sleeps between two ticks."""
+    held = bool(host.granted["pm_qos"])
+    latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
+    deepest = max(latencies, default=0.0)
+    value = "deep ones held off" if held else f"up to {deepest:g} µs to wake; {host.refusal('pm_qos')}"
+    return Finding(
+        "idle states",
+        value,
+        "/dev/cpu_dma_latency held at 0",
+        held or deepest <= SHORT_IDLE_US,
+        max(deepest, 1.0),
+        "waking from a deep idle state delays a tick",
+        "sudo cp deploy/systemd/60-rtloop.rules /etc/udev/rules.d/ && sudo udevadm trigger",
+    )
+
+
+def clock_source(host: Host, pacing: Pacing) -> Finding:
+    """What reads the time."""
+    folder = "/sys/devices/system/clocksource/clocksource0"
+    source = host.read(f"{folder}/current_clocksource")
+    path = f"{folder}/current_clocksource"
+    offered = (host.read(f"{folder}/available_clocksource") or "").split()
+    better = next((clock for clock in EXACT_CLOCKS if clock in offered), None)
+    good = None if source is None else source in EXACT_CLOCKS
+    return Finding(
+        "clock source",
+        source or "not shown",
+        "tsc",
+        good,
+        5.0,
+        "each reading of the clock costs a µs or more, a tick has three",
+        f"echo {better or 'tsc'} | sudo tee {path}",
+        {path: better} if better else {},
+    )
+
+
+def siblings(host: Host, pacing: Pacing) -> Finding:
+    """Another thread of the same core shares its units and caches."""
+    shared = {
+        cpu: text
+        for cpu in sorted(loop_cpus(host, pacing))
+        if len(cpu_list(text := host.read(f"{CPUS}/cpu{cpu}/topology/thread_siblings_list") or "")) > 1
+    }
+    value = "none" if not shared else "; ".join(f"core of processors {text}" for text in sorted(set(shared.values())))
+    return Finding(
+        "hyper-threading",
+        value,
+        "off on loop.cpu",
+        not shared,
+        20.0,
+        "the other thread of the core slows a tick by up to twice",
+        f"echo off | sudo tee {CPUS}/smt/control",
+        {f"{CPUS}/smt/control": "off"},
+    )
+
+
+def swap(host: Host, pacing: Pacing) -> Finding:
+    """Swapped pages take milliseconds to come back."""
+    used = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
+    harmless = not used or bool(host.granted["mlock"])
+    value = f"{', '.join(used)}{', the loop is locked' if harmless else ''}" if used else "none"
+    return Finding(
+        "swap",
+        value,
+        "none, or locked memory",
+        harmless,
+        10_000.0,
+        "a page of the loop that was swapped out takes milliseconds",
+        "sudo swapoff -a",
+    )
+
+
+CONDITIONS = (
+    kernel,
+    virtualisation,
+    processors,
+    isolation,
+    interrupts,
+    frequency,
+    idle_states,
+    clock_source,
+    siblings,
+    swap,
+)

@@ -1,0 +1,132 @@
+"""What the host lets a real-time process do. Each was tried, not looked up."""
+
+from __future__ import annotations
+
+from rtloop.doctor.findings import Finding
+from rtloop.doctor.host import Host
+from rtloop.engine.plan import Pacing
+
+SPINNING_SHARE = 0.9
+LIMITS = "/etc/security/limits.d/rtloop.conf"
+
+
+def spinning_share(pacing: Pacing) -> float:
+    """Share of a processor that waiting takes."""
+    return min(1.0, pacing.spin_us * 1e-6 * pacing.rate_hz)
+
+
+def _grant(limit: str) -> str:
+    """The command that grants a limit to the group; the unit of deploy/systemd needs none."""
+    return f"echo '@rtloop - {limit}' | sudo tee -a {LIMITS}, and log in again as a member of rtloop"
+
+
+def fifo(host: Host, pacing: Pacing) -> Finding:
+    """SCHED_FIFO at the loop's priority."""
+    good = host.granted["scheduler"] == "SCHED_FIFO"
+    value = f"granted, priority {host.granted['priority']}" if good else f"refused: {host.refusal('priority')}"
+    return Finding(
+        "SCHED_FIFO",
+        value,
+        "granted",
+        good,
+        100_000.0,
+        "any busy process takes the processor for its time slices",
+        _grant("rtprio 99"),
+    )
+
+
+def throttling(host: Host, pacing: Pacing) -> Finding:
+    """The kernel takes the processor from SCHED_FIFO threads that never sleep."""
+    path = "/proc/sys/kernel/sched_rt_runtime_us"
+    runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
+    if runtime is None:
+        return Finding("real-time throttling", "not shown", "off where the loop spins", None, 0.0, "", "")
+    sleeps = spinning_share(pacing) < SPINNING_SHARE
+    value = "off" if runtime == "-1" else f"{runtime} of each {period} µs"
+    return Finding(
+        "real-time throttling",
+        value + (", the loop sleeps" if sleeps else ", the loop spins"),
+        "off where the loop spins",
+        sleeps or runtime == "-1",
+        50_000.0,
+        "a spinning loop loses the processor for 50 ms of every second",
+        "sudo sysctl kernel.sched_rt_runtime_us=-1",
+        {path: "-1"},
+    )
+
+
+def fair_server(host: Host, pacing: Pacing) -> Finding:
+    """Kernels from 6.12 on reserve time for ordinary processes in another way as well."""
+    name, wanted = "fair server", "off where the loop spins"
+    if host.kernel_number < (6, 12):
+        return Finding(name, f"not in kernel {host.release}", wanted, True, 0.0, "", "")
+    if spinning_share(pacing) < SPINNING_SHARE:
+        return Finding(name, "the loop sleeps", wanted, True, 0.0, "", "")
+    cpu = 0 if pacing.cpu is None else pacing.cpu
+    path = f"/sys/kernel/debug/sched/fair_server/cpu{cpu}/runtime"
+    runtime = host.read(path)
+    value = "not shown (debugfs)" if runtime is None else f"{runtime} ns of each second"
+    return Finding(
+        name,
+        value,
+        wanted,
+        None if runtime is None else runtime == "0",
+        50_000.0,
+        "a spinning loop loses the processor for 50 ms of every second",
+        f"echo 0 | sudo tee {path}",
+        {path: "0"} if runtime else {},
+    )
+
+
+def real_time_groups(host: Host, pacing: Pacing) -> Finding:
+    """Real-time group scheduling gives a control group no real-time runtime unless told to."""
+    options, granted = host.kernel_options, host.granted["scheduler"] == "SCHED_FIFO"
+    name, wanted = "control groups", "SCHED_FIFO inside"
+    if granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
+        return Finding(name, "do not limit SCHED_FIFO", wanted, True, 0.0, "", "")
+    if options is None:
+        return Finding(name, "not shown", wanted, None, 0.0, "", "")
+    return Finding(
+        name,
+        "CONFIG_RT_GROUP_SCHED=y",
+        wanted,
+        False,
+        100_000.0,
+        "the group has no real-time runtime, and SCHED_FIFO is refused",
+        "echo 950000 | sudo tee /sys/fs/cgroup/cpu/GROUP/cpu.rt_runtime_us",
+    )
+
+
+def locked_memory(host: Host, pacing: Pacing) -> Finding:
+    """Locked pages cause no faults."""
+    good = bool(host.granted["mlock"])
+    value = "granted" if good else f"refused: {host.refusal('mlock')}"
+    return Finding(
+        "locked memory",
+        value,
+        "granted",
+        good,
+        10_000.0,
+        "a page fault in the middle of a tick",
+        _grant("memlock unlimited"),
+    )
+
+
+def timer_slack(host: Host, pacing: Pacing) -> Finding:
+    """Wake-ups of ordinary threads are put together within the slack; those of SCHED_FIFO are not."""
+    slack_ns, exact = host.granted["timer_slack_ns"], host.granted["scheduler"] == "SCHED_FIFO"
+    value = (
+        "without effect under SCHED_FIFO" if exact else f"{slack_ns} ns" if slack_ns else host.refusal("timer_slack_ns")
+    )
+    return Finding(
+        "timer slack",
+        value,
+        "1 ns",
+        exact or slack_ns == 1,
+        50.0,
+        "each wake-up may be put off by 50 µs",
+        "grant SCHED_FIFO (above)",
+    )
+
+
+CONDITIONS = (fifo, throttling, fair_server, real_time_groups, locked_memory, timer_slack)

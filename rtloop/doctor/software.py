@@ -1,0 +1,57 @@
+"""The compiled loop and the libraries that it was compiled with."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.doctor.findings import Finding
+from rtloop.doctor.host import Host
+from rtloop.engine.plan import Pacing
+
+LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
+
+
+def compiled_code(host: Host, pacing: Pacing) -> Finding:
+    """The cache of compiled code; without one each start compiles for half a minute, and no tick is later for it."""
+    kept = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
+    return Finding(
+        "compiled code",
+        kept,
+        "kept in ~/.cache",
+        CACHE_IS_PERSISTENT,
+        0.0,
+        "the first start after each restart of the machine compiles for half a minute",
+        "export XDG_CACHE_HOME=FOLDER, one that you alone may write",
+    )
+
+
+def versions() -> dict[str, str]:
+    """Python's and the libraries' versions."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def libraries(host: Host, pacing: Pacing) -> Finding:
+    """Versions, for a report that others can judge."""
+    found = versions()
+    missing = [name for name, number in found.items() if number == "not installed"]
+    value = ", ".join(f"{name} {number}" for name, number in found.items())
+    return Finding(
+        "libraries",
+        value,
+        "installed",
+        not missing,
+        0.0,
+        f"{', '.join(missing)}: imported without being installed",
+        "pip install .",
+    )
+
+
+CONDITIONS = (compiled_code, libraries)

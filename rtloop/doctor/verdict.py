@@ -1,0 +1,64 @@
+"""Whether the host suits a loop, and the reasons why not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rtloop.design.closedloop import discrete_loop
+from rtloop.design.margins import delay_tolerated
+from rtloop.doctor.examine import Examination, Latency
+from rtloop.prepare import Prepared
+
+LATE_SHARE = 0.001
+US_PER_S = 1e6
+
+
+@dataclass(frozen=True)
+class AxisDelay:
+    """What the measured lateness costs an axis: degrees of phase at its tightest crossover, and what it can bear."""
+
+    axis: str
+    crossover_hz: float
+    tolerated_us: float
+    p50_deg: float
+    p99_deg: float
+    p99_us: float
+
+
+def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
+    """For each axis that has a controller and a model: 360° · f · lateness."""
+    delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
+    for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
+        if check.discrete is None or axis.model is None or check.running is None or not check.running.stable:
+            continue
+        loop = discrete_loop(check.discrete, axis.model.transfer(), axis.model.delay_ticks)
+        tolerated_s, hz = delay_tolerated(loop)
+        p50_deg, p99_deg = (360 * hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
+        delays.append(AxisDelay(axis.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
+    return delays
+
+
+def reasons(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
+    """Why the host does not suit the loop; empty where it does.
+
+    A condition speaks against it where it can make a tick later than a period, the measurement where it did.
+    """
+    latency = examination.latency
+    found = [
+        f"{finding.condition}: {finding.value}; {finding.consequence}"
+        for finding in examination.findings
+        if finding.good is False and finding.late_us > latency.period_us
+    ]
+    worst_us, missed = latency.quantile_us(1.0), int(latency.missed.sum())
+    if latency.late_share >= LATE_SHARE:
+        found.append(f"measured: {100 * latency.late_share:.2f} % of the ticks were late by more than a period")
+    elif worst_us > latency.period_us:
+        found.append(f"measured: a tick was {worst_us:.0f} µs late, and {missed} periods were missed")
+    for delay in delays:
+        if delay.p99_us > delay.tolerated_us:
+            found.append(
+                f"axis {delay.axis}: a delay of {delay.tolerated_us:.0f} µs makes its loop unstable, and one tick in "
+                f"a hundred is {delay.p99_us:.0f} µs late"
+            )
+    return found

@@ -1,0 +1,74 @@
+"""How late the loop's clock wakes on this host: `python -m rtloop.engine.latency`, the pacing as JSON on stdin.
+
+The process is set up as the loop's is, and waits as the loop does, but between two waits it does nothing and it
+drives nothing. On stdout: a JSON line of what the host granted, then the lateness of each tick in µs and the periods
+missed before it, as two arrays of doubles.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.compiled import jit
+from hil.pointers import call
+from rtloop.engine.clock import clock_context, paced_clock
+from rtloop.engine.plan import Pacing
+from rtloop.engine.realtime import freeze_garbage_collection, prepare_realtime
+
+START_DELAY_NS = 20_000_000
+
+
+@jit
+def wait_and_note(wait, context, timing, address, lateness_us, missed):
+    """Wait for so many ticks; `timing` (4,) lies at `address`. Lateness and missed periods of each tick."""
+    for k in range(lateness_us.size):
+        if call(wait, context, address) != 0:
+            return
+        lateness_us[k] = (timing[1] - timing[0]) / 1000.0
+        missed[k] = timing[2]
+
+
+def measure(pacing: Pacing, ticks: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Lateness in µs and missed periods of each tick (ticks,), in the calling thread."""
+    context, timing = clock_context(pacing.rate_hz), np.zeros(4)
+    clock = paced_clock(context, pacing.spin_us)
+    lateness_us, missed = np.zeros(ticks), np.zeros(ticks)
+    arguments = clock.wait, clock.context, timing, timing.ctypes.data
+    wait_and_note(*arguments, lateness_us[:0], missed[:0])  # compiled, before time counts
+    context.start_ns = time.monotonic_ns() + START_DELAY_NS
+    wait_and_note(*arguments, lateness_us, missed)
+    return lateness_us, missed
+
+
+def order(pacing: Pacing, ticks: int) -> bytes:
+    """What the process reads."""
+    return json.dumps({"pacing": asdict(pacing), "ticks": ticks}).encode()
+
+
+def results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """What the process wrote: what was granted, lateness in µs, missed periods."""
+    line, _, data = output.partition(b"\n")
+    lateness_us, missed = np.frombuffer(data).reshape(2, -1)
+    return json.loads(line), lateness_us, missed
+
+
+def main() -> int:
+    """Measure and write."""
+    asked = json.load(sys.stdin)
+    pacing = Pacing(**asked["pacing"])
+    freeze_garbage_collection()
+    granted = prepare_realtime(pacing)
+    lateness_us, missed = measure(pacing, asked["ticks"])
+    sys.stdout.buffer.write(json.dumps(granted).encode() + b"\n" + lateness_us.tobytes() + missed.tobytes())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""Each condition broken in turn, on a host of files: it is named, with the command, and the others are not."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtloop.doctor.examine import conditions
+from rtloop.doctor.host import cpu_list, cpu_text
+from rtloop.doctor.remedy import apply
+from rtloop.engine.plan import Pacing
+from tests.doctor.hosts import CPUS, host
+
+SPINNING = Pacing(10_000.0, spin_us=95.0, cpu=3)
+CLOCK = "sys/devices/system/clocksource/clocksource0/current_clocksource"
+REFUSED = {"scheduler": "SCHED_OTHER", "priority": 0, "refused": ["priority: Operation not permitted"]}
+BROKEN = {
+    "kernel": ({"sys/kernel/realtime": "0\n"}, {}, {"version": "#1 SMP PREEMPT_DYNAMIC"}),
+    "virtualisation": ({"proc/cpuinfo": "flags\t\t: fpu hypervisor avx2\n"}, {}, {}),
+    "processors": ({}, {}, {"allowed_cpus": (3,)}),
+    "isolated processor": ({f"{CPUS}/isolated": "\n"}, {}, {}),
+    "interrupts": ({"proc/irq/25/smp_affinity_list": "0-3\n"}, {}, {}),
+    "frequency governor": ({f"{CPUS}/cpu3/cpufreq/scaling_governor": "powersave\n"}, {}, {}),
+    "idle states": ({}, {"pm_qos": False, "refused": ["pm_qos: Permission denied"]}, {}),
+    "clock source": ({CLOCK: "hpet\n"}, {}, {}),
+    "hyper-threading": ({f"{CPUS}/cpu3/topology/thread_siblings_list": "1,3\n"}, {}, {}),
+    "swap": ({"proc/swaps": "Filename\tType\n/dev/sda2 partition 8000 0 -2\n"}, {"mlock": False}, {}),
+    "SCHED_FIFO": ({}, REFUSED, {}),
+    "real-time throttling": ({"proc/sys/kernel/sched_rt_runtime_us": "950000\n"}, {}, {}),
+    "fair server": ({"sys/kernel/debug/sched/fair_server/cpu3/runtime": "50000000\n"}, {}, {}),
+    "control groups": ({"boot/config-6.12.5-rt": "CONFIG_RT_GROUP_SCHED=y\n"}, REFUSED, {}),
+    "locked memory": ({}, {"mlock": False, "refused": ["mlock: Cannot allocate memory"]}, {}),
+    "timer slack": ({}, {**REFUSED, "timer_slack_ns": 50_000}, {}),
+}
+ALONGSIDE = {"swap": {"locked memory"}, "control groups": {"SCHED_FIFO"}, "timer slack": {"SCHED_FIFO"}}
+"""What cannot be broken without the other."""
+MENDABLE = {
+    "interrupts",
+    "frequency governor",
+    "clock source",
+    "hyper-threading",
+    "real-time throttling",
+    "fair server",
+}
+
+
+def bad(found) -> set[str]:
+    return {finding.condition for finding in found if finding.good is False}
+
+
+def test_a_good_host_is_good(tmp_path):
+    found = conditions(host(tmp_path), SPINNING)
+    assert {finding.condition for finding in found} == {*BROKEN, "compiled code", "libraries"}
+    assert all(finding.good for finding in found if finding.condition != "compiled code")
+
+
+@pytest.mark.parametrize("condition", BROKEN)
+def test_what_is_broken_is_named(condition, tmp_path):
+    files, granted, facts = BROKEN[condition]
+    found = conditions(host(tmp_path, files, granted, **facts), SPINNING)
+    assert bad(found) - {"compiled code"} == {condition} | ALONGSIDE.get(condition, set())
+    finding = next(finding for finding in found if finding.condition == condition)
+    assert finding.late_us > 0
+    assert finding.consequence
+    assert finding.fix
+    assert finding.value not in (finding.wanted, "")
+
+
+@pytest.mark.parametrize("condition", BROKEN)
+def test_apply_mends_what_a_file_mends_and_writes_nothing_else(condition, tmp_path):
+    files, granted, facts = BROKEN[condition]
+    broken = host(tmp_path, files, granted, **facts)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    writes = apply(conditions(broken, SPINNING), tmp_path)
+    changed = {f"/{path.relative_to(tmp_path)}" for path, text in before.items() if path.read_bytes() != text}
+    assert changed == {write.path for write in writes}
+    assert not any(write.refused for write in writes)
+    assert bool(writes) == (condition in MENDABLE)
+    if condition in MENDABLE - {"hyper-threading"}:  # there the kernel takes the sibling away
+        assert condition not in bad(conditions(broken, SPINNING))
+
+
+def test_a_refused_write_is_said(tmp_path):
+    broken = host(tmp_path, {CLOCK: "hpet\n"})
+    (tmp_path / CLOCK).unlink()
+    (tmp_path / CLOCK).mkdir()
+    found = conditions(host(tmp_path / "other", {CLOCK: "hpet\n"}), SPINNING)
+    assert [write.refused for write in apply(found, broken.root)] == ["Is a directory"]
+
+
+def test_a_sleeping_loop_is_not_throttled(tmp_path):
+    files = {**BROKEN["real-time throttling"][0], **BROKEN["fair server"][0]}
+    sleeping = Pacing(10_000.0, spin_us=60.0, cpu=3)
+    assert not bad(conditions(host(tmp_path, files), sleeping)) - {"compiled code"}
+
+
+def test_what_the_host_does_not_show_is_not_judged(tmp_path):
+    from rtloop.doctor.host import Host
+    from tests.doctor.hosts import GRANTED
+
+    found = conditions(Host(GRANTED, tmp_path, "6.1.0", "#1", (0, 1)), Pacing(1000.0))
+    unknown = {finding.condition for finding in found if finding.good is None}
+    assert unknown == {"interrupts", "frequency governor", "clock source", "real-time throttling"}
+
+
+@given(st.sets(st.integers(0, 300)))
+def test_processor_lists(cpus):
+    assert cpu_list(cpu_text(cpus)) == cpus
+
+
+def test_processor_list_as_the_kernel_writes_it():
+    assert cpu_list("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
+    assert cpu_text({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
+    assert cpu_list("") == set()

@@ -1,0 +1,149 @@
+"""The command on this host, whatever it is worth; and the verdict on measurements that were made up."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rtloop.config import parse
+from rtloop.design.closedloop import continuous_loop
+from rtloop.design.margins import delay_tolerated
+from rtloop.design.transfer import Transfer
+from rtloop.doctor.examine import Examination, Latency, conditions
+from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
+from rtloop.engine.plan import Pacing
+from rtloop.prepare import prepare
+from tests.doctor.hosts import host
+from tests.recording.real_loop import ROOT, changed
+
+CAP_IPC_LOCK, CAP_SYS_NICE, PR_CAPBSET_DROP = 14, 23, 24
+
+
+def doctor(*arguments: str, before=None) -> tuple[int, dict, str]:
+    ran = subprocess.run(
+        [sys.executable, "-m", "rtloop", "doctor", "--json", *arguments],
+        capture_output=True, text=True, preexec_fn=before, check=False,
+    )  # fmt: skip
+    return ran.returncode, json.loads(ran.stdout), ran.stderr
+
+
+def without_privileges() -> None:
+    """What a process may do that nobody granted anything."""
+    libc = ctypes.CDLL(None)
+    for capability in (CAP_IPC_LOCK, CAP_SYS_NICE) if os.getuid() == 0 else ():
+        libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+
+
+def test_this_host(tmp_path):
+    code, report, messages = doctor("deploy/paper.toml", "--seconds", "0.3", "--png", str(tmp_path / "late.png"))
+    assert code == (0 if report["suitable"] else 1)
+    assert report["suitable"] == (not report["reasons"])
+    assert report["ticks"] == 3000
+    assert sum(entry["count"] for entry in report["lateness_histogram"]) == 3000
+    assert 0 <= report["lateness_us"]["p50"] <= report["lateness_us"]["p99"] <= report["lateness_us"]["max"]
+    assert [axis["axis"] for axis in report["axes"]] == ["x"]
+    assert not report["applied"]
+    assert not messages
+    assert (tmp_path / "late.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_unprivileged_process_is_told_what_was_refused():
+    code, report, _ = doctor("--seconds", "0.1", before=without_privileges)
+    found = {finding["condition"]: finding for finding in report["findings"]}
+    assert code == 1
+    assert not report["suitable"]
+    assert found["SCHED_FIFO"]["value"] == "refused: Operation not permitted"
+    assert found["locked memory"]["good"] is False
+    assert sum(reason.startswith("SCHED_FIFO: refused") for reason in report["reasons"]) == 1
+
+
+def test_a_configuration_that_is_none():
+    code, report, _ = doctor("no-such.toml")
+    assert code == report["exit_code"] == 66
+
+
+def latency(values_us, rate_hz: float = 10_000.0) -> Latency:
+    values_us = np.asarray(values_us, float)
+    return Latency(Pacing(rate_hz, cpu=3), values_us, np.floor(values_us * rate_hz * 1e-6), 0.0)
+
+
+def test_a_good_host_and_a_quiet_measurement_suit(tmp_path):
+    found = conditions(host(tmp_path), Pacing(10_000.0, cpu=3))
+    assert reasons(Examination(latency(np.full(50_000, 5.0)), found)) == []
+
+
+def test_conditions_count_against_the_period(tmp_path):
+    """Milliseconds of a kernel without PREEMPT_RT forbid 10 kHz, and not 10 Hz."""
+    plain = host(tmp_path, {"sys/kernel/realtime": "0"}, version="#1 SMP PREEMPT_DYNAMIC")
+    found = conditions(plain, Pacing(10_000.0, cpu=3))
+    fast, slow = latency(np.full(20_000, 5.0)), latency(np.full(20, 5.0), 10.0)
+    assert [reason.partition(":")[0] for reason in reasons(Examination(fast, found))] == ["kernel"]
+    assert reasons(Examination(slow, found)) == []
+
+
+def test_a_stall_and_steady_lateness_are_told_apart():
+    stalled, steady = np.full(50_000, 5.0), np.full(50_000, 5.0)
+    stalled[1234] = 70_000.0
+    steady[::500] = 150.0
+    assert reasons(Examination(latency(stalled), ())) == [
+        "measured: a tick was 70000 µs late, and 700 periods were missed"
+    ]
+    assert reasons(Examination(latency(steady), ())) == [
+        "measured: 0.20 % of the ticks were late by more than a period"
+    ]
+
+
+def test_a_delay_beyond_the_loops_margin_is_a_reason():
+    quiet = Examination(latency(np.full(20_000, 5.0)), ())
+    delays = [AxisDelay("x", 95.0, 100.0, 0.1, 0.2, 99.0), AxisDelay("y", 95.0, 100.0, 0.1, 0.2, 101.0)]
+    assert [reason.partition(":")[0] for reason in reasons(quiet, delays)] == ["axis y"]
+
+
+def test_the_papers_loop_bears_two_milliseconds():
+    """Its C(z) has 73.05° left at 95.09 Hz, one sample of delay included in neither."""
+    prepared = prepare(parse(changed(), "paper", ROOT, "paper"))
+    (delay,) = axis_delays(prepared, latency(np.linspace(0, 100, 10_001)))
+    assert delay.crossover_hz == pytest.approx(95.09, abs=0.01)
+    assert delay.tolerated_us == pytest.approx(73.05 / 360 / 95.09 * 1e6, rel=1e-3)
+    assert delay.p50_deg == pytest.approx(360 * 95.09 * 50e-6, rel=1e-3)
+    assert delay.p99_deg == pytest.approx(360 * 95.09 * 99e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize("gain", [1.5, 4.0, 7.9])
+def test_tolerated_delay_of_three_equal_poles(gain):
+    """L = k/(s+1)³: |L| = 1 at ω = √(k^⅔ − 1), where the phase is −3 arctan ω."""
+    w = math.sqrt(gain ** (2 / 3) - 1)
+    loop = continuous_loop(Transfer.from_zpk([], [], gain), Transfer.from_zpk([], [-1.0] * 3, 1.0))
+    delay_s, hz = delay_tolerated(loop)
+    assert delay_s == pytest.approx((math.pi - 3 * math.atan(w)) / w, rel=1e-6)
+    assert hz == pytest.approx(w / (2 * math.pi), rel=1e-6)
+
+
+def test_tolerated_delay_at_the_tightest_of_several_crossovers():
+    """A resonance at 600 Hz that crosses 1 again bears less than the slow crossover, by L written out."""
+    w0, zeta, k = 2 * math.pi * 600, 0.01, 100.0
+    pair = [complex(-zeta * w0, s * w0 * math.sqrt(1 - zeta**2)) for s in (1, -1)]
+    loop = continuous_loop(Transfer.from_zpk([], [0.0], k), Transfer.from_zpk([], pair, w0**2))
+    w = np.linspace(1, 2 * w0, 4_000_001)
+    response = k / (1j * w) * w0**2 / (w0**2 - w**2 + 2j * zeta * w0 * w)
+    at = np.flatnonzero(np.diff(np.sign(np.abs(response) - 1)))
+    left = (np.degrees(np.angle(response[at])) % 360 - 180) % 360
+    delay_s, hz = delay_tolerated(loop)
+    assert len(at) == 3
+    assert delay_s == pytest.approx(np.min(np.radians(left) / w[at]), rel=1e-3)
+    assert hz == pytest.approx(w[at][np.argmin(np.radians(left) / w[at])] / (2 * math.pi), rel=1e-3)
+
+
+def test_no_crossover_bears_any_delay():
+    loop = continuous_loop(Transfer.from_zpk([], [], 0.5), Transfer.from_zpk([], [-1.0], 1.0))
+    assert delay_tolerated(loop)[0] == math.inf
