@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from hil.compiled import jit
+from hil.compiled import inlined, jit
 from hil.linear import CLUSTER, Modal, RepeatedPoles, modal_sum
 
 MAX_MODES = 16
@@ -40,15 +40,20 @@ PAPER_DENOMINATOR = (
 """D(s) = PAPER_GAIN · Π numerator / Π denominator: eq (5), each factor with its highest power of s [rad/s] first."""
 
 COEFFICIENTS = [
-    ("mode_count", "i8"),
+    ("mode_count", "u1"),  # no more than 8 bits, so that no index can be negative
     ("mode_real", "f8", (MAX_MODES,)),
     ("mode_imag", "f8", (MAX_MODES,)),
-    ("true_weights", "f8", (MAX_MODES, 2)),
-    ("sensed_weights", "f8", (MAX_MODES, 2)),
+    *((f"{output}_{part}", "f8", (MAX_MODES,)) for output in ("true", "sensed") for part in ("real", "imag")),
     ("true_direct", "f8"),
     ("sensed_direct", "f8"),
 ]
-STATE = [("modes", "f8", (MAX_MODES, 2)), ("input_um", "f8")]
+STATE = [
+    ("modes_real", "f8", (MAX_MODES,)),
+    ("modes_imag", "f8", (MAX_MODES,)),
+    ("true_sums_um", "f8", (4,)),
+    ("sensed_sums_um", "f8", (4,)),
+    ("input_um", "f8"),
+]
 
 
 def roots_of_factors(factors: Iterable[Sequence[float]]) -> tuple[npt.NDArray[np.complex128], float]:
@@ -126,13 +131,15 @@ def discretise(modal: Modal, period_s: float) -> dict[str, object]:
     if not (np.isfinite(poles).all() and np.isfinite(residues).all()):
         raise ValueError(f"overflow at a period of {period_s:g} s: use slower poles or a shorter period")
     empty = np.zeros(MAX_MODES - count)
-    weights = [np.column_stack([np.append(row.real, empty), np.append(-row.imag, empty)]) for row in residues]
+    true, sensed = residues
     return {
         "mode_count": count,
         "mode_real": np.append(poles.real, empty),
         "mode_imag": np.append(poles.imag, empty),
-        "true_weights": weights[0],
-        "sensed_weights": weights[1],
+        "true_real": np.append(true.real, empty),
+        "true_imag": np.append(-true.imag, empty),
+        "sensed_real": np.append(sensed.real, empty),
+        "sensed_imag": np.append(-sensed.imag, empty),
         "true_direct": modal.direct[0],
         "sensed_direct": modal.direct[1],
     }
@@ -143,27 +150,58 @@ def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
     poles = coefficients.mode_real + 1j * coefficients.mode_imag
     modes: npt.NDArray[np.complex128] = np.where(poles == 1, 0.0, input_um / np.where(poles == 1, 1.0, 1 - poles))
     modes[coefficients.mode_count :] = 0.0
-    state.modes[:, 0], state.modes[:, 1], state.input_um = modes.real, modes.imag, input_um
+    state.modes_real[:], state.modes_imag[:], state.input_um = modes.real, modes.imag, input_um
 
 
 @jit
 def observe(coefficients, state):
-    """True and sensed position [µm] at this instant, the input of the period that ends here still applied."""
-    true_um = coefficients.true_direct * state.input_um
-    sensed_um = coefficients.sensed_direct * state.input_um
-    for i in range(coefficients.mode_count):
-        real, imag = state.modes[i, 0], state.modes[i, 1]
-        true_um += coefficients.true_weights[i, 0] * real + coefficients.true_weights[i, 1] * imag
-        sensed_um += coefficients.sensed_weights[i, 0] * real + coefficients.sensed_weights[i, 1] * imag
-    return true_um, sensed_um
+    """True and sensed position [µm] at this instant, the input of the period that ends here still applied.
+
+    Four modes at a time, as in `hil.hysteresis`; the weights beyond the last mode are 0.
+    """
+    real, imag = state.modes_real, state.modes_imag
+    t_real, t_imag, s_real, s_imag = (
+        coefficients.true_real,
+        coefficients.true_imag,
+        coefficients.sensed_real,
+        coefficients.sensed_imag,
+    )
+    t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for block in range((coefficients.mode_count + 3) // 4):
+        i = 4 * block
+        t0 += t_real[i] * real[i] + t_imag[i] * imag[i]
+        t1 += t_real[i + 1] * real[i + 1] + t_imag[i + 1] * imag[i + 1]
+        t2 += t_real[i + 2] * real[i + 2] + t_imag[i + 2] * imag[i + 2]
+        t3 += t_real[i + 3] * real[i + 3] + t_imag[i + 3] * imag[i + 3]
+        s0 += s_real[i] * real[i] + s_imag[i] * imag[i]
+        s1 += s_real[i + 1] * real[i + 1] + s_imag[i + 1] * imag[i + 1]
+        s2 += s_real[i + 2] * real[i + 2] + s_imag[i + 2] * imag[i + 2]
+        s3 += s_real[i + 3] * real[i + 3] + s_imag[i + 3] * imag[i + 3]
+    true_sums, sensed_sums = state.true_sums_um, state.sensed_sums_um
+    true_sums[0], true_sums[1], true_sums[2], true_sums[3] = t0, t1, t2, t3
+    sensed_sums[0], sensed_sums[1], sensed_sums[2], sensed_sums[3] = s0, s1, s2, s3
+    true_um = coefficients.true_direct * state.input_um + ((t0 + t1) + (t2 + t3))
+    return true_um, coefficients.sensed_direct * state.input_um + ((s0 + s1) + (s2 + s3))
 
 
 @jit
 def step(coefficients, state, input_um):
     """One period with the input held at `input_um` [µm]."""
     state.input_um = input_um
-    for i in range(coefficients.mode_count):
-        real, imag = state.modes[i, 0], state.modes[i, 1]
-        across, along = coefficients.mode_imag[i], coefficients.mode_real[i]
-        state.modes[i, 0] = along * real - across * imag + input_um
-        state.modes[i, 1] = across * real + along * imag
+    real, imag = state.modes_real, state.modes_imag
+    for block in range((coefficients.mode_count + 3) // 4):
+        i = 4 * block
+        real_0, imag_0 = _moved(coefficients, real[i], imag[i], i, input_um)
+        real_1, imag_1 = _moved(coefficients, real[i + 1], imag[i + 1], i + 1, input_um)
+        real_2, imag_2 = _moved(coefficients, real[i + 2], imag[i + 2], i + 2, input_um)
+        real_3, imag_3 = _moved(coefficients, real[i + 3], imag[i + 3], i + 3, input_um)
+        real[i], real[i + 1], real[i + 2], real[i + 3] = real_0, real_1, real_2, real_3
+        imag[i], imag[i + 1], imag[i + 2], imag[i + 3] = imag_0, imag_1, imag_2, imag_3
+
+
+@inlined
+def _moved(coefficients, real, imag, i, input_um):
+    """Mode i after a period: λz + u."""
+    along, across = coefficients.mode_real[i], coefficients.mode_imag[i]
+    return along * real - across * imag + input_um, across * real + along * imag

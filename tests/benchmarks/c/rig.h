@@ -25,12 +25,16 @@ static inline double noise(uint64_t *word) {
 }
 
 static inline double rig_sample(rig_c c, rig_s s) {
-    double true_um = c->true_direct * s->input_um, sensed_um = c->sensed_direct * s->input_um;
-    for (int64_t i = 0; i < c->mode_count; i++) {
-        double real = s->modes[i][0], imag = s->modes[i][1];
-        true_um += c->true_weights[i][0] * real + c->true_weights[i][1] * imag;
-        sensed_um += c->sensed_weights[i][0] * real + c->sensed_weights[i][1] * imag;
-    }
+    double true_sums[4] = {0}, sensed_sums[4] = {0};
+    for (unsigned i = 0; i < c->mode_count; i += 4)
+        for (unsigned lane = 0; lane < 4; lane++) {
+            double real = s->modes_real[i + lane], imag = s->modes_imag[i + lane];
+            true_sums[lane] += c->true_real[i + lane] * real + c->true_imag[i + lane] * imag;
+            sensed_sums[lane] += c->sensed_real[i + lane] * real + c->sensed_imag[i + lane] * imag;
+        }
+    double true_um = c->true_direct * s->input_um + ((true_sums[0] + true_sums[1]) + (true_sums[2] + true_sums[3]));
+    double sensed_um =
+        c->sensed_direct * s->input_um + ((sensed_sums[0] + sensed_sums[1]) + (sensed_sums[2] + sensed_sums[3]));
     s->true_position_um = true_um;
     double reading_um = sensed_um + c->sensor_offset_um;
     if (c->sensor_noise_um > 0) reading_um += c->sensor_noise_um * noise(&s->noise_word);
@@ -84,9 +88,10 @@ static inline void rig_advance(rig_c c, rig_s s, double dac_v) {
     s->hysteresis_um = crept_um;
     double input_um = crept_um + rig_disturbance(c, s);
     s->input_um = input_um;
-    for (int64_t i = 0; i < c->mode_count; i++) {
-        double real = s->modes[i][0], imag = s->modes[i][1];
-        s->modes[i][0] = c->mode_real[i] * real - c->mode_imag[i] * imag + input_um;
-        s->modes[i][1] = c->mode_imag[i] * real + c->mode_real[i] * imag;
-    }
+    for (unsigned i = 0; i < c->mode_count; i += 4)
+        for (unsigned lane = 0; lane < 4; lane++) {
+            double real = s->modes_real[i + lane], imag = s->modes_imag[i + lane];
+            s->modes_real[i + lane] = c->mode_real[i + lane] * real - c->mode_imag[i + lane] * imag + input_um;
+            s->modes_imag[i + lane] = c->mode_imag[i + lane] * real + c->mode_real[i + lane] * imag;
+        }
 }
