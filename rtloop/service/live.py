@@ -29,14 +29,17 @@ SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
 
 
 class LiveLaw:
-    """The law as it runs now, and the ways to change it. Thread-safe."""
+    """The law as it runs now, and the ways to change it. Thread-safe.
 
-    def __init__(self, prepared: Prepared, block: SharedBlock, desk: Desk) -> None:
+    `offsets_v` are the readings at position 0 of the axes that were tared, which no other change may undo.
+    """
+
+    def __init__(self, prepared: Prepared, block: SharedBlock, desk: Desk, offsets_v: dict[int, float]) -> None:
         self.prepared = prepared
+        self.offsets_v = offsets_v
         self._block, self._desk = block, desk
         self._lock = threading.Lock()
         self._first_spare = prepared.plan.table.size
-        self._offsets_v: dict[int, float] = {}
         self._places = [0] * len(prepared.plan.axes)
 
     def axis_number(self, name: str) -> int:
@@ -100,7 +103,7 @@ class LiveLaw:
     def tare(self, number: int, offset_v: float) -> int:
         """Make `offset_v` the reading at position 0; returns the tick."""
         with self._lock:
-            self._offsets_v[number] = offset_v
+            self.offsets_v[number] = offset_v
             return self._stage(number, self.prepared)
 
     def replace_all(self, prepared: Prepared) -> list[str]:
@@ -139,7 +142,7 @@ class LiveLaw:
         """Copy coefficients to where the loop takes them from, and have it take them."""
         before, after = self.prepared.configuration.axes[number], prepared.configuration.axes[number]
         coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1].copy()
-        coefficients["offset_v"] = self._offsets_v.get(number, float(coefficients["offset_v"][0]))
+        coefficients["offset_v"] = self.offsets_v.get(number, float(coefficients["offset_v"][0]))
         size = COEFFICIENTS.itemsize
         self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller

@@ -77,6 +77,7 @@ class Service:
         self._ending, self._reload = threading.Event(), threading.Event()
         self._reloading = threading.Lock()
         self._deaths_s: list[float] = []
+        self._offsets_v: dict[int, float] = {}
         self._ready = False
 
     # what signals and the API ask for
@@ -177,12 +178,16 @@ class Service:
             if resting or preparing:
                 plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE))
                 prepared = replace(prepared, plan=plan)
-            prepared = replace(prepared, plan=replace(prepared.plan, spare_samples=SPARE_SAMPLES))
+            coefficients = prepared.plan.coefficients.copy()
+            for number, offset_v in self._offsets_v.items():  # the actuator is not at rest: it cannot be tared again
+                coefficients["offset_v"][number] = offset_v
+            plan = replace(prepared.plan, coefficients=coefficients, spare_samples=SPARE_SAMPLES)
+            prepared = replace(prepared, plan=plan)
             supervisor = Supervisor(processes, prepared, recording_path(prepared, None), options.stall_ms / 1000)
             try:
                 supervisor.start()
                 self._desk = Desk(supervisor.block)
-                self.live = LiveLaw(prepared, supervisor.block, self._desk)
+                self.live = LiveLaw(prepared, supervisor.block, self._desk, self._offsets_v)
                 self.supervisor = supervisor
                 if preparing:
                     self._aside(self._prepare_and_start)

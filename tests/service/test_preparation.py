@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 
+import rtloop
 from rtloop.service.options import DepolariseOptions
 from rtloop.service.preparation import decaying_sine
+from tests.faults.account import runs_in
+from tests.faults.bench import Bench
 
 R = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
 P = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
@@ -34,3 +40,23 @@ def test_the_sweep_begins_and_ends_at_rest():
     assert sweep.size == 500
     assert sweep[0] == 0.0
     assert abs(sweep[-1]) < 1e-12
+
+
+def test_the_tare_survives_the_loop(tmp_path):
+    """A sensor that is 3 µm off: read from the recordings of the tared loop and of the one after it."""
+    changes = (
+        ("noise_um = 0.010\n", "noise_um = 0.0\noffset_um = 3.0\n"),
+        ("[recording]", "[service]\ntare_s = 0.2\n[recording]"),
+    )
+    with Bench(tmp_path, *changes) as bench:
+        bench.await_drive()
+        os.kill(bench.pid("rt"), signal.SIGKILL)
+        bench.await_restart()
+        bench.recover()
+        assert bench.stop() == 0, bench.log()
+    first, second = (rtloop.load(files) for files in runs_in(tmp_path / "recordings"))
+    offsets_v = [run["x_adc_v"] - run["x_position_um"] / 10.0 for run in (first, second)]
+    assert abs(offsets_v[0][0]) < 1e-12
+    assert abs(offsets_v[0][-1] - 0.3) < 0.001
+    assert np.ptp(offsets_v[1]) < 1e-12
+    assert abs(offsets_v[1][0] - offsets_v[0][-1]) < 1e-12
