@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings soak-chain check install uninstall test-systemd clean soak-identification
+.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings soak-chain soak-aborts check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -30,7 +30,9 @@ soak-swaps: $(READY)
 soak-daemon: $(READY)
 	$(BIN)/python -m tests.soak.daemon
 
-bench: $(READY)
+# Every benchmark, about half an hour, as root for real-time scheduling; figures are kept in .benchmarks/, and
+# `.venv/bin/python -m tests.benchmarks --page docs/benchmarks.md` puts the newest into that page.
+bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks
 
 # Killed runs, damaged files, other processors, an hour at 10 kHz: about half an hour, 2 GB in the temporary folder.
@@ -45,6 +47,10 @@ soak-identification: $(READY)
 soak-chain: $(READY)
 	$(BIN)/python -m tests.soak.chain
 
+# Ctrl-C at twenty random moments of all experiments: about ten minutes.
+soak-aborts: $(READY)
+	$(BIN)/python -m tests.soak.aborts
+
 check: $(READY)
 	$(BIN)/rtloop check deploy/paper.toml
 
@@ -54,6 +60,10 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m rtloop.warm
 	touch $@
 
+$(VENV)/.bench: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	touch $@
+
 # As root; PREFIX, DESTDIR and PIP_ARGS (such as "--no-index --find-links FOLDER") are explained in deploy/install.
 install uninstall:
 	PYTHON='$(PYTHON)' PREFIX='$(PREFIX)' DESTDIR='$(DESTDIR)' PIP_ARGS='$(PIP_ARGS)' deploy/install $@
@@ -61,6 +71,11 @@ install uninstall:
 # As root, with debootstrap and systemd-container: the installed service under a real systemd, in a Debian container.
 test-systemd: $(READY)
 	PYTHON='$(abspath $(BIN)/python)' tests/systemd/run
+
+# As root, with debootstrap and qemu-system-x86: the kernel's comedi board, SocketCAN and systemd on a PREEMPT_RT kernel, in
+# an emulated machine: about half an hour.
+rig: $(READY)
+	PYTHON='$(abspath $(BIN)/python)' tests/rig/run
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -47,6 +47,7 @@ class Facts:
     max_rate_hz: float = float("inf")
     exclusive: bool = True
     hardware_watchdog: bool = False
+    """True where the card itself ramps its outputs to their safe values, when nobody writes and when it is opened."""
     real: bool = True
     """False where no real actuator hangs on the outputs, so that virtual time is allowed."""
 
@@ -66,6 +67,8 @@ class Driver(ABC):
 
     kind: ClassVar[str]
     options_model: ClassVar[type[Options]] = Options
+    example: ClassVar[Wiring] = Wiring("adc0", "dac0")
+    """Channels that it has by default, for a list of what drivers can do."""
 
     def __init__(self, options: Options, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
         """`wiring` names the channels of each axis, in the order of the axes.

@@ -22,6 +22,8 @@ class PythonDriver(Driver):
 
     error: Exception | None = None
     sample_age_us: float = 0.0
+    status: int = 0
+    """What the loop records for a read that succeeded; above 0 is degraded."""
 
     @abstractmethod
     def start(self) -> None:
@@ -59,7 +61,7 @@ class PythonDriver(Driver):
                     raise ValueError(f"driver {self.kind!r}: read gave {len(row)} numbers; its facts say {given}")
                 for i, value in enumerate(row):
                     values[i] = value
-                return 0
+                return self.status
             except Exception as error:  # nothing may propagate into compiled code
                 self.error = error
                 return FAILED

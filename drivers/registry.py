@@ -10,6 +10,8 @@ from drivers.errors import MissingExtra
 
 GROUP = "rtloop.drivers"
 BUILT_IN = {
+    "can": "drivers.can.driver:CanDriver",
+    "comedi": "drivers.comedi:ComediDriver",
     "shm": "drivers.shm:ShmDriver",
     "sim": "drivers.sim:SimDriver",
 }

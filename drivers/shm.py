@@ -18,7 +18,7 @@ from hil import board
 from hil.board import HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, BoardMemory, latest_sample
 from hil.compiled import cfunc
 from hil.monotonic import monotonic_ns
-from hil.options import RigOptions
+from hil.options import BoardOptions
 from hil.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype(
@@ -29,8 +29,8 @@ TRIES = 1000
 NO_SAMPLE = 1
 
 
-class ShmOptions(RigOptions):
-    """Where the board's memory is; the rest describes the rig, for `rtloop hil serve`."""
+class ShmOptions(BoardOptions):
+    """Where the board's memory is; the rest describes the board and its rig, for `rtloop hil serve`."""
 
     file: str = "/dev/shm/rtloop-board"
     board_rate_hz: float | None = Field(default=None, gt=0, le=1e6)

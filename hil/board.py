@@ -1,7 +1,8 @@
 """The rig as a board of its own: a free-running process with its own clock behind memory that looks like a card.
 
 The controller's side writes DAC codes and reads ADC codes; the board moves the rig at its own rate whether or not
-anybody writes, and holds the last codes like a card does. What it saw at its outputs (lowest, highest, largest step)
+anybody writes, and holds the last codes like a card does. Samples can be dropped or repeated at random, as a bad link
+does; a seed makes that the same in every run. What it saw at its outputs (lowest, highest, largest step)
 is kept here: evidence that does not come from the process that is judged.
 """
 
@@ -20,7 +21,8 @@ import numpy as np
 from hil.atomics import fence_acquire, fence_release, load_acquire, store_release
 from hil.compiled import jit
 from hil.monotonic import monotonic_ns, sleep_until
-from hil.options import RigOptions
+from hil.noise import seed_word
+from hil.options import BoardOptions
 from hil.rig import advance, build_rig, sample
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
@@ -36,9 +38,10 @@ BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
 """First in the file, written once."""
-WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS = 8, 0, 1, 2
-"""uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, and how late the board's
-own clock ever was: between two looks at its outputs lay at most so much more than its period."""
+WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS, DROPPED, REPEATED = 8, 0, 1, 2, 3, 4
+"""uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, how late the board's own
+clock ever was (between two looks at its outputs lay at most so much more than its period), and how many samples were
+dropped and repeated."""
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 SEEN = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("largest_step_v", np.float64), ("last_v", np.float64),
@@ -50,6 +53,10 @@ SEEN = np.dtype(
 `largest_rate_v_per_s` is the largest step over the time since the board looked before and two periods more: a ramp
 that moves by its slew once a period never exceeds its slew here, however late board or controller are.
 """
+LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
+"""How often samples are lost, and the state of the chance that decides."""
+_SHIFTS = np.uint64(13), np.uint64(7), np.uint64(17)
+_UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
 class BoardMemory:
@@ -98,7 +105,7 @@ class BoardBusy(OSError):
 
 def serve(
     path: Path,
-    options: RigOptions,
+    options: BoardOptions,
     axes: Sequence[str],
     rate_hz: float,
     stopped: Callable[[], bool],
@@ -116,8 +123,11 @@ def serve(
         memory = BoardMemory(fd)
         memory.reset()
         timespec = np.zeros(2, np.int64)
+        losses = np.zeros(1, LOSSES).view(np.recarray)
+        losses.word = seed_word(options.seed, "losses")
+        losses.dropped_share, losses.repeated_share = options.dropped_share, options.repeated_share
         arguments = (coefficients, state, memory.words, memory.sample_ns, memory.dac_codes, memory.adc_codes,
-                     memory.seen, timespec.ctypes.data)  # fmt: skip
+                     memory.seen, losses, timespec.ctypes.data)  # fmt: skip
         _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
@@ -147,7 +157,19 @@ def take_role(fd: int, byte: int) -> bool:
 
 @jit
 def _run(
-    coefficients, state, words, sample_ns, dac_codes, adc_codes, seen, timespec, start_ns, period_ns, index, count
+    coefficients,
+    state,
+    words,
+    sample_ns,
+    dac_codes,
+    adc_codes,
+    seen,
+    losses,
+    timespec,
+    start_ns,
+    period_ns,
+    index,
+    count,
 ):
     """`count` periods of the board's fixed grid; periods that a stall swallowed still move the rig. Next index."""
     for _ in range(count):
@@ -158,15 +180,17 @@ def _run(
         if np.uint64(now_ns - wake_ns) > words[LONGEST_LATE_NS]:
             words[LONGEST_LATE_NS] = np.uint64(now_ns - wake_ns)
         fault = load_acquire(words, FAULT)
+        fresh, dated = _arrives(losses[0], words)
+        frozen = fault == FROZEN_INPUT
         sequence = load_acquire(words, SEQUENCE)
         store_release(words, SEQUENCE, BUSY)
         fence_release()
         for i in range(coefficients.shape[0]):
             volts = sample(coefficients[i], state[i])
-            if fault != FROZEN_INPUT:
+            if fresh and not frozen:
                 adc_codes[i] = np.int64(np.rint(volts / LSB_V))
             _look(seen[i], state[i], index)
-        if fault != FROZEN_INPUT:
+        if dated and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
         look_ns = monotonic_ns(timespec)
@@ -176,6 +200,24 @@ def _run(
             advance(coefficients[i], state[i], volts)
         index += 1
     return index
+
+
+@jit
+def _arrives(losses, words):
+    """Whether this sample's value, and whether its time, reach the controller."""
+    word = losses.word
+    word ^= word << _SHIFTS[0]
+    word ^= word >> _SHIFTS[1]
+    word ^= word << _SHIFTS[2]
+    losses.word = word
+    chance = float(word >> _UNUSED_BITS) * _UNIT
+    if chance < losses.dropped_share:
+        words[DROPPED] += np.uint64(1)
+        return False, False
+    if chance < losses.dropped_share + losses.repeated_share:
+        words[REPEATED] += np.uint64(1)
+        return False, True
+    return True, True
 
 
 @jit

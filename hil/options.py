@@ -156,3 +156,21 @@ class RigOptions(Options):
     """Of all noise. Each axis has a stream of its own, by its name."""
     latency_ticks: int = Field(default=0, ge=0, le=MAX_LATENCY)
     """Periods more than the one that a held output always takes: 0 is written in tick k, seen from k + 1."""
+
+
+class BoardOptions(RigOptions):
+    """The rig behind a board's clock, with what goes wrong between board and controller."""
+
+    dropped_share: float = Field(default=0.0, ge=0, le=1)
+    """Share of the samples that the board does not take: the one before stays, and grows old."""
+    repeated_share: float = Field(default=0.0, ge=0, le=1)
+    """Share of the samples that carry the value before under a new time: no age tells."""
+
+    @model_validator(mode="after")
+    def _check_shares(self) -> Self:
+        if self.dropped_share + self.repeated_share > 1:
+            raise ValueError(
+                f"dropped_share {self.dropped_share:g} and repeated_share {self.repeated_share:g}: "
+                "allowed is a sum of at most 1"
+            )
+        return self

@@ -1,15 +1,17 @@
-"""`rtloop hil serve`: the simulated rig as a board of its own, for driver kind `shm`."""
+"""`rtloop hil serve`: the simulated rig as a board of its own, for driver kind `shm`, or as a node on a CAN bus."""
 
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import click
 
+from drivers.can.options import CanOptions
 from drivers.shm import ShmOptions
 from hil.board import serve
-from rtloop.config import load
+from rtloop.config import Configuration, load
 from rtloop.engine.plan import Pacing
 from rtloop.engine.realtime import prepare_realtime
 from rtloop.errors import ConfigError, UnavailableError
@@ -24,9 +26,56 @@ def serve_board(config: Path) -> int:
     options = configuration.driver_options
     if not isinstance(options, ShmOptions):
         kind = configuration.driver_kind
-        raise ConfigError(str(config), [f"driver.kind: {kind!r}; `rtloop hil serve` is the board of kind 'shm' alone"])
+        allowed = "`rtloop hil serve` is the board of kind 'shm', with --can the node of kind 'can'"
+        raise ConfigError(str(config), [f"driver.kind: {kind!r}; {allowed}"])
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
-    axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
+    axes = _axes_by_output(configuration)
+    stopped = _stop_signals()
+    prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
+    click.echo(f"board at {options.file}: {len(axes)} channels at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
+    try:
+        ready = lambda: Notifier().send(READY=1)
+        samples = serve(Path(options.file), options, axes, rate_hz, stopped, ready)
+    except ValueError as error:
+        raise ConfigError(str(config), [f"driver: {error}"]) from None
+    except OSError as error:
+        raise UnavailableError(f"{options.file}: {error.strerror or error}") from None
+    click.echo(f"board at {options.file}: {samples} samples", err=True)
+    return 0
+
+
+def serve_node(config: Path) -> int:
+    """Be the CAN node of a configuration's [driver] until SIGINT or SIGTERM. Raises ConfigError, DriverError."""
+    configuration = load(config)
+    options = configuration.driver_options
+    if not isinstance(options, CanOptions):
+        kind = configuration.driver_kind
+        raise ConfigError(str(config), [f"driver.kind: {kind!r}; --can is the node of kind 'can'"])
+    from drivers.can.node import serve as serve_can
+
+    axes = _axes_by_output(configuration)
+    stopped = _stop_signals()
+    prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
+
+    def ready() -> None:
+        click.echo(f"node on {options.place}: {len(axes)} channels; Ctrl-C ends it", err=True)
+        Notifier().send(READY=1)
+
+    try:
+        did = serve_can(options, axes, stopped, ready)
+    except ValueError as error:
+        raise ConfigError(str(config), [f"driver.{error}"]) from None
+    click.echo(f"node on {options.place}: {did}", err=True)
+    return 0
+
+
+def _axes_by_output(configuration: Configuration) -> list[str]:
+    """The axis at each output of the board, in their order."""
+    return [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
+
+
+def _stop_signals() -> Callable[[], bool]:
+    """Whether SIGINT or SIGTERM has come since."""
     stopped = False
 
     def stop(*_: object) -> None:
@@ -35,14 +84,4 @@ def serve_board(config: Path) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
-    click.echo(f"board at {options.file}: {len(axes)} channels at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
-    try:
-        ready = lambda: Notifier().send(READY=1)
-        samples = serve(Path(options.file), options, axes, rate_hz, lambda: stopped, ready)
-    except ValueError as error:
-        raise ConfigError(str(config), [f"driver: {error}"]) from None
-    except OSError as error:
-        raise UnavailableError(f"{options.file}: {error.strerror or error}") from None
-    click.echo(f"board at {options.file}: {samples} samples", err=True)
-    return 0
+    return lambda: stopped

@@ -7,7 +7,6 @@ from typing import IO, Any
 from rich.console import Console
 from rich.table import Table
 
-from drivers.base import Wiring
 from drivers.errors import DriverError
 from drivers.registry import driver_class, kinds
 from rtloop import signals
@@ -102,13 +101,13 @@ def _print_timing(console: Console, summary: dict[str, Any]) -> None:
     console.print(table)
     histogram = summary.get("lateness_histogram")
     if histogram:
-        console.print("lateness  " + _bars(histogram))
+        console.print("lateness  " + bars(histogram))
     phases = summary["phases"]
     labels = (("read", "read_us"), ("law", "law_us"), ("write", "write_us"))
     console.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
 
 
-def _bars(histogram: list[dict[str, Any]]) -> str:
+def bars(histogram: list[dict[str, Any]]) -> str:
     """Counts per class as bars on a logarithmic scale."""
     largest = max((entry["count"] for entry in histogram), default=0)
     cells = []
@@ -144,7 +143,7 @@ def print_drivers() -> None:
     for kind, where in kinds().items():
         try:
             driver = driver_class(kind)
-            facts = driver(driver.options_model(), {"x": Wiring("adc0", "dac0")}, 1000.0).facts
+            facts = driver(driver.options_model(), {"x": driver.example}, 1000.0).facts
         except (DriverError, ValueError) as error:
             table.add_row(kind, f"[red]{error}[/]", "", "", where)
             continue

@@ -34,7 +34,7 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
         path = recording_path(prepared, out)
         recover_leftovers(path.parent)
         supervisor = Supervisor(processes, prepared, path)
-        with _stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
+        with stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
             result = supervisor.run(_every(PROGRESS_PERIOD_S, view.show))
     summary = run_summary(prepared, result)
     summary["startup_s"] = supervisor.startup_s
@@ -98,7 +98,7 @@ def recover_leftovers(folder: Path) -> None:
 
 
 @contextmanager
-def _stopped_by_signals(supervisor: Supervisor) -> Any:
+def stopped_by_signals(supervisor: Supervisor) -> Any:
     """SIGINT and SIGTERM ramp the loop down instead of ending this process."""
     previous = {name: signal.signal(name, lambda *_: supervisor.stop()) for name in (signal.SIGINT, signal.SIGTERM)}
     try:

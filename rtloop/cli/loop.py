@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import click
 
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds, fails_clearly
+
+
+class Positive(click.FloatRange):
+    """A number above 0, and a number indeed."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """The number; a usage error where it is none."""
+        number = super().convert(value, param, ctx)
+        return self.fail(f"{value}: a number above 0 is needed", param, ctx) if math.isnan(number) else number
+
+
+POSITIVE = Positive(0.0, 1e6, min_open=True)
 
 
 @click.command()
@@ -35,13 +49,37 @@ def check(config: Path, as_json: bool) -> int:
 
 
 @click.command()
+@click.option("--selftest", "config", type=OUTPUT, metavar="CONFIG", help="Drive the channels of CONFIG and measure.")
+@click.option(
+    "--amplitude",
+    "amplitude_v",
+    type=POSITIVE,
+    default=1.0,
+    show_default=True,
+    help="Volts from the safe value; the axis's limits and the channel's range hold all the same.",
+)
+@click.option("--loopback", is_flag=True, help="Every output is wired to its input: judge gain and offset.")
+@click.option("--gain-tolerance", type=POSITIVE, default=0.01, show_default=True)
+@click.option("--offset-tolerance", "offset_v", type=POSITIVE, default=0.01, show_default=True)
+@JSON
 @fails_clearly
-def drivers() -> int:
-    """List the backends and what each can do."""
-    from rtloop.report import print_drivers
+def drivers(
+    config: Path | None, amplitude_v: float, loopback: bool, gain_tolerance: float, offset_v: float, as_json: bool
+) -> int:
+    """List the backends; or test the channels of a configuration: gain, offset, noise, delay, highest rate.
 
-    print_drivers()
-    return 0
+    The self-test moves outputs: nothing fragile may hang on them.
+    """
+    if config is None:
+        from rtloop.report import print_drivers
+
+        print_drivers()
+        return 0
+    from rtloop.selftest import Tolerances, selftest_configuration
+
+    return selftest_configuration(
+        config, amplitude_v, Tolerances(gain_tolerance, offset_v) if loopback else None, as_json
+    )
 
 
 COMMANDS = (run, check, drivers)

@@ -39,12 +39,13 @@ def hil() -> None:
 
 @hil.command("serve")
 @CONFIG
+@click.option("--can", "on_can", is_flag=True, help="Be a node on the CAN bus of CONFIG, whose driver is of kind can.")
 @fails_clearly
-def hil_serve(config: Path) -> int:
+def hil_serve(config: Path, on_can: bool) -> int:
     """Be the board of CONFIG, whose driver is of kind shm: a rig with its own clock that outlives its controllers."""
-    from rtloop.board import serve_board
+    from rtloop.board import serve_board, serve_node
 
-    return serve_board(config)
+    return serve_node(config) if on_can else serve_board(config)
 
 
 @click.group()

@@ -56,6 +56,7 @@ class Origin(IntEnum):
     SCHEDULE = 1
     OPERATOR = 2
     SUPERVISOR = 3
+    CAN = 4
 
 
 def message(

@@ -18,6 +18,7 @@ import uvicorn
 
 from rtloop.errors import UnavailableError
 from rtloop.service.api import application
+from rtloop.service.can_bus import supervised_by_can
 from rtloop.service.paths import socket_path
 from rtloop.service.service import Service
 
@@ -32,7 +33,7 @@ def serve(config: Path) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
-    with _listening(service):
+    with _listening(service), supervised_by_can(service):
         return service.run()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from rtloop.errors import RtloopError
 
 ANSWER_TIMEOUT_S = 2.0
 POLL_S = 0.001
+asked_by = ContextVar("asked_by", default=Origin.OPERATOR)
+"""Who asks, in this thread: the origin that the recording shows."""
 
 
 class Refused(RtloopError):
@@ -35,7 +38,7 @@ class Desk:
         """Send a command and wait until its tick was executed, which it returns. Raises Refused."""
         with self._lock:
             self._identity += 1
-            command = message(kind, axis=axis, origin=Origin.OPERATOR, values=values)
+            command = message(kind, axis=axis, origin=asked_by.get(), values=values)
             command["identity"] = self._identity
             cursor = int(self._block["events_head"][0])
             send(self._block, command)

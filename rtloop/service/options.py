@@ -6,6 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from drivers.can.options import BusOptions
 from hil.options import Options
 
 
@@ -33,6 +34,8 @@ class ServiceOptions(Options):
     tare_s: float = Field(default=0.0, ge=0, le=60.0)
     """Mean of the sensor over so long, outputs at safe, becomes position 0."""
     depolarise: DepolariseOptions | None = None
+    can: BusOptions | None = None
+    """A CAN bus on which the service says how it is, and is told setpoints and modes."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

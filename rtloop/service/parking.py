@@ -105,8 +105,11 @@ def park(
     last_drive_v: Sequence[float],
     slew_v_per_s: float,
 ) -> None:
-    """Ramp every axis from `last_drive_v` to its safe value, then close the driver. Raises DriverError."""
-    outputs = driver.facts.outputs
+    """Ramp every axis from `last_drive_v` to its safe value, then close the driver. Raises DriverError.
+
+    A card with a watchdog of its own is no longer where it was: it has gone to its safe values, or is on its way.
+    """
+    outputs, parks_itself = driver.facts.outputs, driver.facts.hardware_watchdog
     safe_v = np.array([channel.safe_v for channel in outputs])
     last_v = safe_v.copy()
     for axis, drive_v in zip(axes, last_drive_v, strict=True):
@@ -115,7 +118,7 @@ def park(
     try:
         write = _WRITE(pointers.write)
         period_s = max(1.0 / driver.rate_hz, SHORTEST_PERIOD_S)
-        for row in ramp(last_v, safe_v, slew_v_per_s * period_s):
+        for row in [] if parks_itself else ramp(last_v, safe_v, slew_v_per_s * period_s):
             values = np.ascontiguousarray(row)
             if write(pointers.context, values.ctypes.data) < 0:
                 raise DriverError(f"{driver.kind}: write failed while parking at {row.tolist()} V")

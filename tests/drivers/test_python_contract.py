@@ -2,33 +2,57 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
+from drivers import contract
 from drivers.contract import Calls
 from drivers.errors import DriverError
 from rtloop.engine.plan import require_facts
 from tests.drivers.bench_driver import LoopBack, LoopBackContract
-from tests.drivers.mutants import MUTANTS, ForgetsAnInput
+from tests.drivers.mutants import MUTANTS, ForgetsAnInput, Native
 
 
 class TestLoopBack(LoopBackContract):
     pass
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda kind: kind.__name__)
-def test_a_broken_promise_turns_the_suite_red(mutant):
+class TestNative(LoopBackContract):
+    kind = Native
+
+
+def broken_promises(mutant: type[LoopBack]) -> list[tuple[str, int]]:
+    """Tests that fail for a mutant, each with the line of the contract's own assertion, 0 where it was not one."""
     suite = type("Suite", (LoopBackContract,), {"kind": mutant})
-    failed = []
+    found = []
     for name in dir(suite):
         if name.startswith("test_"):
             try:
                 getattr(suite(), name)()
-            except (AssertionError, DriverError, ValueError):
-                failed.append(name)
-    assert failed
+            except AssertionError as error:
+                lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == contract.__file__]
+                found.append((name, lines[-1] or 0))
+            except (DriverError, ValueError):
+                found.append((name, 0))
+    return found
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda kind: kind.__name__)
+def test_a_broken_promise_turns_the_suite_red(mutant):
+    assert broken_promises(mutant)
+
+
+def test_every_promise_is_broken_by_a_mutant():
+    """No assertion of the suite stands there that none of the mutants sets off."""
+    tree = ast.parse(Path(contract.__file__).read_text())
+    promises = {node.lineno: ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Assert)}
+    broken = {line for mutant in MUTANTS for _, line in broken_promises(mutant)}
+    assert [text for line, text in promises.items() if line not in broken] == []
 
 
 def test_an_exception_in_read_is_a_failed_driver_and_is_kept():

@@ -26,8 +26,8 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from hil.board import serve
-from hil.options import RigOptions
-serve(Path(sys.argv[1]), RigOptions(), ["x"], 1000.0, lambda: False)
+from hil.options import BoardOptions
+serve(Path(sys.argv[1]), BoardOptions(), ["x"], 1000.0, lambda: False)
 """
 
 

@@ -6,9 +6,13 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from typing import ClassVar
 
 import pytest
 
+from drivers.base import Channel, Facts, Wiring
+from drivers.python import PythonDriver
+from hil.options import Options
 from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import UnavailableError
 from rtloop.service import parking
@@ -78,3 +82,33 @@ def test_a_service_that_is_alive_is_left_alone(block):
         ended.set()
         beating.join()
     assert loop.returncode == 0
+
+
+@pytest.mark.parametrize(("parks_itself", "writes"), [(False, [1.5, 1.0, 0.5, 0.0]), (True, [])])
+def test_a_card_that_parks_itself_is_not_driven_back(parks_itself, writes):
+    """From 2 V at 50 V/s and 100 Hz; a card with a watchdog has left its last drive by the time it is parked."""
+
+    class Card(PythonDriver):
+        kind = "card"
+        written: ClassVar[list[float]] = []
+
+        @property
+        def facts(self):
+            return Facts((Channel("in"),), (Channel("out"),), hardware_watchdog=parks_itself)
+
+        def start(self):
+            self.written.clear()
+
+        def read(self):
+            return [0.0]
+
+        def write(self, volts):
+            self.written.extend(volts)
+
+        def stop(self):
+            pass
+
+    wiring = {"x": Wiring("in", "out")}
+    card = Card(Options(), wiring, 100.0)
+    parking.park(card, wiring, ["x"], [2.0], 50.0)
+    assert card.written == [*writes, 0.0]  # `close` writes the safe value

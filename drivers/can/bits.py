@@ -1,0 +1,49 @@
+"""How long a frame takes on the wire: bits with the worst stuffing, 11-bit identifiers, space between frames included.
+
+Classic (ISO 11898-1), n bytes: 34 + 8n bits from the start of the frame to the end of its CRC can be stuffed, of
+which the first five equal ones cost a bit and then every four that alternate; 13 more cannot.
+
+    8n + 44 + 3 + ⌊(34 + 8n − 1) / 4⌋
+
+CAN FD, n bytes: 17 bits to the one that switches the rate, and 5 + 8n behind it (ESI, length, data), can be stuffed.
+The CRC field has fixed stuff bits instead, before its first bit and after every four: 17 + 4 + 6 bits up to 16 bytes,
+21 + 4 + 7 above. CRC delimiter, acknowledgement, its delimiter, end of frame and space are 13 slow bits.
+"""
+
+from __future__ import annotations
+
+FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+_CLASSIC_STUFFED, _CLASSIC_UNSTUFFED = 34, 13
+_FD_SLOW, _FD_HEAD, _FD_TAIL = 17, 5, 13
+_SHORT_CRC_BYTES, _SHORT_CRC_FIELD, _LONG_CRC_FIELD = 16, 17 + 4 + 6, 21 + 4 + 7
+
+
+def most_stuff_bits(bits: int) -> int:
+    """Stuff bits that `bits` bits in a row can need at most."""
+    return (bits - 1) // 4
+
+
+def classic_frame_bits(length: int) -> int:
+    """Bits of a classic frame of `length` bytes, at most."""
+    stuffed = _CLASSIC_STUFFED + 8 * length
+    return stuffed + most_stuff_bits(stuffed) + _CLASSIC_UNSTUFFED
+
+
+def fd_frame_bits(length: int) -> tuple[int, int]:
+    """Bits of a CAN FD frame of `length` bytes at the slow and at the fast rate, at most.
+
+    As many stuff bits as there can be are taken to be slow.
+    """
+    stuffed = _FD_SLOW + _FD_HEAD + 8 * length
+    slow_stuff = most_stuff_bits(_FD_SLOW)
+    crc = _SHORT_CRC_FIELD if length <= _SHORT_CRC_BYTES else _LONG_CRC_FIELD
+    fast = _FD_HEAD + 8 * length + most_stuff_bits(stuffed) - slow_stuff + crc
+    return _FD_SLOW + slow_stuff + _FD_TAIL, fast
+
+
+def frame_s(length: int, fd: bool, bitrate: int, data_bitrate: int) -> float:
+    """How long a frame of `length` bytes takes at most."""
+    if not fd:
+        return classic_frame_bits(length) / bitrate
+    slow, fast = fd_frame_bits(length)
+    return slow / bitrate + fast / data_bitrate

@@ -1,0 +1,35 @@
+"""Opening a bus, and what is wrong with one, in one message."""
+
+from __future__ import annotations
+
+import logging
+
+from drivers.can.extra import can
+from drivers.can.options import BusOptions
+from drivers.errors import DriverError
+
+FAILURES = (can.CanError, OSError)
+"""What python-can's interfaces raise while they work."""
+
+
+def require_interface(options: BusOptions) -> None:
+    """Raises ValueError for an interface that python-can does not have."""
+    known = sorted(can.VALID_INTERFACES)
+    if options.interface not in known:
+        raise ValueError(f"interface: {options.interface!r}; python-can has {', '.join(known)}")
+
+
+def open_bus(options: BusOptions) -> can.BusABC:
+    """The bus of the options, and of nothing else that python-can might read. Raises DriverError."""
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # it says once more what its errors say
+    try:
+        return can.Bus(ignore_config=True, **options.keywords)
+    except (*FAILURES, ValueError, TypeError, NotImplementedError, ImportError) as error:
+        raise DriverError(f"{options.place}: {described(error)}") from error
+
+
+def described(error: BaseException) -> str:
+    """The message of an error, and of the one behind it where python-can hides the cause there."""
+    cause = error.__cause__ or error.__context__
+    texts = [str(one) or type(one).__name__ for one in (error, cause) if one is not None]
+    return ": ".join(dict.fromkeys(texts))

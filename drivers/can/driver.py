@@ -1,0 +1,190 @@
+"""The loop's side of a node on a CAN bus.
+
+Tick n ends with drive frame n, which makes the node convert its inputs, set its outputs and answer with sample n.
+Tick n + 1 begins with whatever has come: sample n, as old as the time since drive n was handed to the bus, at most.
+A sample thus does not show drive n yet: one period of delay more than where the ADC is read within the tick.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+
+from drivers.base import Channel, Facts, Wiring, index_of
+from drivers.can.bus import FAILURES, described, open_bus, require_interface
+from drivers.can.extra import can
+from drivers.can.frames import exchange, load_frames
+from drivers.can.options import CanOptions
+from drivers.can.stream import AnswerStream
+from drivers.errors import DriverError
+from drivers.python import PythonDriver
+
+OBSERVED = (
+    "can_lost_samples", "can_reordered_samples", "can_duplicated_samples", "can_invalid_frames", "can_held_ticks"
+)  # fmt: skip
+LISTEN_S, RETRY_S, CONFIRM_S = 0.1, 0.05, 0.02
+CONFIRMATIONS = 25
+FRAMES_A_TICK = 64
+HELD = 1
+
+
+class CanDriver(PythonDriver):
+    """The controller of a node."""
+
+    kind = "can"
+    options_model = CanOptions
+
+    def __init__(self, options: CanOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        super().__init__(options, wiring, rate_hz)
+        self._options = options
+        require_interface(options)
+        self._exchange = exchange(load_frames(options), len(wiring), options)
+        self._bus: can.BusABC | None = None
+        for axis, (source, sink) in wiring.items():
+            for name, channels in ((source, self.facts.inputs), (sink, self.facts.outputs)):
+                try:
+                    index_of(channels, name)
+                except ValueError as error:
+                    raise ValueError(f"channels.{axis}: {error}") from None
+
+    @property
+    def facts(self) -> Facts:
+        """As many channel pairs as there are axes, with the ranges of the DBC; the rate that fills the bus."""
+        drive, sample = self._exchange.drive.signals, self._exchange.sample.signals
+        count = self._exchange.channels
+        return Facts(
+            inputs=tuple(_channel(f"adc{i}", sample[f"Sample_{i}"]) for i in range(count)),
+            outputs=tuple(_channel(f"dac{i}", drive[f"Drive_{i}"]) for i in range(count)),
+            observed=OBSERVED,
+            max_rate_hz=self._exchange.max_rate_hz(self._options),
+            hardware_watchdog=True,
+        )
+
+    def start(self) -> None:
+        """Open the bus and wait for the node's first answer. Raises DriverError."""
+        self._stream = AnswerStream(self._exchange.highest_sequence)
+        self._sent_ns = [0] * (self._exchange.highest_sequence + 1)
+        self._sent = [b""] * (self._exchange.highest_sequence + 1)
+        self._volts = [0.0] * self._exchange.channels
+        self._age_us, self._held, self._held_in_all = 0.0, 0, 0
+        self._idle = [0.0] * (self._exchange.room - self._exchange.channels)
+        self._message = self._exchange.drive.message(self._options, [0.0] * (1 + self._exchange.room))
+        self._bus = open_bus(self._options)
+        try:
+            self._listen(LISTEN_S)  # another controller shows itself
+            self._stream = AnswerStream(self._exchange.highest_sequence)
+            self._await_node()
+        except FAILURES as error:
+            self._shut()
+            raise DriverError(f"{self._options.place}: {described(error)}") from error
+        except DriverError:
+            self._shut()
+            raise
+
+    def read(self) -> Sequence[float]:
+        """The newest sample. Status 1 where none has come since the last drive, infinitely old after `hold_ticks`."""
+        if self._stream.sent == 0:  # between `open` and the first tick much time may pass
+            while self._receive(0.0) is not None:
+                pass
+            self._open_node()
+            self._listen(RETRY_S)
+        for _ in range(FRAMES_A_TICK):
+            message = self._receive(0.0)
+            if message is None:
+                break
+            self._take(message)
+        stream = self._stream
+        self._held = 0 if stream.newest == stream.sent else self._held + 1
+        self._held_in_all += self._held > 0
+        self.status = HELD if self._held else 0
+        sent_ns = self._sent_ns[stream.sequence(stream.newest) if stream.newest else 0]
+        age_us = (time.monotonic_ns() - sent_ns) * 1e-3 + self._age_us
+        self.sample_age_us = math.inf if self._held > self._options.hold_ticks else age_us
+        return self._volts
+
+    def observe(self) -> Sequence[float]:
+        """What was wrong with the frames so far."""
+        stream = self._stream
+        return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._held_in_all
+
+    def write(self, volts: Sequence[float]) -> None:
+        """Drive frame with the next number."""
+        self._send(self._stream.next_sequence(), volts)
+
+    def stop(self) -> None:
+        """See that the node got the safe values, then leave the bus. Raises DriverError where it does not say so."""
+        if self._bus is None:
+            return
+        try:
+            for _ in range(CONFIRMATIONS):
+                deadline_s = time.monotonic() + CONFIRM_S
+                while (left_s := deadline_s - time.monotonic()) > 0:
+                    message = self._receive(left_s)
+                    if message is not None and self._take(message) and self._stream.newest == self._stream.sent:
+                        return
+                self.write([channel.safe_v for channel in self.facts.outputs])
+            raise DriverError(f"{self._options.place}: the node does not confirm its safe outputs; its watchdog must")
+        except FAILURES as error:
+            raise DriverError(f"{self._options.place}: {described(error)}") from error
+        finally:
+            self._shut()
+
+    def _shut(self) -> None:
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+
+    def _await_node(self) -> None:
+        deadline_s = time.monotonic() + self._options.wait_s
+        while time.monotonic() < deadline_s:
+            self._open_node()
+            if self._listen(RETRY_S):
+                return
+        raise DriverError(
+            f"{self._options.place}: no node has answered within {self._options.wait_s:g} s; "
+            "for a simulated one: `rtloop hil serve CONFIG --can`"
+        )
+
+    def _open_node(self) -> None:
+        self._send(0, [channel.safe_v for channel in self.facts.outputs])
+
+    def _listen(self, for_s: float) -> bool:
+        """Whether the answer to an opening frame came within `for_s`."""
+        deadline_s = time.monotonic() + for_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            message = self._receive(left_s)
+            if message is not None and self._take(message):
+                return True
+        return False
+
+    def _send(self, sequence: int, volts: Sequence[float]) -> None:
+        assert self._bus is not None
+        self._sent[sequence] = self._exchange.drive.pack((sequence, *volts, *self._idle))
+        self._message.data[:] = self._sent[sequence]
+        self._sent_ns[sequence] = time.monotonic_ns()
+        self._bus.send(self._message)
+
+    def _receive(self, timeout_s: float) -> can.Message | None:
+        assert self._bus is not None
+        return self._bus.recv(timeout_s)
+
+    def _take(self, message: can.Message) -> bool:
+        """Look at a frame; True for a sample newer than all before. Raises DriverError for a second controller."""
+        drive, sample = self._exchange.drive, self._exchange.sample
+        if message.arbitration_id == drive.identifier and drive.fits(message):
+            sequence = int(drive.unpack(message.data)[0])
+            if bytes(message.data) != self._sent[sequence]:  # some interfaces hand back what was sent
+                raise DriverError(f"{self._options.place}: another controller drives this node")
+        elif message.is_error_frame or (message.arbitration_id == sample.identifier and not sample.fits(message)):
+            self._stream.invalid += 1
+        elif message.arbitration_id == sample.identifier:
+            sequence, age_us, *volts = sample.unpack(message.data)
+            if self._stream.sent == 0 if sequence == 0 else self._stream.take(int(sequence)):
+                self._volts, self._age_us = volts[: self._exchange.channels], age_us
+                return True
+        return False
+
+
+def _channel(name: str, signal: object) -> Channel:
+    return Channel(name, float(signal.minimum), float(signal.maximum))  # type: ignore[attr-defined]

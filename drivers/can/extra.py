@@ -1,0 +1,14 @@
+"""python-can and cantools, or a message that says what to install."""
+
+from __future__ import annotations
+
+from drivers.errors import MissingExtra
+
+try:
+    import can
+    from cantools.database import load_file
+    from cantools.database.errors import UnsupportedDatabaseFormatError  # type: ignore[attr-defined]
+except ImportError as error:
+    raise MissingExtra(f"CAN needs the package {error.name}: pip install 'rtloop[can]'") from None
+
+__all__ = ["UnsupportedDatabaseFormatError", "can", "load_file"]

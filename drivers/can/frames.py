@@ -1,0 +1,123 @@
+"""Frames as the DBC describes them, packed and unpacked fast enough for every tick."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from drivers.can.bits import FD_LENGTHS, frame_s
+from drivers.can.extra import UnsupportedDatabaseFormatError, can, load_file
+from drivers.can.options import BusOptions
+
+DBC = Path(__file__).with_name("rtloop.dbc")
+HIGHEST_STANDARD_ID = 0x7FF
+_CODES = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (32, False): "I", (32, True): "i"}
+
+
+class Frame:
+    """One message of the DBC: whole bytes, little-endian, so that one `struct` packs it. Values are physical."""
+
+    def __init__(self, message: Any) -> None:
+        """Raises ValueError for a layout that is not like that."""
+        self.name, self.identifier, self.length = str(message.name), int(message.frame_id), int(message.length)
+        self.fd, self.cycle_s = bool(message.is_fd), (message.cycle_time or 0) / 1000
+        if message.is_extended_frame or self.length not in FD_LENGTHS[: None if self.fd else 9]:
+            raise ValueError(f"{self.name}: an 11-bit identifier and a length that CAN has are needed")
+        signals = sorted(message.signals, key=lambda signal: signal.start)
+        layout, position = "<", 0
+        for signal in signals:
+            code = _CODES.get((signal.length, signal.is_signed))
+            if code is None or signal.byte_order != "little_endian" or signal.start % 8 or signal.is_float:
+                raise ValueError(f"{self.name}.{signal.name}: 8, 16 or 32 bits on whole bytes, Intel order, are needed")
+            layout += f"{(signal.start - position) // 8}x{code}"
+            position = signal.start + signal.length
+        self._struct = struct.Struct(f"{layout}{self.length - position // 8}x")
+        self.signals = {signal.name: signal for signal in signals}
+        self._scales = [(float(s.scale), float(s.offset), *_raw_range(s)) for s in signals]
+
+    def pack(self, values: Sequence[float]) -> bytes:
+        """Values in the order of their bits; what the raw number cannot hold is clipped to what it can."""
+        raw = []
+        for value, (scale, offset, lowest, highest) in zip(values, self._scales, strict=True):
+            number = round((value - offset) / scale)
+            raw.append(lowest if number < lowest else highest if number > highest else number)
+        return self._struct.pack(*raw)
+
+    def unpack(self, data: bytes | bytearray) -> list[float]:
+        """Values in the order of their bits."""
+        raw = self._struct.unpack(data)
+        return [number * scale + offset for number, (scale, offset, _, _) in zip(raw, self._scales, strict=True)]
+
+    def message(self, options: BusOptions, values: Sequence[float]) -> can.Message:
+        """A message for python-can."""
+        return can.Message(
+            arbitration_id=self.identifier,
+            data=self.pack(values),
+            is_extended_id=False,
+            is_fd=self.fd,
+            bitrate_switch=self.fd and options.switches_bitrate,
+        )
+
+    def fits(self, message: can.Message) -> bool:
+        """Whether a message with this frame's identifier has its form too."""
+        plain = not (message.is_remote_frame or message.is_error_frame or message.is_extended_id)
+        return plain and message.is_fd == self.fd and len(message.data) == self.length
+
+
+class Exchange(NamedTuple):
+    """The frames that loop and node exchange in every tick."""
+
+    drive: Frame
+    sample: Frame
+    channels: int
+
+    @property
+    def highest_sequence(self) -> int:
+        """After it comes 1; 0 opens."""
+        return _raw_range(self.drive.signals["Sequence"])[1]
+
+    @property
+    def room(self) -> int:
+        """Channels that the frames have; those beyond `channels` carry 0."""
+        return len(self.drive.signals) - 1
+
+    def max_rate_hz(self, options: BusOptions) -> float:
+        """Ticks a second at which both frames fill the bus."""
+        rates = options.bitrate, options.data_phase_bitrate
+        return 1.0 / sum(frame_s(frame.length, frame.fd, *rates) for frame in (self.drive, self.sample))
+
+
+def load_frames(options: BusOptions) -> dict[str, Frame]:
+    """Every message of the DBC by its name. Raises ValueError for a file that is missing or unsuitable."""
+    path = Path(options.dbc or DBC)
+    try:
+        database = load_file(path)
+    except OSError as error:
+        raise ValueError(f"dbc: {path}: {error.strerror}") from None
+    except (UnsupportedDatabaseFormatError, UnicodeDecodeError) as error:
+        raise ValueError(f"dbc: {path}: not a CAN database: {error}") from None
+    try:
+        return {message.name: Frame(message) for message in database.messages}  # type: ignore[union-attr]
+    except ValueError as error:
+        raise ValueError(f"dbc: {path}: {error}") from None
+
+
+def exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
+    """The shortest pair Drive…, Sample… that has room for `channels`. Raises ValueError where there is none."""
+    pairs = [
+        Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
+        for name, frame in frames.items()
+        if name.startswith("Drive") and frame.fd == options.fd
+    ]
+    pairs = [pair for pair in pairs if pair.room >= channels]
+    if not pairs:
+        kind = "CAN FD" if options.fd else "classic CAN"
+        raise ValueError(f"channels: {channels} axes; the DBC has no frames of {kind} for so many")
+    return min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
+
+
+def _raw_range(signal: Any) -> tuple[int, int]:
+    half = signal.is_signed and 1
+    return -half * 2 ** (signal.length - 1), 2 ** (signal.length - half) - 1

@@ -1,0 +1,145 @@
+"""The simulated rig as a node on a CAN bus: a process that answers drive frames with samples.
+
+The rig moves by its own clock, a fixed fine grid, whether or not anybody drives. A drive frame that is not newer than
+the last is ignored. Where none comes for the watchdog's time, the outputs ramp to 0 V; when frames come again, they
+ramp to what those ask for, and follow it from then on.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from drivers.can.bus import FAILURES, described, open_bus, require_interface
+from drivers.can.driver import LISTEN_S
+from drivers.can.extra import can
+from drivers.can.frames import Frame, exchange, load_frames
+from drivers.can.options import CanOptions
+from drivers.errors import DriverError
+from hil.compiled import jit
+from hil.rig import advance, build_rig, sample
+
+RIG_RATE_HZ = 20_000.0
+IDLE_S, RAMP_S = 0.01, 0.001
+SAFE_V, STARTING = 0.0, 0.0
+
+
+class RigNode:
+    """One node, on a bus that is open. `step` again and again."""
+
+    def __init__(self, bus: can.BusABC, options: CanOptions, axes: Sequence[str]) -> None:
+        """Raises ValueError where rig, axes and DBC do not fit together."""
+        self._bus, self._options = bus, options
+        frames = load_frames(options)
+        self._exchange = exchange(frames, len(axes), options)
+        self._present: Frame = frames["Node"]
+        self._coefficients, self._state = build_rig(options, axes, 1.0 / RIG_RATE_HZ)
+        self.drive_v = np.full(len(axes), SAFE_V)
+        self._wanted_v = self.drive_v.copy()
+        self._sample_v = np.zeros(len(axes))
+        self._idle = [0.0] * (self._exchange.room - len(axes))
+        self.samples = self.ignored = self.parked = 0
+        self._following, self._newest = False, 0
+        self._serving, self._identity = False, secrets.randbits(32)
+        _run(self._coefficients, self._state, self.drive_v, self._sample_v, 0)  # compiles
+        self._start_s = self._moved_s = self._heard_s = time.monotonic()
+        self._index = 0
+
+    def announce(self) -> None:
+        """Say that this node is here."""
+        values = (self._exchange.channels, self._serving, self._options.watchdog_ms, self._identity)
+        self._bus.send(self._present.message(self._options, values))
+
+    def require_alone(self) -> None:
+        """Raises DriverError where another node answers, or is about to start."""
+        self.announce()
+        deadline_s = time.monotonic() + LISTEN_S
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            message = self._bus.recv(left_s)
+            if message is None:
+                break
+            if message.arbitration_id == self._exchange.sample.identifier or self._other(message) is not None:
+                raise DriverError(f"{self._options.place}: another node is there already")
+        self._serving = True
+
+    def _other(self, message: can.Message) -> float | None:
+        """What another node says of itself: STARTING, or 1; None where the message is none, or this node's own."""
+        if message.arbitration_id != self._present.identifier or not self._present.fits(message):
+            return None
+        _, serving, _, identity = self._present.unpack(message.data)
+        return None if identity == self._identity else serving
+
+    def step(self) -> None:
+        """Answer the next drive frame, or see how long there has been none. Raises python-can's errors."""
+        message = self._bus.recv(IDLE_S if self._following else RAMP_S)
+        now_s = time.monotonic()
+        self._move(now_s)
+        if message is not None and message.arbitration_id == self._exchange.drive.identifier:
+            if self._obey(message):
+                self._heard_s = now_s
+                return
+            self.ignored += 1
+        elif message is not None and self._other(message) == STARTING:
+            self.announce()
+        if self._following and now_s - self._heard_s > self._options.watchdog_ms * 1e-3:
+            self.parked += bool(np.any(self.drive_v != SAFE_V))
+            self._wanted_v[:], self._following, self._newest = SAFE_V, False, 0
+
+    def _obey(self, message: can.Message) -> bool:
+        """Set the outputs and answer; False for a frame that is malformed or not newer than the last."""
+        drive, highest = self._exchange.drive, self._exchange.highest_sequence
+        if not drive.fits(message):
+            return False
+        sequence, *volts = drive.unpack(message.data)
+        if sequence and self._newest and not 0 < (sequence - self._newest) % highest <= highest // 2:
+            return False
+        self._newest = int(sequence)
+        self._wanted_v[:] = volts[: self.drive_v.size]
+        if sequence == 0:
+            self._following = bool(np.all(self.drive_v == self._wanted_v))
+        if self._following:
+            self.drive_v[:] = self._wanted_v
+        values = (sequence, 0.0, *self._sample_v, *self._idle)
+        self._bus.send(self._exchange.sample.message(self._options, values))
+        self.samples += 1
+        return True
+
+    def _move(self, now_s: float) -> None:
+        """Let the time that has passed pass for the rig too, and for a ramp of its outputs."""
+        index = int((now_s - self._start_s) * RIG_RATE_HZ)
+        _run(self._coefficients, self._state, self.drive_v, self._sample_v, index - self._index)
+        self._index = index
+        if not self._following:
+            step_v = self._options.park_slew_v_per_s * (now_s - self._moved_s)
+            self.drive_v[:] = np.clip(self._wanted_v, self.drive_v - step_v, self.drive_v + step_v)
+            self._following = self._newest > 0 and bool(np.all(self.drive_v == self._wanted_v))
+        self._moved_s = now_s
+
+
+def serve(
+    options: CanOptions, axes: Sequence[str], stopped: Callable[[], bool], ready: Callable[[], None] = lambda: None
+) -> str:
+    """Be the node until `stopped`; what it did, in words. Raises ValueError, DriverError."""
+    require_interface(options)
+    with open_bus(options) as bus:
+        node = RigNode(bus, options, axes)
+        try:
+            node.require_alone()
+            ready()
+            while not stopped():
+                node.step()
+        except FAILURES as error:
+            raise DriverError(f"{options.place}: {described(error)}") from error
+    return f"{node.samples} samples, {node.ignored} drive frames ignored, parked {node.parked} times by the watchdog"
+
+
+@jit
+def _run(coefficients, state, drive_v, sample_v, periods):
+    """The rig after `periods` of its grid with the outputs held, and what its converters read then."""
+    for i in range(coefficients.shape[0]):
+        for _ in range(periods):
+            advance(coefficients[i], state[i], drive_v[i])
+        sample_v[i] = sample(coefficients[i], state[i])

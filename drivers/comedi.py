@@ -1,0 +1,226 @@
+"""Kind `comedi`: analogue channels of any board under Linux' comedi, by libcomedi's functions from the compiled loop.
+
+Channels are `ai<n>` and `ao<n>`. Codes and volts are converted by the board's own range table, linearly; a software
+calibration is not applied. libcomedi is reached through addresses in the context: it need not be installed to check a
+configuration, and no pointer becomes part of what is compiled and cached.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from pydantic import Field, model_validator
+
+from drivers.base import Channel, Driver, Facts, Pointers, Wiring
+from drivers.comedi_board import Board, Kind
+from drivers.errors import DriverError
+from hil.compiled import cfunc, intrinsic
+from hil.options import Options
+from hil.pointers import SIGNATURE, address_pointer, carray
+
+LINE = np.dtype(
+    [(name, np.uint32) for name in ("subdevice", "channel", "range", "aref")]
+    + [(name, np.float64) for name in ("lowest_v", "lsb_v", "highest_code")]
+)
+"""A channel as libcomedi addresses it, and its scale: volts = lowest_v + code · lsb_v."""
+CONTEXT = np.dtype(
+    [(name, np.int64) for name in ("device", "data_read", "data_write", "code", "inputs", "outputs")]
+    + [(name, np.int64) for name in ("input_count", "output_count", "failed_input", "failed_output")]
+)
+"""`failed_…`: place of the channel that failed last, −1 for none."""
+FAILED = -1
+_DOUBLES = ctypes.POINTER(ctypes.c_double)
+Volts = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class ComediOptions(Options):
+    """Which board, and how its channels are used."""
+
+    device: str = "/dev/comedi0"
+    library: str = "libcomedi.so.0"
+    input_subdevice: int | None = Field(default=None, ge=0)
+    """The first analogue one by default, as with `output_subdevice`."""
+    output_subdevice: int | None = Field(default=None, ge=0)
+    input_range_v: Volts = (-10.0, 10.0)
+    """One of the board's own ranges, which is looked for when the board is opened."""
+    output_range_v: Volts = (-10.0, 10.0)
+    aref: Literal["ground", "common", "diff", "other"] = "ground"
+    """What inputs are measured against."""
+    more_inputs: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Inputs beside those of the axes, such as an enable switch."""
+    safe_v: float = 0.0
+    """Where every output is parked."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name in ("input_range_v", "output_range_v"):
+            lowest, highest = getattr(self, name)
+            if lowest >= highest:
+                raise ValueError(f"{name}: [{lowest:g}, {highest:g}]; allowed is the lower end before the higher")
+        lowest, highest = self.output_range_v
+        if not lowest <= self.safe_v <= highest:
+            raise ValueError(f"safe_v: {self.safe_v:g} is outside output_range_v, {lowest:g} … {highest:g} V")
+        return self
+
+
+@intrinsic
+def _call(typingctx: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
+    """`int function(comedi_t *, subdevice, channel, range, aref, last)`, addresses as integers.
+
+    `last` is a code, or the address where one goes.
+    """
+    last_type = ir.IntType(32) if last == types.uint32 else ir.IntType(64)
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        word, int32 = ir.IntType(64), ir.IntType(32)
+        function_type = ir.FunctionType(int32, [word, *[int32] * 4, last_type]).as_pointer()
+        numbers = [builder.extract_value(arguments[2], i) for i in range(4)]
+        pointer = builder.inttoptr(arguments[0], function_type)
+        return builder.call(pointer, [arguments[1], *numbers, arguments[3]])
+
+    return types.int32(types.intp, types.intp, types.UniTuple(types.uint32, 4), last), codegen
+
+
+@cfunc(SIGNATURE)
+def comedi_read(context, values):
+    """Volts of every input, converted now: their age is 0."""
+    card = carray(context, 1, CONTEXT)[0]
+    lines = carray(address_pointer(card.inputs), card.input_count, LINE)
+    code = carray(address_pointer(card.code), 1, np.uint32)
+    out = carray(values, card.input_count + 1)
+    out[card.input_count] = 0.0
+    for i in range(card.input_count):
+        line = lines[i]
+        where = line.subdevice, line.channel, line.range, line.aref
+        if _call(card.data_read, card.device, where, card.code) < 0:
+            card.failed_input = i
+            return FAILED
+        out[i] = line.lowest_v + code[0] * line.lsb_v
+    return 0
+
+
+@cfunc(SIGNATURE)
+def comedi_write(context, values):
+    """Codes nearest to the volts; what is no number is refused before any output moves."""
+    card = carray(context, 1, CONTEXT)[0]
+    lines = carray(address_pointer(card.outputs), card.output_count, LINE)
+    volts = carray(values, card.output_count)
+    for i in range(card.output_count):
+        if np.isnan(volts[i]):
+            return FAILED
+    for i in range(card.output_count):
+        line = lines[i]
+        code = np.rint((volts[i] - line.lowest_v) / line.lsb_v)
+        code = 0.0 if code < 0.0 else (line.highest_code if code > line.highest_code else code)
+        where = line.subdevice, line.channel, line.range, line.aref
+        if _call(card.data_write, card.device, where, np.uint32(code)) < 0:
+            card.failed_output = i
+            return FAILED
+    return 0
+
+
+class ComediDriver(Driver):
+    """The wired channels of a board; its other outputs are left alone."""
+
+    kind = "comedi"
+    options_model = ComediOptions
+    example: ClassVar[Wiring] = Wiring("ai0", "ao0")
+
+    def __init__(self, options: ComediOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
+        super().__init__(options, wiring, rate_hz)
+        self._options = options
+        self._board: Board | None = None
+        self._context = np.zeros(1, CONTEXT)
+        self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
+        for axis, wire in wiring.items():
+            _require_name(f"channels.{axis}.input", wire.input, Kind.INPUT)
+            _require_name(f"channels.{axis}.output", wire.output, Kind.OUTPUT)
+            first = next(name for name, other in wiring.items() if other.output == wire.output)
+            if first != axis:
+                raise ValueError(f"channels.{axis}.output: {wire.output!r} is taken by axis {first}")
+        for name in options.more_inputs:
+            _require_name("more_inputs", name, Kind.INPUT)
+        self._inputs = tuple(dict.fromkeys([*(wire.input for wire in wiring.values()), *options.more_inputs]))
+        self._outputs = tuple(wire.output for wire in wiring.values())
+
+    @property
+    def facts(self) -> Facts:
+        """The channels that are wired, with the configured ranges."""
+        options = self._options
+        return Facts(
+            inputs=tuple(Channel(name, *options.input_range_v) for name in self._inputs),
+            outputs=tuple(Channel(name, *options.output_range_v, options.safe_v) for name in self._outputs),
+        )
+
+    @property
+    def error(self) -> Exception | None:
+        """What the board said, where a read or a write of the loop failed."""
+        card = self._context[0]
+        if self._board is None or max(card["failed_input"], card["failed_output"]) < 0:
+            return None
+        names = self._inputs, card["failed_input"], self._outputs, card["failed_output"]
+        where = ", ".join(group[i] for group, i in (names[:2], names[2:]) if i >= 0)
+        return DriverError(f"{self._options.device}: {where}: {self._board.last_error()}")
+
+    def open(self) -> Pointers:
+        """Take the board's subdevices, outputs to `safe_v`. Raises DriverError."""
+        options = self._options
+        self._board = Board(options.library, options.device)
+        try:
+            inputs = self._lines(Kind.INPUT, options.input_subdevice, self._inputs)
+            outputs = self._lines(Kind.OUTPUT, options.output_subdevice, self._outputs)
+            self._fill(inputs, outputs, np.zeros(1, np.uint32))
+            self._park()
+        except DriverError:
+            self._release()
+            raise
+        return Pointers(self._context.ctypes.data, comedi_read.address, comedi_write.address)
+
+    def close(self) -> None:
+        """All outputs to `safe_v`, and the board free for another. Raises DriverError where they cannot be."""
+        if self._board is not None:
+            try:
+                self._park()
+            finally:
+                self._release()
+
+    def _lines(self, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
+        """The address and scale of each channel, on a subdevice that is reserved."""
+        assert self._board is not None
+        taken, options = self._board.take(kind, subdevice), self._options
+        range_v, aref = (
+            (options.input_range_v, options.aref) if kind is Kind.INPUT else (options.output_range_v, "ground")
+        )
+        return np.array([self._board.line(kind, taken, int(name[2:]), range_v, aref) for name in names], LINE)
+
+    def _fill(self, inputs: np.ndarray, outputs: np.ndarray, code: np.ndarray) -> None:
+        """The context of the compiled functions."""
+        assert self._board is not None
+        self._arrays = inputs, outputs, code
+        context = self._context
+        context["device"], context["data_read"], context["data_write"] = self._board.addresses
+        context["inputs"], context["outputs"], context["code"] = (array.ctypes.data for array in self._arrays)
+        context["input_count"], context["output_count"] = inputs.size, outputs.size
+        context["failed_input"] = context["failed_output"] = -1
+
+    def _park(self) -> None:
+        safe = np.full(len(self._outputs), self._options.safe_v)
+        if comedi_write.ctypes(self._context.ctypes.data, safe.ctypes.data_as(_DOUBLES)) < 0:
+            raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
+
+    def _release(self) -> None:
+        if self._board is not None:
+            self._board.close()
+            self._board = None
+
+
+def _require_name(where: str, name: str, kind: Kind) -> None:
+    """Raise ValueError for a name that no channel has."""
+    if not re.fullmatch(f"{kind.prefix}(0|[1-9][0-9]{{0,3}})", name):
+        raise ValueError(f"{where}: {name!r}; allowed are {kind.prefix}0, {kind.prefix}1, …")

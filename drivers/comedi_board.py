@@ -1,0 +1,133 @@
+"""A board under comedi, as libcomedi shows it: opened, its subdevices reserved, its tables read.
+
+libcomedi (see comedi_open(3) and the pages beside it) returns −1 or a null pointer for a failure, and keeps the reason
+for comedi_errno.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+from ctypes import c_char_p, c_double, c_int, c_uint, c_void_p
+from enum import IntEnum
+from typing import Any
+
+from drivers.errors import DriverError, MissingExtra
+
+
+class Kind(IntEnum):
+    """Types of subdevices, as comedi numbers them."""
+
+    INPUT = 1
+    OUTPUT = 2
+
+    @property
+    def prefix(self) -> str:
+        """What the names of its channels begin with."""
+        return "ai" if self is Kind.INPUT else "ao"
+
+
+class _Range(ctypes.Structure):
+    _fields_ = (("lowest", c_double), ("highest", c_double), ("unit", c_uint))
+
+
+AREFS = {"ground": 0, "common": 1, "diff": 2, "other": 3}
+UNIT_VOLT = 0
+_FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
+    "comedi_open": (c_void_p, [c_char_p]),
+    "comedi_close": (c_int, [c_void_p]),
+    "comedi_errno": (c_int, []),
+    "comedi_strerror": (c_char_p, [c_int]),
+    "comedi_get_n_subdevices": (c_int, [c_void_p]),
+    "comedi_get_subdevice_type": (c_int, [c_void_p, c_uint]),
+    "comedi_find_subdevice_by_type": (c_int, [c_void_p, c_int, c_uint]),
+    "comedi_lock": (c_int, [c_void_p, c_uint]),
+    "comedi_get_n_channels": (c_int, [c_void_p, c_uint]),
+    "comedi_get_n_ranges": (c_int, [c_void_p, c_uint, c_uint]),
+    "comedi_get_range": (ctypes.POINTER(_Range), [c_void_p, c_uint, c_uint, c_uint]),
+    "comedi_get_maxdata": (c_uint, [c_void_p, c_uint, c_uint]),
+    "comedi_data_read": (c_int, [c_void_p, c_uint, c_uint, c_uint, c_uint, c_void_p]),
+    "comedi_data_write": (c_int, [c_void_p, c_uint, c_uint, c_uint, c_uint, c_uint]),
+}
+_HINTS = {
+    errno.ENOENT: "; is the board's kernel module loaded?",
+    errno.EACCES: "; is this user in the device's group?",
+    errno.ENODEV: "; no board is attached to it",
+    errno.ENOTTY: "; this is no comedi device",
+}
+
+
+class Board:
+    """An open board. Every method raises DriverError."""
+
+    def __init__(self, library: str, device: str) -> None:
+        """Raises MissingExtra without the library, DriverError without the device."""
+        self._device = device
+        try:
+            self._library = ctypes.CDLL(library)
+            for name, (result, arguments) in _FUNCTIONS.items():
+                function = getattr(self._library, name)
+                function.restype, function.argtypes = result, arguments
+        except (OSError, AttributeError) as error:
+            raise MissingExtra(f"driver 'comedi': {error}; install libcomedi0 (Debian's name of libcomedi)") from None
+        self._handle: int | None = self._library.comedi_open(device.encode())
+        if self._handle is None:
+            raise DriverError(f"{device}: {self.last_error()}{_HINTS.get(self._library.comedi_errno(), '')}")
+
+    @property
+    def addresses(self) -> tuple[int, int, int]:
+        """The device, comedi_data_read and comedi_data_write, as compiled code calls them."""
+        functions = self._library.comedi_data_read, self._library.comedi_data_write
+        read, write = (ctypes.cast(function, c_void_p).value or 0 for function in functions)
+        return self._handle or 0, read, write
+
+    def last_error(self) -> str:
+        """Why the last call that failed did."""
+        return self._library.comedi_strerror(self._library.comedi_errno()).decode()
+
+    def take(self, kind: Kind, wanted: int | None) -> int:
+        """Reserve a subdevice for this process: number `wanted`, or the first of its kind."""
+        subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if wanted is None else wanted
+        if wanted is None and subdevice < 0:
+            raise DriverError(f"{self._device}: the board has no analogue {kind.name.lower()}s")
+        if wanted is not None and self._library.comedi_get_subdevice_type(self._handle, wanted) != kind:
+            there = range(self._library.comedi_get_n_subdevices(self._handle))
+            fitting = [n for n in there if self._library.comedi_get_subdevice_type(self._handle, n) == kind]
+            raise DriverError(
+                f"{self._device}: {kind.name.lower()}_subdevice: {wanted} has no analogue {kind.name.lower()}s; "
+                f"there are {', '.join(map(str, fitting)) or 'none'}"
+            )
+        if self._library.comedi_lock(self._handle, subdevice) < 0:
+            busy = self._library.comedi_errno() == errno.EBUSY
+            reason = "another program uses it" if busy else self.last_error()
+            raise DriverError(f"{self._device}: subdevice {subdevice}: {reason}")
+        return subdevice
+
+    def line(self, kind: Kind, subdevice: int, channel: int, range_v: tuple[float, float], aref: str) -> tuple:
+        """A channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code."""
+        name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
+        if channel >= count:
+            has = f"{kind.prefix}0 … {kind.prefix}{count - 1}" if count > 0 else "none"
+            raise DriverError(f"{self._device}: {name} is not a channel of this board; it has {has}")
+        ranges = self._ranges_v(subdevice, channel)
+        if range_v not in ranges.values():
+            has = ", ".join(f"[{lowest:g}, {highest:g}]" for lowest, highest in ranges.values()) or "none in volts"
+            raise DriverError(f"{self._device}: {name} has no range {list(range_v)} V; it has {has}")
+        index = next(i for i, ends in ranges.items() if ends == range_v)
+        highest_code = self._library.comedi_get_maxdata(self._handle, subdevice, channel)
+        lsb_v = (range_v[1] - range_v[0]) / highest_code
+        return subdevice, channel, index, AREFS[aref], range_v[0], lsb_v, highest_code
+
+    def close(self) -> None:
+        """Let the board and its subdevices go."""
+        self._library.comedi_close(self._handle)
+        self._handle = None
+
+    def _ranges_v(self, subdevice: int, channel: int) -> dict[int, tuple[float, float]]:
+        """The channel's ranges in volts by their number, as a person would write them: the table has six decimals."""
+        found = {}
+        for index in range(max(0, self._library.comedi_get_n_ranges(self._handle, subdevice, channel))):
+            pointer = self._library.comedi_get_range(self._handle, subdevice, channel, index)
+            if pointer and pointer.contents.unit == UNIT_VOLT:
+                found[index] = (round(pointer.contents.lowest, 6), round(pointer.contents.highest, 6))
+        return found

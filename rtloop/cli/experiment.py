@@ -1,0 +1,91 @@
+"""Commands that run the paper's experiments, and report what came of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+
+SET = click.option(
+    "--set",
+    "settings",
+    metavar="EXPERIMENT.KEY=VALUE",
+    multiple=True,
+    help="A parameter; see `rtloop experiment list`.",
+)
+AXIS = click.option("--axis", help="Name of the axis [the only one]; every other one rests.")
+PACED = click.option("--paced", is_flag=True, help="In real time even where virtual time would do; hardware always is.")
+OUT = click.option("--out", type=OUTPUT, help="Folder for recordings and report [a new one with the recordings].")
+
+
+@click.group()
+def experiment() -> None:
+    """The paper's experiments on any driver, and one report of them."""
+
+
+@experiment.command(name="list")
+@fails_clearly
+def list_experiments() -> int:
+    """Show every experiment and its parameters."""
+    from rtloop.report_experiments import print_list
+
+    print_list()
+    return 0
+
+
+@experiment.command()
+@click.argument("names", metavar="NAME...", nargs=-1, required=True)
+@CONFIG
+@SET
+@AXIS
+@PACED
+@OUT
+@JSON
+@fails_clearly
+def run(
+    names: tuple[str, ...], config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Run experiments on the rig or the hardware of CONFIG, record each, and report.
+
+    Only mode, reference and schedule are changed, and the simulated rig where an experiment is about that; limits and
+    interlocks stay. Ctrl-C ramps down and reports what there is. Exit 1 where an experiment could not be finished.
+    """
+    from rtloop.experimenting import run_experiments
+
+    return run_experiments(names, config, settings, axis, paced, out, as_json)
+
+
+@experiment.command()
+@CONFIG
+@SET
+@AXIS
+@PACED
+@OUT
+@JSON
+@fails_clearly
+def paper(
+    config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None, as_json: bool
+) -> int:
+    """Run all experiments on the rig or the hardware of CONFIG: every figure of the paper with its verdicts."""
+    from rtloop.experimenting import run_experiments
+    from rtloop.experiments.registry import EXPERIMENTS
+
+    return run_experiments(tuple(EXPERIMENTS), config, settings, axis, paced, out, as_json)
+
+
+@experiment.command()
+@click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
+@click.option("--out", type=OUTPUT, help="Folder for the report [that of the first recording].")
+@JSON
+@fails_clearly
+def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
+    """Analyse recordings of experiments again; RUN is a recording or a folder of them."""
+    from rtloop.experimenting import report_recordings
+
+    return report_recordings(runs, out, as_json)
+
+
+COMMANDS = (experiment,)

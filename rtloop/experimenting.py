@@ -1,0 +1,233 @@
+"""`rtloop experiment`: run procedures with the loop as it is, and report from the recordings alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import click
+
+from drivers.errors import DriverError
+from hil.options import RigOptions
+from rtloop.config import Configuration, load
+from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
+from rtloop.experiments.derive import derived
+from rtloop.experiments.page import page
+from rtloop.experiments.procedure import Experiment, Run, Setting
+from rtloop.experiments.registry import chosen, parameters
+from rtloop.experiments.report import Report, report, take
+from rtloop.law.options import AxisOptions
+from rtloop.prepare import Prepared, prepare
+from rtloop.progress import StatusLine
+from rtloop.recording.errors import RecordingError
+from rtloop.report_experiments import Progress, print_report
+from rtloop.running import recording_path, recover_leftovers
+from rtloop.service.supervisor import Processes, RunResult, Supervisor
+
+
+class Planned(NamedTuple):
+    """One run with the configuration that it is made with."""
+
+    experiment: Experiment
+    run: Run
+    configuration: Configuration
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"{self.experiment.name} {self.run.label}".rstrip()
+
+
+class Interruption:
+    """SIGINT and SIGTERM stop the present run and all that would follow; a second one ends what is no run."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._supervisor: Supervisor | None = None
+
+    def __enter__(self) -> Self:
+        self._previous = {name: signal.signal(name, self._handle) for name in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name, handler in self._previous.items():
+            signal.signal(name, handler)
+
+    def attend(self, supervisor: Supervisor | None) -> None:
+        """What is to be stopped from now on."""
+        self._supervisor = supervisor
+        if supervisor is not None and self.requested:
+            supervisor.stop()
+
+    def _handle(self, *_: object) -> None:
+        if self.requested and self._supervisor is None:
+            raise KeyboardInterrupt
+        self.requested = True
+        if self._supervisor is not None:
+            self._supervisor.stop()
+
+
+def run_experiments(
+    names: Sequence[str], config: Path, settings: Sequence[str], axis: str | None, paced: bool, out: Path | None,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Run, record, report; returns the exit code. Raises ConfigError and what `rtloop run` raises."""
+    experiments = chosen(names)
+    options = parameters(experiments, settings)
+    base = load(config)
+    prepared = prepare(base)
+    for warning in prepared.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    about = _axis(base, axis)
+    skipped = _unsuitable(experiments, prepared, about)
+    setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real)
+    planned = [
+        one
+        for experiment in experiments
+        if experiment.name not in skipped
+        for one in _planned(experiment, options[experiment.name], base, setting)
+    ]
+    if not planned:
+        raise LoopFault("\n  ".join(["no experiment can be done", *(f"{n}: {why}" for n, why in skipped.items())]))
+    folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
+    with Interruption() as interruption:
+        paths, problems = _record_all(planned, folder, paced or prepared.facts.real, interruption)
+        for problem in problems:
+            click.echo(f"rtloop: {problem}", err=True)
+        if interruption.requested:
+            click.echo("rtloop: interrupted; outputs are parked, and what was recorded is reported", err=True)
+        if not paths:
+            raise LoopFault("nothing was recorded")
+        made, files = _write(take_and_report(paths), folder, skipped)
+    whole = made.whole and not interruption.requested and not problems
+    _show(made, files, skipped, as_json, {"interrupted": interruption.requested, "skipped": skipped})
+    return 0 if whole else LoopFault.exit_code
+
+
+def report_recordings(runs: Sequence[Path], out: Path | None, as_json: bool) -> int:
+    """The report of recordings that were made before. Raises RecordingError, OutputError."""
+    paths = _recordings(runs)
+    made, files = _write(take_and_report(paths), out or paths[0].parent, {})
+    _show(made, files, {}, as_json, {})
+    return 0 if made.whole else LoopFault.exit_code
+
+
+def take_and_report(paths: Sequence[Path]) -> tuple[Report, dict[str, Path]]:
+    """The report, and each recording's path by its name."""
+    with StatusLine("reading", sys.stderr) as status:
+        takings = take(paths)
+        made = report(takings, status.update)
+    return made, {path.name: path for taken in takings for path in taken.paths}
+
+
+def _axis(base: Configuration, name: str | None) -> AxisOptions:
+    names = [axis.name for axis in base.axes]
+    if name is None and len(names) > 1:
+        raise ConfigError(base.name, [f"it has the axes {', '.join(names)}: --axis says which one is meant"])
+    if name is not None and name not in names:
+        raise ConfigError(base.name, [f"--axis {name}: there is no such axis; there are {', '.join(names)}"])
+    return next(axis for axis in base.axes if name in (None, axis.name))
+
+
+def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: AxisOptions) -> dict[str, str]:
+    """Reasons by experiment. A rig that is no real hardware is built anew for each run, and can be another one."""
+    rig = isinstance(prepared.configuration.driver_options, RigOptions) and not prepared.facts.real
+    reasons = {one.name: one.unsuitable(prepared.configuration, axis, rig) for one in experiments}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
+
+
+def _planned(experiment: Experiment, options: Any, base: Configuration, setting: Setting) -> list[Planned]:
+    runs = experiment.runs(options, setting)
+    values = options.model_dump(mode="json")
+    return [
+        Planned(experiment, run, derived(base, setting.axis.name, experiment.name, values, run, len(runs)))
+        for run in runs
+    ]
+
+
+def _record_all(
+    planned: Sequence[Planned], folder: Path, paced: bool, interruption: Interruption
+) -> tuple[list[Path], list[str]]:
+    """Run after run until something goes wrong; recordings, and what it was. Raises what prevents the first run."""
+    paths: list[Path] = []
+    problems: list[str] = []
+    with Progress(sum(one.run.timeline.ticks for one in planned), sys.stderr) as progress:
+        for one in planned:
+            if interruption.requested:
+                break
+            try:
+                result = _record(one, folder, paced, interruption, progress)
+            except (RtloopError, DriverError) as error:
+                if not paths:
+                    raise
+                problems.append(f"{one.label}: {error}")
+                break
+            paths += result.recordings
+            if result.error:
+                problems.append(f"{one.label}: {result.error}")
+                break
+    return paths, problems
+
+
+def _record(one: Planned, folder: Path, paced: bool, interruption: Interruption, progress: Progress) -> RunResult:
+    """One run of the normal loop."""
+    timeline = one.run.timeline
+    with Processes() as processes:
+        prepared = prepare(one.configuration, duration_s=timeline.ticks / one.configuration.loop.rate_hz, paced=paced)
+        path = recording_path(prepared, folder)
+        recover_leftovers(path.parent)
+        supervisor = Supervisor(processes, prepared, path)
+        interruption.attend(supervisor)
+        try:
+            result = supervisor.run(lambda supervisor: progress.show(one.label, supervisor.ticks, timeline.ticks))
+        finally:
+            interruption.attend(None)
+    progress.finished(timeline.ticks)
+    return result
+
+
+def _recordings(runs: Sequence[Path]) -> list[Path]:
+    """The files that are meant, and those of experiments in the folders that are. Raises RecordingError."""
+    found: list[Path] = []
+    for run in runs:
+        found += sorted(run.glob("*.mcap")) if run.is_dir() else [run]
+    if not found:
+        raise RecordingError(f"{', '.join(map(str, runs))}: holds no recording (*.mcap)")
+    return found
+
+
+def _write(
+    taken: tuple[Report, Mapping[str, Path]], folder: Path, skipped: Mapping[str, str]
+) -> tuple[Report, list[Path]]:
+    """report.html, report.json and a PNG of each picture in each theme."""
+    made, recordings = taken
+    links = {name: os.path.relpath(path.resolve(), folder.resolve()) for name, path in recordings.items()}
+    contents = {
+        "report.html": page(made.content, made.pictures, links, skipped).encode(),
+        "report.json": (json.dumps(made.content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode(),
+        **{f"{name}-{theme}.png": png for name, files in made.pictures.items() for theme, png in files.items()},
+    }
+    for name, content in contents.items():
+        path = folder / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise OutputError(f"{path}: {error.strerror}") from None
+    return made, [folder / name for name in contents]
+
+
+def _show(made: Report, files: Sequence[Path], skipped: Mapping[str, str], as_json: bool, more: dict[str, Any]) -> None:
+    with suppress(BrokenPipeError):
+        if as_json:
+            click.echo(json.dumps({**made.content, **more, "files": [str(file) for file in files]}, allow_nan=False))
+            return
+        print_report(made.content, skipped)
+        click.echo(files[0])

@@ -1,0 +1,69 @@
+"""A run's own configuration: the base with another schedule, and in its first line what it is for.
+
+The line is a comment to the configuration's reader and JSON to `about`, so that a recording, which holds the text
+under a checksum, tells on its own what to analyse.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import tomllib
+from typing import Any
+
+from rtloop.config import Configuration, parse
+from rtloop.design.toml_text import section
+from rtloop.experiments.procedure import Run, hold
+
+MARK = "rtloop experiment "
+
+
+def derived(
+    base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, runs: int
+) -> Configuration:
+    """`base`, doing what `run`, one of `runs`, asks of `axis`, every other axis at rest. Raises ConfigError."""
+    raw = tomllib.loads(base.text)
+    first, timeline = run.timeline.segments[0], run.timeline
+    raw["loop"]["mode"] = first.mode
+    raw["schedule"] = timeline.schedule(axis)
+    for one in raw["axis"]:
+        one["reference"] = dict(timeline.references[0] if one["name"] == axis else hold(0.0))
+    if run.plant:
+        _change_plant(raw["driver"], axis, run.plant)
+    about = {
+        "name": experiment,
+        "run": run.label,
+        "runs": runs,
+        "axis": axis,
+        "may_trip": run.may_trip,
+        "ticks": timeline.ticks,
+        "parameters": parameters,
+        "segments": timeline.segments,
+    }
+    name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))
+    text = section("", raw, [MARK + json.dumps(about, allow_nan=False), f"derived from {base.name}"])
+    return parse(text, name, base.folder, f"{base.name}, experiment {experiment}")
+
+
+def about(configuration: str) -> dict[str, Any] | None:
+    """What `derived` wrote about the run; None for any other configuration."""
+    first = configuration.partition("\n")[0].removeprefix("# ")
+    if not first.startswith(MARK):
+        return None
+    try:
+        found = json.loads(first.removeprefix(MARK))
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
+    """Merge section by section into the axis's plant, a copy of `plant` where it has none of its own."""
+    plants = driver.setdefault("plants", {})
+    plant = plants.setdefault(axis, copy.deepcopy(driver.get("plant", {})))
+    for name, values in changes.items():
+        plant[name] = {**plant.get(name, {}), **values}
+
+
+def _file_name(label: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "+-." else "-" for letter in label).rstrip("-")

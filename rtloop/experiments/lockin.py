@@ -1,0 +1,74 @@
+"""Lock-in: amplitude and phase of a signal at one frequency, and a response from two signals.
+
+    s_k ≈ Re(S e^{2πi f kT}) + c        least squares over the samples
+    G(f) = X/U,     γ² = (part of x at f)·(part of u at f),     parts of the power about the mean
+
+The constant is fitted along, so that a window need not hold a whole number of cycles; where it does, harmonics have no
+influence. No drift is fitted: over a single cycle it would take the harmonics of a hysteresis for a slope. γ² is near
+1 where a linear system is driven by one sine, and falls with noise, harmonics, and where nothing was excited.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hil.linear import Real
+
+LEAST_CYCLES = 0.9
+"""Of a fraction of a cycle, sine and constant cannot be told apart."""
+BLOCK = 1 << 18
+
+
+class Tone(NamedTuple):
+    """Complex amplitude at the frequency, and its part of the power, 0 … 1."""
+
+    amplitude: complex
+    part: float
+
+
+class Response(NamedTuple):
+    """Complex gain at one frequency, and coherence γ²."""
+
+    gain: complex
+    coherence: float
+
+
+def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
+    """Of `signal` (samples,) at `hz`; the phase is that at its first sample. Raises ValueError for too short a one."""
+    if not 0 < hz < rate_hz / 2:
+        raise ValueError(f"frequency: {hz:g} Hz; between 0 and half the rate of {rate_hz:g} Hz is allowed")
+    if signal.size * hz < LEAST_CYCLES * rate_hz or signal.size < 3:
+        raise ValueError(f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of "
+                         f"{hz:g} Hz; at least {LEAST_CYCLES} are needed")  # fmt: skip
+    gram, right = np.zeros((3, 3)), np.zeros(3)
+    for start in range(0, signal.size, BLOCK):
+        part = signal[start : start + BLOCK]
+        columns = _columns(start, part.size, hz / rate_hz)
+        gram += columns.T @ columns
+        right += columns.T @ part
+    weights = np.linalg.solve(gram, right)
+    left = power = 0.0
+    for start in range(0, signal.size, BLOCK):
+        part = signal[start : start + BLOCK]
+        columns = _columns(start, part.size, hz / rate_hz)
+        about_mean = part - weights[2]
+        power += float(about_mean @ about_mean)
+        rest = part - columns @ weights
+        left += float(rest @ rest)
+    return Tone(complex(weights[0], -weights[1]), max(0.0, 1 - left / power) if power else 0.0)
+
+
+def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
+    """From input `u` to output `x`, each (samples,), at `hz`."""
+    source, answer = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
+    gain = answer.amplitude / source.amplitude if source.amplitude else complex(np.nan, np.nan)
+    return Response(gain, source.part * answer.part)
+
+
+def _columns(start: int, count: int, turns_per_sample: float) -> Real:
+    """cos, sin and 1 for the samples from `start` on, (count, 3)."""
+    k = np.arange(start, start + count, dtype=float)
+    angle = 2 * np.pi * np.remainder(k * turns_per_sample, 1.0)
+    return np.stack([np.cos(angle), np.sin(angle), np.ones(count)], axis=1)

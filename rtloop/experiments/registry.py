@@ -1,0 +1,63 @@
+"""The experiments by name, in the paper's order, and the parameters that a user sets for them."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+
+from pydantic import ValidationError
+
+from hil.options import Options
+from rtloop.config import describe
+from rtloop.errors import ConfigError
+from rtloop.experiments import (
+    characterise,
+    compensation,
+    disturbance,
+    harmonic,
+    robustness,
+    sines,
+    step_response,
+    steps,
+)
+from rtloop.experiments.procedure import Experiment
+
+MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness)
+EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}
+
+
+def chosen(names: Sequence[str]) -> list[Experiment]:
+    """The named ones, in the paper's order. Raises ConfigError for an unknown name."""
+    unknown = [name for name in names if name not in EXPERIMENTS]
+    if unknown:
+        known = ", ".join(EXPERIMENTS)
+        raise ConfigError(
+            "experiment", [f"{name!r}: there is no such experiment; there are {known}" for name in unknown]
+        )
+    return [experiment for name, experiment in EXPERIMENTS.items() if name in names]
+
+
+def parameters(experiments: Sequence[Experiment], settings: Sequence[str]) -> dict[str, Options]:
+    """Options of each experiment, with `EXPERIMENT.KEY=VALUE` applied, VALUE as in TOML. Raises ConfigError."""
+    given: dict[str, dict[str, object]] = {experiment.name: {} for experiment in experiments}
+    faults = []
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        name, dot, option = key.strip().rpartition(".")
+        if not equals or not dot or name not in given:
+            faults.append(f"--set {setting}: EXPERIMENT.KEY=VALUE is needed, with one of {', '.join(given)}")
+            continue
+        try:
+            given[name][option] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            faults.append(f"--set {setting}: {value!r} is no value; a number, or numbers as in [1.0, 2.0], is needed")
+    found = {}
+    for experiment in experiments:
+        raw = given[experiment.name]
+        try:
+            found[experiment.name] = experiment.options.model_validate(raw)
+        except ValidationError as error:
+            faults += describe(error, experiment.name, raw, set(experiment.options.model_fields))
+    if faults:
+        raise ConfigError("parameters of the experiments", faults)
+    return found

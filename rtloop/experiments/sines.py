@@ -1,0 +1,108 @@
+"""Fig 11: sines of several frequencies in closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from hil.options import Numbers, Options
+from rtloop.experiments import paper
+from rtloop.experiments.lockin import response
+from rtloop.experiments.procedure import Experiment, Run, Setting, hold, sine
+from rtloop.experiments.taken import Taken
+from rtloop.experiments.theme import Ink
+from rtloop.experiments.verdict import Analysis, Row, Table
+
+REST_S = 0.1
+LEAST_S = 0.5
+SHOWN_CYCLES, POINTS = 2.0, 2000
+
+
+class SinesOptions(Options):
+    """The reference."""
+
+    amplitude_um: float = Field(default=20.0, gt=0)
+    frequencies_hz: Numbers = Field(default=(0.1, 1.0, 5.0, 10.0, 20.0, 50.0), min_length=1)
+    cycles: int = Field(default=2, ge=1)
+    """Judged of each, after one to settle; more where they are short."""
+
+
+def runs(options: SinesOptions, setting: Setting) -> list[Run]:
+    """Frequency after frequency, whole cycles each."""
+    timeline = setting.timeline()
+    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    for hz in options.frequencies_hz:
+        cycles = max(options.cycles, round(LEAST_S * hz))
+        reference = sine(options.amplitude_um, hz)
+        timeline.add("sine", "closed_loop", reference, (cycles + 1) / hz, frequency_hz=hz, cycles=cycles)
+    return [Run("", timeline)]
+
+
+def analyse(recordings: Sequence[Taken], options: SinesOptions) -> Analysis:
+    """Rms error, amplitude and phase at each frequency."""
+    (taken,) = recordings
+    reference, position = taken.read("reference_um", "position_um")
+    rows, table, traces = [], [], []
+    for segment in taken.labelled("sine"):
+        hz = segment.values["frequency_hz"]
+        judged = taken.tail(segment, round(segment.values["cycles"] / hz * taken.rate_hz))
+        wanted, there = reference[judged], position[judged]
+        error = wanted - there
+        rms = float(np.sqrt(np.mean(error**2)))
+        gain = response(wanted, there, hz, taken.rate_hz)
+        left = paper.sensitivity(np.array([hz]))[0]
+        phase, model_phase = (float(np.degrees(np.angle(value))) for value in (gain.gain, 1 - left))
+        model_rms = options.amplitude_um * abs(left) / np.sqrt(2)
+        rows += [
+            Row(f"rms error at {hz:g} Hz", "µm", rms, paper.SAID_TRACKING, model_rms, max(0.05, 0.1 * model_rms)),
+            Row(f"phase at {hz:g} Hz", "°", phase, model=model_phase, tolerance=max(0.3, 0.05 * abs(model_phase))),
+        ]
+        table.append([f"{hz:g}", f"{rms:.4f}", f"{np.abs(error).max():.4f}", f"{abs(gain.gain):.5f}",
+                      f"{20 * np.log10(abs(gain.gain)):.3f}", f"{phase:.3f}", f"{gain.coherence:.6f}"])  # fmt: skip
+        step = max(1, wanted.size // POINTS)
+        cycles = hz * np.arange(wanted.size)[::step] / taken.rate_hz
+        shown = cycles <= SHOWN_CYCLES
+        traces.append((hz, cycles[shown], wanted[::step][shown], there[::step][shown]))
+    headings = ("f / Hz", "rms error / µm", "largest error / µm", "|x/x_d|", "dB", "phase / °", "coherence")
+    notes = ["The paper shows the curves and no numbers. The model is |S| of eqs (5) and (20) times the amplitude, "
+             "without hysteresis; what the hysteresis adds shows at low frequencies."]  # fmt: skip
+    return Analysis(rows, {"traces": traces}, (Table("Every frequency", headings, table),), notes)
+
+
+def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+    """Two cycles of each frequency with the error below."""
+    traces = curves["traces"]
+    columns = min(3, len(traces))
+    rows = -(-len(traces) // columns)
+    grid = figure.add_gridspec(2 * rows, columns, height_ratios=(2, 1) * rows)
+    for number, (hz, cycles, wanted, there) in enumerate(traces):
+        row, column = divmod(number, columns)
+        above, below = figure.add_subplot(grid[2 * row, column]), figure.add_subplot(grid[2 * row + 1, column])
+        above.plot(cycles, there, color=ink.measured, linewidth=2.4, alpha=0.6, label="position x")
+        above.plot(cycles, wanted, color=ink.model, linewidth=0.9, label="reference")
+        below.plot(cycles, wanted - there, color=ink.error, linewidth=0.9, label="error")
+        above.tick_params(labelbottom=False)
+        for panel in (above, below):
+            panel.set_xlim(0, SHOWN_CYCLES)
+            panel.set_xticks(np.arange(0, SHOWN_CYCLES + 0.1, 0.5))
+        ink.label(above, "", "x / µm" if column == 0 else "", f"{hz:g} Hz")
+        ink.label(below, "cycles" if row == rows - 1 else "", "e / µm" if column == 0 else "")
+        if number == 0:
+            handles = [line for panel in (above, below) for line in panel.get_lines()]
+            figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
+
+
+EXPERIMENT = Experiment(
+    "sines",
+    "Closed-loop tracking of sines",
+    "Fig 11",
+    "Feedforward and feedback: sines of 20 µm at several frequencies.",
+    SinesOptions,
+    runs,
+    analyse,
+    draw,
+    size=(11.0, 6.4),
+)

@@ -1,0 +1,128 @@
+"""What was taken of one run of an experiment: its signals, segment by segment, from the recording alone."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from hil.linear import Real
+from rtloop.design.measured import UnsuitableData
+from rtloop.experiments.derive import about
+from rtloop.experiments.procedure import Segment
+from rtloop.identifying import actuator_model
+from rtloop.law.hysteresis import PlayModel
+from rtloop.law.options import AxisOptions
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import Recording
+
+
+class Taken:
+    """One run of an experiment."""
+
+    def __init__(self, recording: Recording) -> None:
+        said = about(recording.configuration)
+        if said is None:
+            raise RecordingError(f"{recording.paths[0]}: is not of an experiment; `rtloop info` shows what it holds")
+        self.recording = recording
+        self.experiment: str = said["name"]
+        self.label: str = said["run"]
+        self.runs: int = said["runs"]
+        self.axis: str = said["axis"]
+        self.parameters: dict[str, Any] = said["parameters"]
+        self.ticks_planned: int = said["ticks"]
+        self.segments = [Segment(*values) for values in said["segments"]]
+        self._may_trip: bool = said["may_trip"]
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The recording's files."""
+        return self.recording.paths
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks per second."""
+        return float(self.recording.header["rate_hz"])
+
+    @cached_property
+    def configured(self) -> dict[str, Any]:
+        """The configuration as plain values."""
+        return tomllib.loads(self.recording.configuration)
+
+    @cached_property
+    def axis_options(self) -> AxisOptions:
+        """The axis as it was configured."""
+        return AxisOptions.model_validate(next(one for one in self.configured["axis"] if one["name"] == self.axis))
+
+    @property
+    def actuator_model(self) -> PlayModel:
+        """The forward hysteresis model as it was identified, its dead band included."""
+        return actuator_model(self.axis_options.feedforward)
+
+    @property
+    def static_gain(self) -> float:
+        """D(0) of the axis's model; 1 where it has none."""
+        model = self.axis_options.model
+        return model.transfer().dc_gain if model else 1.0
+
+    @property
+    def trip(self) -> dict[str, Any] | None:
+        """Tick and causes of the first trip."""
+        for event in self.recording.events:
+            if event["kind"] == "tripped":
+                return {"tick": event["tick"], "causes": event["what"]["causes"]}
+        return None
+
+    def require_whole(self) -> None:
+        """Raise UnsuitableData where the run was cut short, lost ticks, or tripped though it must not."""
+        if self.trip and not self._may_trip:
+            causes = ", ".join(self.trip["causes"])
+            raise UnsuitableData(f"{self._named}tripped at tick {self.trip['tick']} ({causes}); not analysed")
+        last = self._ticks[-1] + 1 if self._ticks.size else 0
+        if last < self.ticks_planned:
+            raise UnsuitableData(
+                f"{self._named}ended after {last / self.rate_hz:.1f} of {self.ticks_planned / self.rate_hz:g} s; "
+                "not analysed"
+            )
+        if missing := int(last) - self._ticks.size:
+            raise UnsuitableData(f"{self._named}{missing} ticks are missing from the recording; not analysed")
+
+    def signal(self, name: str) -> Real:
+        """A signal of the axis by its name without the axis, (ticks,)."""
+        return self.recording[f"{self.axis}_{name}"]
+
+    def read(self, *names: str) -> list[Real]:
+        """Several signals of the axis, in one pass."""
+        return self.recording.read(*(f"{self.axis}_{name}" for name in names))
+
+    def labelled(self, *labels: str) -> list[Segment]:
+        """The segments of these labels, in order."""
+        return [segment for segment in self.segments if segment.label in labels]
+
+    def tail(self, segment: Segment, ticks: int) -> slice:
+        """The last ticks of a segment."""
+        end = segment.start_tick + segment.ticks
+        return slice(end - ticks, end)
+
+    @property
+    def truth(self) -> str | None:
+        """Name of the simulated actuator's hysteresis, where the driver is the simulated rig; else None."""
+        driver = self.configured["driver"]
+        if driver["kind"] not in ("sim", "shm"):
+            return None
+        plant = driver.get("plants", {}).get(self.axis) or driver.get("plant", {})
+        return plant.get("hysteresis", {}).get("truth", "residual")
+
+    @cached_property
+    def _ticks(self) -> Real:
+        return self.recording["tick"]
+
+    @property
+    def _named(self) -> str:
+        return f"{self.label}: " if self.label else ""
+
+
+def whole(segment: Segment) -> slice:
+    """The ticks of a segment."""
+    return slice(segment.start_tick, segment.start_tick + segment.ticks)

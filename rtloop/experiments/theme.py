@@ -1,0 +1,86 @@
+"""How pictures look: one set of colours for light paper, one for dark screens, and what all panels share."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rtloop.errors import MissingExtra
+
+DPI = 130
+
+
+@dataclass(frozen=True)
+class Ink:
+    """Colours by meaning."""
+
+    back: str
+    text: str
+    faint: str
+    measured: str
+    model: str
+    error: str
+    drive: str
+    other: str
+    paper: str
+
+    def label(self, panel: Any, x: str, y: str, title: str = "") -> None:
+        """Axes and title of a panel."""
+        panel.set_xlabel(x)
+        panel.set_ylabel(y)
+        panel.set_title(title, loc="left", fontsize=10, fontweight="bold")
+
+    def legend(self, panel: Any, **options: Any) -> None:
+        """A legend that leaves the curves to be seen."""
+        panel.legend(fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.back, **options)
+
+
+LIGHT = Ink("#ffffff", "#1c2024", "#8a919b", "#1f6fb2", "#2b3036", "#d62728", "#2a8c2a", "#8257b5", "#c4700a")
+DARK = Ink("#14171a", "#e4e7ea", "#7f8791", "#5aa9e6", "#d5dade", "#ff6b6b", "#5fcf6a", "#b794f4", "#f0a94a")
+THEMES: Mapping[str, Ink] = {"light": LIGHT, "dark": DARK}
+
+
+def pictures(draw: Callable[[Any, Any, Ink], None], curves: Any, size: tuple[float, float]) -> dict[str, bytes]:
+    """PNG files by theme. Raises MissingExtra without matplotlib."""
+    try:
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("the report's pictures need matplotlib: pip install 'rtloop[plot]'") from None
+    drawn: dict[str, bytes] = {}
+    for name, ink in THEMES.items():
+        with matplotlib.rc_context(_settings(ink)):
+            figure = Figure(figsize=size, layout="constrained")
+            FigureCanvasAgg(figure)
+            draw(figure, curves, ink)
+            file = io.BytesIO()
+            figure.savefig(file, format="png", dpi=DPI)
+        drawn[name] = file.getvalue()
+    return drawn
+
+
+def _settings(ink: Ink) -> Any:
+    return {
+        "figure.facecolor": ink.back,
+        "axes.facecolor": ink.back,
+        "savefig.facecolor": ink.back,
+        "text.color": ink.text,
+        "axes.labelcolor": ink.text,
+        "axes.edgecolor": ink.faint,
+        "xtick.color": ink.text,
+        "ytick.color": ink.text,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "axes.labelsize": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "grid.color": ink.faint,
+        "grid.alpha": 0.25,
+        "grid.linewidth": 0.6,
+        "lines.linewidth": 1.4,
+        "lines.solid_capstyle": "round",
+    }

@@ -1,0 +1,75 @@
+"""What the terminal shows of experiments: the list, progress with the time left, verdicts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import IO, Any
+
+from rich.markup import escape
+
+from rtloop.experiments.page import mark, number
+from rtloop.experiments.registry import EXPERIMENTS
+from rtloop.progress import StatusLine
+from rtloop.terminal import console, table
+
+WIDTH = 150
+COLOURS = {"good": "green", "mixed": "yellow", "bad": "red", "": "default"}
+
+
+class Progress(StatusLine):
+    """Which run of how many, how far, and about how long all of them still take."""
+
+    def __init__(self, total_ticks: int, stream: IO[str]) -> None:
+        super().__init__("starting", stream)
+        self._total, self._done = total_ticks, 0
+        self._began_s = time.monotonic()
+
+    def show(self, label: str, ticks: int, planned: int) -> None:
+        """Ticks of the present run."""
+        done = self._done + min(ticks, planned)
+        spent_s = time.monotonic() - self._began_s
+        left = f"about {duration(spent_s * (self._total - done) / done)} left" if done else ""
+        self.update(f"{label}: {100 * min(ticks, planned) // planned} %   all: {100 * done // self._total} %   {left}")
+
+    def finished(self, planned: int) -> None:
+        """A run has ended."""
+        self._done += planned
+
+
+def duration(seconds: float) -> str:
+    """In words that can be read at a glance."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+def print_list() -> None:
+    """Every experiment with its parameters."""
+    shown = console()
+    for experiment in EXPERIMENTS.values():
+        shown.print(f"[bold]{experiment.name}[/]  {experiment.title} ({experiment.figure})")
+        shown.print(f"  {experiment.about}")
+        for name, field in experiment.options.model_fields.items():
+            value = list(field.default) if isinstance(field.default, tuple) else field.default
+            shown.print(f"  --set {experiment.name}.{name}={value}", style="dim", markup=False)
+
+
+def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
+    """Verdicts of every experiment; lines that are too long are left to the terminal."""
+    shown = console()
+    shown.width = max(shown.width, WIDTH)
+    for section in content["experiments"]:
+        shown.print(f"[bold]{section['title']}[/] ({section['figure']})")
+        if section["problem"]:
+            shown.print(f"  [red]{escape(section['problem'])}[/]")
+            continue
+        rows = table("", "the paper says", "its model gives", "this run gave", "verdict")
+        rows.columns[4].justify = "left"
+        for row in section["rows"]:
+            model, run = ("–" if row[key] is None else number(row[key]) for key in ("model", "run"))
+            unit = "" if row["unit"] == "1" else f" {row['unit']}"
+            verdict = f"[{COLOURS[mark(row)]}]{escape(row['verdict'])}[/]"
+            rows.add_row(f"  {row['quantity']}", escape(row["paper"]), model, run + unit, verdict)
+        shown.print(rows)
+    for name, reason in skipped.items():
+        shown.print(f"[bold]{name}[/] skipped: {escape(reason)}")

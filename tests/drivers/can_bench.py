@@ -1,0 +1,80 @@
+"""Configurations for a node on a bus of this machine alone, and the node as a process of its own."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from drivers.can.options import CanOptions
+
+ROOT = Path(__file__).resolve().parents[2]
+GROUP = "239.74.163.77"
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+DRIVER = """
+[driver]
+kind = "can"
+interface = "udp_multicast"
+channel = "{group}"
+settings = {{ port = {port}, hop_limit = 0 }}
+watchdog_ms = 1000
+wait_s = 60
+hold_ticks = {hold_ticks}
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+"""
+LAW = """
+[loop]
+rate_hz = {rate_hz}
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.controller]
+form = "zpk"
+gain = 60.0
+poles = [[-0.5, 0.0]]
+[axis.interlocks]
+sample_age_us = 1e7
+[axis.reference]
+kind = "sine"
+amplitude = 5.0
+offset = 10.0
+frequency_hz = 2.0
+[recording]
+folder = "{folder}"
+min_free_mib = 0.0
+"""
+
+
+def free_port() -> int:
+    """Of UDP: buses on different ports do not hear each other."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return int(one.getsockname()[1])
+
+
+def configuration(folder: Path, port: int, rate_hz: float = 500.0, hold_ticks: int = 500, more: str = "") -> Path:
+    """A file; a stall of this machine is bridged by `hold_ticks`."""
+    path = folder / "lab.toml"
+    driver = DRIVER.format(group=GROUP, port=port, hold_ticks=hold_ticks)
+    path.write_text(LAW.format(rate_hz=rate_hz, folder=folder / "recordings") + driver + more)
+    return path
+
+
+def options_on(port: int, **more: Any) -> CanOptions:
+    """Of a driver on a bus of this machine."""
+    settings = {"port": port, "hop_limit": 0}
+    return CanOptions(interface="udp_multicast", channel=GROUP, settings=settings, **more)
+
+
+def rtloop(*arguments: str | Path) -> subprocess.Popen[str]:
+    """A command, as a user gives it."""
+    command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
+    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -1,0 +1,51 @@
+"""The stand-in for libcomedi, compiled once a session, and a look at its hardware, which is a file."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+MAGIC, OUTPUTS, HIGHEST_CODE = 0xDA9, 4, 65535
+HARDWARE = np.dtype(
+    [("magic", "u4"), ("fail_read", "u4"), ("fail_write", "u4"), ("code", "u4", OUTPUTS), ("range", "u4", OUTPUTS)]
+)
+OUTPUT_RANGES_V = ((-10.0, 10.0), (0.0, 5.0))
+
+
+@functools.cache
+def stub_library() -> Path:
+    """The shared library; the test is skipped where there is no C compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    folder = tempfile.mkdtemp(prefix="rtloop-comedi-")
+    library = Path(folder) / "libcomedi.so.0"
+    source = Path(__file__).with_name("comedi_stub.c")
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-w", "-o", library, source], check=True)
+    return library
+
+
+def new_board(path: Path) -> Path:
+    """Hardware as somebody left it: outputs at 7 V."""
+    hardware = np.zeros(1, HARDWARE)
+    hardware["magic"], hardware["code"] = MAGIC, round(0.85 * HIGHEST_CODE)
+    path.write_bytes(hardware.tobytes())
+    return path
+
+
+def hardware(path: Path) -> np.ndarray:
+    """The hardware, to look at and to break."""
+    return np.memmap(path, HARDWARE, "r+", shape=(1,))
+
+
+def output_v(path: Path, channel: int) -> float:
+    """Volts at an output now."""
+    board = hardware(path)[0]
+    lowest, highest = OUTPUT_RANGES_V[board["range"][channel]]
+    return float(lowest + board["code"][channel] * (highest - lowest) / HIGHEST_CODE)

@@ -1,0 +1,136 @@
+"""A board at a rate of its own that is paused, killed and started again during a run.
+
+How late the trip came is counted in ticks of the recording: never more than the limit on the sample's age holds, and
+one, whatever else the machine did meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rtloop
+from hil import board
+from rtloop.config import parse
+from rtloop.errors import ConfigError
+from tests.faults.account import account
+from tests.faults.bench import Bench
+from tests.faults.configuration import ROOT, on_a_board
+from tests.faults.evidence import wait_for
+
+LOOP_HZ = 4000.0
+LIMIT_TICKS = 400
+LIMIT_US = LIMIT_TICKS / LOOP_HZ * 1e6
+CHANGES = (
+    ("board_rate_hz = 8000", "board_rate_hz = 8000\ndropped_share = 0.05\nrepeated_share = 0.05"),
+    ("sample_age_us = 400000.0", f"sample_age_us = {LIMIT_US}"),
+)
+
+
+def await_stale(bench: Bench) -> None:
+    bench.await_state("tripped", "stale")
+
+
+def drive_again(bench: Bench) -> None:
+    """A host that stalls the board alone for longer than the limit trips once more: then once more."""
+    for attempt in range(3):
+        try:
+            return bench.recover()
+        except AssertionError:
+            if attempt == 2:
+                raise
+    return None
+
+
+def test_a_board_that_stops_trips_within_the_ticks_of_the_limit_and_a_reset_recovers(tmp_path, capsys):
+    with Bench(tmp_path, *CHANGES) as bench:
+        assert bench.board is not None
+        drive_again(bench)
+        bench.board.send_signal(signal.SIGSTOP)
+        await_stale(bench)
+        bench.board.send_signal(signal.SIGCONT)
+        drive_again(bench)
+        bench.board.kill()
+        bench.board.wait()
+        await_stale(bench)
+        bench.start_board()
+        drive_again(bench)
+        assert bench.stop() == 0
+        assert account(tmp_path / "recordings", bench.blocks).problems == []
+    recording = rtloop.load(sorted((tmp_path / "recordings").glob("*.mcap")))
+    late = [ticks_stale(recording, event) for event in recording.events if stale(event)]
+    assert len(late) >= 2
+    with capsys.disabled():
+        print(f"\nstale after {late} ticks; the limit holds {LIMIT_TICKS}")
+    assert max(late) <= LIMIT_TICKS + 1
+
+
+def stale(event) -> bool:
+    return event["kind"] == "tripped" and "stale" in event["what"]["causes"]
+
+
+def ticks_stale(recording, event) -> int:
+    """Ticks that woke from the newest sample to the trip, which came in the first that was beyond the limit."""
+    before = recording["tick"] <= event["tick"]
+    age_us, read_us = recording["sample_age_us"][before], recording["read_us"][before]
+    assert age_us[-1] > LIMIT_US
+    assert age_us[-2] <= LIMIT_US
+    wake_us = recording["deadline_ns"][before] * 1e-3 + recording["lateness_us"][before]
+    return int(np.sum(wake_us > wake_us[-1] + read_us[-1] - age_us[-1]))
+
+
+@pytest.mark.parametrize("key", ["dropped_share", "repeated_share"])
+def test_a_share_is_checked_with_the_configuration(key):
+    text = on_a_board(Path("/nowhere"), ("board_rate_hz = 8000", f"{key} = 1.5"))
+    with pytest.raises(ConfigError, match=rf"driver\.{key}: 1\.5: .*less than or equal to 1"):
+        parse(text, "lab", Path(), "lab.toml")
+
+
+def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys):
+    changes = (("board_rate_hz = 8000", "board_rate_hz = 50000"), ("rate_hz = 4000\n", "rate_hz = 5000\n"))
+    config = tmp_path / "lab.toml"
+    config.write_text(on_a_board(tmp_path, *changes))
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    rtloop_command = (sys.executable, "-m", "rtloop")
+    with (tmp_path / "log").open("w") as log:
+        served = subprocess.Popen([*rtloop_command, "hil", "serve", config], env=environment, stderr=log)
+        try:
+            wait_for(lambda: "board at" in (tmp_path / "log").read_text(), "a board", 120.0)
+            wait_for(lambda: running(tmp_path / "board"), "samples", 120.0)
+            command = [*rtloop_command, "run", config, "--duration", "1", "--json"]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250, check=False)
+            memory = memory_of(tmp_path / "board")
+        finally:
+            served.send_signal(signal.SIGTERM)
+            served.wait()
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert memory.facts["rate_hz"] == 50_000
+    assert (summary["ticks_logged"], summary["ticks_lost"], summary["trips"]) == (5_000, 0, [])
+    ages_us = rtloop.load(summary["recording"])["sample_age_us"]
+    with capsys.disabled():
+        print(f"\nboard at 50 kHz: samples {np.median(ages_us):.1f} µs old, the oldest {ages_us.max():.0f} µs; "
+              f"its own clock at most {int(memory.words[board.LONGEST_LATE_NS]) / 1e3:.0f} µs late")  # fmt: skip
+    replayed = subprocess.run([*rtloop_command, "replay", summary["recording"], "--json"], env=environment,
+                              capture_output=True, text=True, timeout=250, check=False)  # fmt: skip
+    assert json.loads(replayed.stdout)["identical"] is True
+
+
+def memory_of(path: Path) -> board.BoardMemory:
+    with path.open("r+b") as file:
+        return board.BoardMemory(file.fileno())
+
+
+def running(path: Path) -> bool:
+    return (
+        path.exists()
+        and path.stat().st_size >= board.file_bytes()
+        and bool(memory_of(path).words[board.SEQUENCE] > 1000)
+    )

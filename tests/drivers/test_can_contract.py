@@ -1,0 +1,159 @@
+"""A node in a process of its own keeps the drivers' contract; what its outputs did is read from its memory."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.base import Driver, Wiring
+from drivers.can.driver import CanDriver
+from drivers.can.node import serve
+from drivers.contract import Calls, DriverContract
+from drivers.errors import DriverError
+from tests.drivers.can_bench import ENVIRONMENT, free_port, options_on
+from tests.faults.evidence import wait_for
+
+ONE = {"x": Wiring("adc0", "dac0")}
+RATE_HZ = 500.0
+WATCHDOG_MS = 300.0
+WITNESS = struct.Struct("<qdq")
+PROGRAM = """
+import mmap, sys
+from drivers.can.bus import open_bus
+from drivers.can.node import RigNode
+from tests.drivers.can_bench import options_on
+from tests.drivers.test_can_contract import WATCHDOG_MS, WITNESS
+
+options = options_on(int(sys.argv[1]), watchdog_ms=WATCHDOG_MS)
+with open(sys.argv[2], "r+b") as file:
+    seen = mmap.mmap(file.fileno(), WITNESS.size)
+with open_bus(options) as bus:
+    node = RigNode(bus, options, ["x"])
+    node.require_alone()
+    while True:
+        node.step()
+        WITNESS.pack_into(seen, 0, node.samples, node.drive_v[0], node.parked)
+"""
+
+
+class Node:
+    """A node's process, and what it did."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port, path = free_port(), folder / "witness"
+        path.write_bytes(bytes(WITNESS.size))
+        with path.open("r+b") as file:
+            self._seen = mmap.mmap(file.fileno(), WITNESS.size)
+        command = [sys.executable, "-c", PROGRAM, str(self.port), str(path)]
+        self.process = subprocess.Popen(command, env=ENVIRONMENT)
+
+    def driver(self, **more: object) -> CanDriver:
+        return CanDriver(options_on(self.port, **{"hold_ticks": 100, "wait_s": 60.0} | more), ONE, RATE_HZ)
+
+    @property
+    def seen(self) -> tuple[int, float, int]:
+        """Samples, output in V, how often its watchdog parked it."""
+        return WITNESS.unpack_from(self._seen)
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    node = Node(tmp_path_factory.mktemp("node"))
+    yield node
+    node.end()
+
+
+class TestNode(DriverContract):
+    @pytest.fixture(autouse=True)
+    def _node(self, node: Node) -> None:
+        self.node = node
+
+    def driver(self) -> Driver:
+        return self.node.driver()
+
+    def outputs(self, driver: Driver) -> Sequence[float] | None:
+        """Once the node is at rest: it has followed everything that is under way."""
+        last = None
+        while last != (last := self.node.seen[:2]):
+            time.sleep(0.05)
+        return [self.node.seen[1]]
+
+
+def test_a_silent_controller_gets_the_outputs_parked(node):
+    driver = node.driver()
+    calls = Calls(driver.open(), driver.facts)
+    before = node.seen[2]
+    assert calls.write([4.0]) == 0
+    wait_for(lambda: node.seen[1] == pytest.approx(4.0, abs=2e-4), "the drive")
+    wait_for(lambda: node.seen[1] == 0.0 and node.seen[2] == before + 1, "a parked output")
+    driver.close()
+
+
+def test_a_stopped_node_shows_in_status_and_age(node):
+    driver = node.driver(hold_ticks=3)
+    calls = Calls(driver.open(), driver.facts)
+    assert calls.read()[0] == 0
+    node.process.send_signal(signal.SIGSTOP)
+    found = []
+    for _ in range(5):
+        calls.write([0.0])
+        found.append(calls.read())
+    node.process.send_signal(signal.SIGCONT)
+    assert [status for status, _ in found] == [1] * 5
+    ages = [values[1] for _, values in found]
+    assert ages[0] < ages[1] < ages[2] < math.inf
+    assert ages[3:] == [math.inf] * 2
+    assert [values[-1] for _, values in found] == [1, 2, 3, 4, 5]
+    driver.close()
+
+
+def test_a_second_controller_is_refused(node):
+    driver, ending = node.driver(), threading.Event()
+    calls = Calls(driver.open(), driver.facts)
+
+    def drive() -> None:
+        while not ending.wait(0.005):
+            calls.write([0.5])
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    try:
+        with pytest.raises(DriverError, match=r"CAN bus udp_multicast 239\.\d.*: another controller drives this node"):
+            node.driver().open()
+    finally:
+        ending.set()
+        thread.join()
+        driver.close()
+
+
+def test_an_intruder_fails_the_driver(node):
+    driver = node.driver()
+    calls = Calls(driver.open(), driver.facts)
+    assert (calls.read()[0], calls.write([0.0])) == (0, 0)
+    with can.Bus(ignore_config=True, **options_on(node.port).keywords) as bus:
+        bus.send(can.Message(arbitration_id=0x100, data=bytes([9, 0, 0, 16]), is_extended_id=False))
+    wait_for(lambda: calls.read()[0] == -1, "a failed read")
+    assert "another controller drives this node" in str(driver.error)
+    wait_for(lambda: node.seen[1] == 0.0, "a parked output")
+    driver.open()  # where it is alone again
+    driver.close()
+
+
+def test_a_second_node_is_refused(node):
+    with pytest.raises(DriverError, match="another node is there already"):
+        serve(options_on(node.port), ["x"], lambda: True)

@@ -1,0 +1,161 @@
+"""The comedi driver keeps the contract on a stand-in for libcomedi; `make rig` runs it on the kernel's own board."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.base import Driver, Wiring
+from drivers.comedi import ComediDriver, ComediOptions
+from drivers.contract import Calls, DriverContract
+from drivers.errors import DriverError, MissingExtra
+from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
+
+ONE = {"x": Wiring("ai0", "ao0")}
+CROSSED = {"y": Wiring("ai1", "ao3"), "x": Wiring("ai3", "ao1")}
+LSB_V = 20.0 / 65535
+
+
+def comedi(path: Path, wiring: dict[str, Wiring] = ONE, **options: Any) -> ComediDriver:
+    given = {"device": str(path), "library": str(stub_library()), **options}
+    return ComediDriver(ComediOptions.model_validate(given), wiring, 1000.0)
+
+
+class TestOneAxis(DriverContract):
+    tolerance_v = LSB_V
+    wiring = ONE
+    options: dict[str, Any] = {}  # noqa: RUF012
+
+    @pytest.fixture(autouse=True)
+    def _board(self, tmp_path: Path) -> None:
+        self.device = new_board(tmp_path / "comedi0")
+
+    def driver(self) -> Driver:
+        return comedi(self.device, self.wiring, **self.options)
+
+    def outputs(self, driver: Driver) -> Sequence[float] | None:
+        return [output_v(self.device, int(channel.name[2:])) for channel in driver.facts.outputs]
+
+
+class TestTwoAxesAndAnEnableInput(TestOneAxis):
+    wiring = CROSSED
+    options = {"more_inputs": ["ai7"], "input_subdevice": 0, "output_subdevice": 1, "aref": "diff"}  # noqa: RUF012
+
+
+class TestUnipolarOutput(TestOneAxis):
+    """Its lowest code is 0 V; the others cover another range and must stay as they were."""
+
+    options = {"output_range_v": [0, 5], "input_range_v": [0.0, 5.0], "safe_v": 1.0}  # noqa: RUF012
+
+    def test_other_outputs_are_left_alone(self) -> None:
+        with self.opened() as (_, calls):
+            calls.write([2.0])
+        assert [output_v(self.device, channel) for channel in (1, 2, 3)] == pytest.approx([7.0] * 3, abs=LSB_V)
+
+
+@pytest.mark.parametrize("volts", [-10.0, -3.7, 0.0, 1e-4, 2.5, 10.0])
+def test_codes_are_the_nearest_and_come_back(tmp_path, volts):
+    device = new_board(tmp_path / "comedi0")
+    driver = comedi(device, {"x": Wiring("ai2", "ao2")})
+    calls = Calls(driver.open(), driver.facts)
+    assert calls.write([volts]) == 0
+    assert output_v(device, 2) == pytest.approx(volts, abs=LSB_V / 2 * 1.0001)
+    status, (read_v, age_us) = calls.read()
+    assert (status, age_us) == (0, 0.0)
+    assert read_v == pytest.approx(output_v(device, 2), abs=1e-9)
+    driver.close()
+
+
+def test_channels_are_not_mixed_up(tmp_path):
+    device = new_board(tmp_path / "comedi0")
+    driver = comedi(device, CROSSED, more_inputs=["ai7"])
+    calls = Calls(driver.open(), driver.facts)
+    assert [channel.name for channel in driver.facts.inputs] == ["ai1", "ai3", "ai7"]
+    calls.write([3.0, -4.0])  # ao3, ao1
+    assert calls.read()[1] == pytest.approx([-4.0, 3.0, 0.0, 0.0], abs=LSB_V)
+    driver.close()
+
+
+def test_what_is_no_number_moves_no_output(tmp_path):
+    device = new_board(tmp_path / "comedi0")
+    driver = comedi(device, CROSSED)
+    calls = Calls(driver.open(), driver.facts)
+    calls.write([1.0, 2.0])
+    before = hardware(device)["code"].tolist()
+    assert calls.write([5.0, math.nan]) < 0
+    assert hardware(device)["code"].tolist() == before
+    driver.close()
+
+
+def test_a_failing_board_is_a_failed_driver_and_says_where(tmp_path):
+    device = new_board(tmp_path / "comedi0")
+    driver = comedi(device, CROSSED)
+    calls = Calls(driver.open(), driver.facts)
+    assert driver.error is None
+    hardware(device)["fail_read"] = 1
+    assert calls.read()[0] < 0
+    assert str(driver.error) == f"{device}: ai1: Input/output error"
+    hardware(device)["fail_write"] = 1
+    assert calls.write([0.0, 0.0]) < 0
+    assert str(driver.error) == f"{device}: ai1, ao3: Input/output error"
+    hardware(device)["fail_write"] = 1
+    with pytest.raises(DriverError, match=r"its outputs could not be made safe: .*ao3: Input/output error"):
+        driver.close()
+    driver.close()
+    comedi(device).open()
+
+
+FAULTS = {
+    "no device": ({"device": "/nowhere/comedi0"}, ONE, "/nowhere/comedi0: No such file or directory; is the board's"),
+    "not a board": ({"device": __file__}, ONE, "Inappropriate ioctl for device; this is no comedi device"),
+    "channel": ({}, {"x": Wiring("ai0", "ao4")}, "ao4 is not a channel of this board; it has ao0 … ao3"),
+    "range": ({"input_range_v": [-1, 1]}, ONE, r"ai0 has no range \[-1.0, 1.0\] V; it has \[-10, 10\], \[-5, 5\]"),
+    "subdevice": ({"output_subdevice": 2}, ONE, "output_subdevice: 2 has no analogue outputs; there are 1"),
+    "no such subdevice": ({"input_subdevice": 9}, ONE, "input_subdevice: 9 has no analogue inputs; there are 0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("options", "wiring", "message"), FAULTS.values(), ids=FAULTS)
+def test_what_a_board_does_not_have_is_said_and_the_board_let_go(tmp_path, options, wiring, message):
+    device = new_board(tmp_path / "comedi0")
+    with pytest.raises(DriverError, match=message):
+        comedi(device, wiring, **options).open()
+    driver = comedi(device)
+    driver.open()
+    driver.close()
+
+
+def test_a_board_in_use_is_said(tmp_path):
+    device = new_board(tmp_path / "comedi0")
+    first = comedi(device)
+    first.open()
+    with pytest.raises(DriverError, match=f"{device}: subdevice 0: another program uses it"):
+        comedi(device).open()
+    first.close()
+
+
+def test_a_missing_library_is_said_with_what_to_install(tmp_path):
+    with pytest.raises(MissingExtra, match=r"driver 'comedi': libabsent\.so\.0: .*; install libcomedi0"):
+        comedi(tmp_path / "comedi0", library="libabsent.so.0").open()
+    with pytest.raises(MissingExtra, match="undefined symbol: comedi_open; install libcomedi0"):
+        comedi(tmp_path / "comedi0", library="libm.so.6").open()
+
+
+@pytest.mark.parametrize(
+    ("options", "wiring", "message"),
+    [
+        ({}, {"x": Wiring("adc0", "ao0")}, r"channels\.x\.input: 'adc0'; allowed are ai0, ai1, …"),
+        ({}, {"x": Wiring("ai0", "ao01")}, r"channels\.x\.output: 'ao01'; allowed are ao0, ao1, …"),
+        ({}, {"x": Wiring("ai0", "ao0"), "y": Wiring("ai1", "ao0")}, r"channels\.y\.output: 'ao0' is taken by axis x"),
+        ({"more_inputs": ["enable"]}, ONE, "more_inputs: 'enable'; allowed are ai0"),
+        ({"input_range_v": [10, -10]}, ONE, r"input_range_v: \[10, -10\]; allowed is the lower end before the higher"),
+        ({"output_range_v": [1, 5]}, ONE, "safe_v: 0 is outside output_range_v, 1 … 5 V"),
+    ],
+)
+def test_what_cannot_be_is_said_without_a_board(options, wiring, message):
+    with pytest.raises(ValueError, match=message):
+        ComediDriver(ComediOptions.model_validate(options), wiring, 1000.0)

@@ -1,0 +1,62 @@
+"""The drivers of docs/drivers.md, taken from the page as they stand there, keep the contract."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FILE = re.compile(r"^    (?:# |/\* )(\w+\.(?:py|c))(?: \*/)?\n((?:    .*\n|\n)+)", re.MULTILINE)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The page's files."""
+    for name, text in FILE.findall((ROOT / "docs" / "drivers.md").read_text()):
+        (tmp_path / name).write_text(textwrap.dedent(text))
+    return tmp_path
+
+
+def passed(folder: Path, test: str) -> str:
+    """The last line of pytest's report."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", "--rootdir", folder, test]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return done.stdout.strip().splitlines()[-1]
+
+
+def test_in_plain_python(folder):
+    assert re.match(r"11 passed", passed(folder, "test_mycard.py"))
+
+
+def test_as_native_functions(folder):
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    command = re.search(r"`(cc .*mycard\.c)`", (ROOT / "docs" / "drivers.md").read_text())
+    assert command
+    subprocess.run(command[1].split(), cwd=folder, check=True)
+    test = (folder / "test_mycard.py").read_text()
+    test = test.replace(
+        "from mycard import MyCard, MyCardOptions",
+        "from mycard import MyCardOptions\nfrom mycard_native import NativeCard as MyCard",
+    )
+    test = test.replace("return list(vendor.volts)", 'return list(driver.card.at) if hasattr(driver, "card") else None')
+    (folder / "test_native.py").write_text(test)
+    assert re.match(r"11 passed", passed(folder, "test_native.py"))
+
+
+def test_a_broken_copy_is_red(folder):
+    """The page's driver without its parking: the documented suite must see it."""
+    text = (folder / "mycard.py").read_text()
+    assert text.count("vendor.write(channel, value)") == 1
+    (folder / "mycard.py").write_text(
+        text.replace("vendor.write(channel, value)", "vendor.write(channel, value + 0.1)")
+    )
+    assert "failed" in passed(folder, "test_mycard.py")

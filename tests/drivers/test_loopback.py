@@ -1,0 +1,134 @@
+"""The numbers of the self-test, on wires whose gain, offset, noise and delay are known, and the command on a wire."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from rtloop.cli import main
+from rtloop.loopback import measure
+from tests.drivers.comedi_board import new_board, output_v, stub_library
+
+DWELL, SETTLING = 100, 50
+LSB_V = 20.0 / 65535
+CONFIG = """
+[loop]
+rate_hz = 1000
+[driver]
+kind = "comedi"
+device = "{device}"
+library = "{library}"
+[driver.channels.x]
+input = "ai0"
+output = "ao0"
+um_per_v = 10.0
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [10.0]
+[axis.limits]
+drive_v = {drive_v}
+"""
+
+
+def staircase() -> np.ndarray:
+    """±1 V with ramps of 20 ticks between the levels."""
+    levels = np.tile([0.0, 1.0, 0.0, -1.0], 5)
+    corners = np.arange(levels.size) * DWELL
+    return np.interp(
+        np.arange(levels.size * DWELL), np.ravel([corners, corners + DWELL - 20], "F"), np.repeat(levels, 2)
+    )
+
+
+def wire(drive_v: np.ndarray, gain: float, offset_v: float, delay: int, noise_v: float = 0.0) -> np.ndarray:
+    delayed = np.concatenate([np.full(delay, drive_v[0]), drive_v[: drive_v.size - delay]])
+    return gain * delayed + offset_v + np.random.default_rng(5).normal(0.0, noise_v, drive_v.size)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 17])
+@pytest.mark.parametrize(("gain", "offset_v"), [(1.0, 0.0), (0.43, -0.2), (-2.0, 3.0)])
+def test_a_wire_without_noise_is_measured_exactly(gain, offset_v, delay):
+    pair = measure(staircase(), wire(staircase(), gain, offset_v, delay), SETTLING)
+    assert pair.gain == pytest.approx(gain, rel=1e-9)
+    assert pair.offset_v == pytest.approx(offset_v, abs=1e-9)
+    assert pair.noise_v == pytest.approx(0.0, abs=1e-9)
+    assert pair.delay_ticks == delay
+
+
+def test_noise_is_its_deviation_and_does_not_hide_the_delay():
+    pair = measure(staircase(), wire(staircase(), 1.0, 0.1, 3, noise_v=0.05), SETTLING)
+    settled = 20 * 30
+    assert pair.noise_v == pytest.approx(0.05, rel=5 / np.sqrt(2 * settled))
+    assert pair.gain == pytest.approx(1.0, abs=5 * 0.05 / np.sqrt(settled * 0.5))
+    assert pair.delay_ticks == 3
+
+
+@pytest.mark.parametrize("noise_v", [0.0, 0.01])
+def test_an_input_that_does_not_follow_has_no_delay(noise_v):
+    pair = measure(staircase(), wire(staircase(), 0.0, 0.7, 0, noise_v), SETTLING)
+    assert pair.gain == pytest.approx(0.0, abs=0.005)
+    assert pair.delay_ticks is None
+
+
+def test_a_drive_that_stands_still_shows_nothing():
+    with pytest.raises(ValueError, match="never stood still at two different values"):
+        measure(np.zeros(100), np.zeros(100), 10)
+
+
+@pytest.fixture
+def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The command on a board of its own, with at most two rates; its result and the board."""
+    monkeypatch.setattr("rtloop.selftest.RUNGS", 2)
+
+    def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
+        device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"
+        text = CONFIG.format(device=device, library=stub_library(), drive_v=drive_v)
+        config.write_text(text)
+        return CliRunner().invoke(main, ["drivers", "--selftest", str(config), *arguments]), device
+
+    return command
+
+
+def test_a_wire_passes_and_the_output_is_parked(selftest):
+    limits = ("--gain-tolerance", "0.001", "--offset-tolerance", str(2 * LSB_V))
+    done, device = selftest("--loopback", *limits, "--json")
+    report = json.loads(done.stdout)
+    assert (done.exit_code, report["passed"]) == (0, True), done.stderr
+    pair = report["axes"][0]
+    assert abs(pair["gain"] - 1.0) < 0.001
+    assert abs(pair["offset_v"]) < 2 * LSB_V
+    assert pair["delay_ticks"] == 1
+    assert "ao0 from -1 V to 1 V, at most 1000 V/s" in done.stderr
+    assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
+    reached = [rate["rate_hz"] for rate in report["rates"] if rate["missed_share"] <= 0.01]
+    assert report["highest_rate_hz"] == max(reached, default=None)
+    assert report["rates"][0]["rate_hz"] == 1000.0
+
+
+def test_a_verdict_of_no_is_exit_1_and_the_limits_of_axis_and_range_hold(selftest):
+    """At most 0.5 V: nothing is wrong with the wire but a tolerance that no code can keep."""
+    done, device = selftest("--loopback", "--gain-tolerance", "1e-9", drive_v=0.5)
+    assert done.exit_code == 1, done.output
+    assert "no loopback" in done.stdout
+    assert "ao0 from -0.5 V to 0.5 V" in done.stderr
+    assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
+    assert output_v(device, 1) == pytest.approx(7.0, abs=LSB_V)  # wired to no axis
+
+
+def test_without_a_claim_there_is_no_verdict(selftest):
+    done, _ = selftest("--amplitude", "0.5")
+    assert done.exit_code == 0, done.output
+    assert "no verdict" in done.stdout
+
+
+@pytest.mark.parametrize("amplitude", ["0", "nan", "-1"])
+def test_an_amplitude_that_cannot_be_is_said_before_anything_moves(selftest, amplitude):
+    done, device = selftest("--amplitude", amplitude)
+    assert done.exit_code == 2
+    assert "Invalid value for '--amplitude'" in done.stderr
+    assert output_v(device, 0) == pytest.approx(7.0, abs=LSB_V)

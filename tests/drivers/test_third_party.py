@@ -1,0 +1,99 @@
+"""A third party's package, installed and found by its entry point, closes the loop and replays."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rtloop
+from drivers.base import Driver, Wiring
+from drivers.contract import DriverContract
+from drivers.registry import driver_class
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = """
+[loop]
+rate_hz = {rate_hz}
+[driver]
+kind = "bench_card"
+seed = 3
+[driver.channels.x]
+input = "in"
+output = "out"
+um_per_v = 10.0
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.controller]
+form = "zpk"
+gain = 20.0
+poles = [[0.0, 0.0]]
+[axis.reference]
+kind = "steps"
+levels = [10.0, -10.0]
+dwell_s = 0.5
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that the package is installed in, as its own pyproject.toml says and as pip would leave it."""
+    source, target = Path(__file__).with_name("third_party"), tmp_path_factory.mktemp("installed")
+    pyproject = tomllib.loads((source / "pyproject.toml").read_text())
+    project, modules = pyproject["project"], pyproject["tool"]["setuptools"]["py-modules"]
+    for module in modules:
+        shutil.copy(source / f"{module}.py", target)
+    info = target / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    lines = [f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
+             for group, points in project["entry-points"].items()]  # fmt: skip
+    (info / "entry_points.txt").write_text("".join(lines))
+    return target
+
+
+def run(installed: Path, *arguments: str) -> str:
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{installed}"}
+    command = [sys.executable, "-m", "rtloop", *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+class TestContract(DriverContract):
+    @pytest.fixture(autouse=True)
+    def _installed(self, installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.syspath_prepend(installed)
+
+    def driver(self) -> Driver:
+        kind = driver_class("bench_card")
+        return kind(kind.options_model(), {"x": Wiring("in", "out")}, 1000.0)
+
+
+def test_it_is_listed(installed):
+    assert "bench_card:BenchCard" in run(installed, "drivers")
+
+
+@pytest.mark.parametrize("rate_hz", [2_000, 10_000])
+def test_it_closes_the_loop_and_replays(installed, tmp_path, rate_hz):
+    config = tmp_path / "bench.toml"
+    config.write_text(CONFIG.format(rate_hz=rate_hz))
+    summary = json.loads(run(installed, "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"))
+    assert summary["ticks_logged"] == summary["ticks_expected"] == 2 * rate_hz
+    assert summary["ticks_lost"] == 0
+    recording = rtloop.load(summary["recording"])
+    ends = recording["x_true_position_um"].reshape(4, -1)[:, -50:].mean(axis=1)
+    assert np.allclose(ends, [10.0, -10.0, 10.0, -10.0], atol=0.1)
+    verdict = json.loads(run(installed, "replay", summary["recording"], "--json"))
+    assert verdict["identical"] is True
+    assert verdict["ticks"] == 2 * rate_hz

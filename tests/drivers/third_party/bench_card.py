@@ -1,0 +1,34 @@
+"""A laboratory's own card in plain Python: what hangs on it is the simulated rig, which moves once a write."""
+
+from __future__ import annotations
+
+from drivers.base import Channel, Facts, Wiring
+from drivers.python import PythonDriver
+from hil.options import RigOptions
+from hil.rig import advance, build_rig, sample
+
+
+class BenchCard(PythonDriver):
+    kind = "bench_card"
+    options_model = RigOptions
+    example = Wiring("in", "out")
+
+    @property
+    def facts(self) -> Facts:
+        return Facts((Channel("in"),), (Channel("out"),), observed=("x_true_position_um",), max_rate_hz=20_000.0)
+
+    def start(self) -> None:
+        coefficients, state = build_rig(self.options, ["x"], 1.0 / self.rate_hz)
+        self.rig = coefficients[0], state[0]
+
+    def read(self) -> list[float]:
+        return [sample(*self.rig)]
+
+    def observe(self) -> list[float]:
+        return [self.rig[1].true_position_um]
+
+    def write(self, volts: list[float]) -> None:
+        advance(*self.rig, volts[0])
+
+    def stop(self) -> None:
+        pass

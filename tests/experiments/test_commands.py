@@ -1,0 +1,112 @@
+"""`rtloop experiment` as a user meets it: real processes, real recordings, the report from these alone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from rtloop.cli import main
+from rtloop.experiments.report import report, take
+from tests.service.test_run import PAPER, finish, start
+from tests.soak.aborts import abort, check
+
+BOARD = PAPER.with_name("board.toml")
+QUICK = (
+    "--set", "robustness.shifts_percent=[0.0, 5.0]", "--set", "robustness.duration_s=0.3",
+)  # fmt: skip
+
+
+def command(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["experiment", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Folder and JSON of a run of three quick experiments, one of them with a run that trips."""
+    folder = tmp_path_factory.mktemp("experiments")
+    names = ("step-response", "compensation", "robustness")
+    code, content, error = finish(start("experiment", "run", *names, PAPER, *QUICK, "--out", folder, "--json"))
+    assert code == 0, error
+    return folder, content
+
+
+def rows(content: dict[str, Any], name: str) -> dict[str, Any]:
+    section = next(section for section in content["experiments"] if section["name"] == name)
+    return {row["quantity"]: row for row in section["rows"]}
+
+
+def test_the_step_is_that_of_eq_5(made: tuple[Path, dict[str, Any]]) -> None:
+    found = rows(made[1], "step-response")
+    assert found["overshoot"]["run"] == pytest.approx(14.474, abs=0.3)
+    assert found["frequency of the ringing"]["run"] == pytest.approx(595.50, abs=0.2)
+    assert found["damping ratio of the ringing"]["run"] == pytest.approx(0.00735, abs=1e-4)
+    assert found["overshoot"]["as_the_paper"] is False
+    assert "not as the paper says" in found["frequency of the ringing"]["verdict"]
+
+
+def test_compensation_leaves_what_the_rig_was_made_for(made: tuple[Path, dict[str, Any]]) -> None:
+    found = rows(made[1], "compensation")
+    delay_s = 925 / 4.59e5 - 1 / 1430 + 0.5e-4  # D's slowest poles and zero, and half a tick of hold
+    lag_um = 2 * 2 * np.pi * 0.1 * 40.0 * delay_s  # of both branches, where the sine is fastest
+    assert found["h/H after compensation"]["run"] == pytest.approx(3.75 + 100 * lag_um / 80, abs=0.03)
+
+
+def test_a_shifted_resonance_trips_and_is_a_result(made: tuple[Path, dict[str, Any]]) -> None:
+    section = next(one for one in made[1]["experiments"] if one["name"] == "robustness")
+    assert section["problem"] is None
+    assert [row[2] for row in section["tables"][0]["rows"]] == ["settles", "trips (oscillation)"]
+
+
+def test_the_report_of_the_recordings_alone_is_that_of_the_run(
+    made: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    folder, content = made
+    again = command("report", folder, "--out", tmp_path, "--json")
+    assert again.exit_code == 0, again.output
+    found = json.loads(again.stdout)
+    for key in ("files", "interrupted", "skipped"):
+        content.pop(key, None)
+        found.pop(key, None)
+    assert found == content
+    assert json.loads((tmp_path / "report.json").read_text()) == json.loads((folder / "report.json").read_text())
+    page = (tmp_path / "report.html").read_text()
+    assert "<script" not in page
+    assert page.count("data:image/png") == 2 * len(content["experiments"])
+    for section in content["experiments"]:
+        assert all(name in page for name in section["recordings"])
+
+
+def test_a_damaged_claim_is_seen(made: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """The equality above can fail: one recording less is another report."""
+    folder, content = made
+    for path in folder.glob("*robustness*.mcap"):
+        shutil.copy(path, tmp_path)
+    next(iter(sorted(tmp_path.glob("*.mcap")))).unlink()
+    (section,) = report(take(sorted(tmp_path.glob("*.mcap")))).content["experiments"]
+    assert section["problem"] == "1 of its 2 recordings are there; not analysed"
+    assert section not in content["experiments"]
+
+
+def test_what_cannot_be_done_is_said(tmp_path: Path) -> None:
+    nothing = command("report", tmp_path)
+    assert (nothing.exit_code, "holds no recording" in nothing.output) == (66, True)
+    unknown = command("run", "fig3", PAPER)
+    assert (unknown.exit_code, "there is no such experiment" in unknown.output) == (78, True)
+    fixed = command("run", "disturbance", BOARD, "--out", tmp_path)
+    assert fixed.exit_code == 1
+    assert "'shm' has no option for it" in fixed.output
+    listed = command("list")
+    assert listed.exit_code == 0
+    assert "harmonic.amplitude_um=2.0" in listed.output
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path, seed: int) -> None:
+    after_s = float(np.random.default_rng(seed).uniform(0.0, 4.0))
+    check(abort(tmp_path, after_s), tmp_path)

@@ -1,0 +1,145 @@
+"""What is asked of the loop, what a recording says about itself, and what a verdict says."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from rtloop.config import load
+from rtloop.errors import ConfigError
+from rtloop.experiments.derive import about, derived
+from rtloop.experiments.harmonic import bandwidth
+from rtloop.experiments.procedure import Setting
+from rtloop.experiments.registry import EXPERIMENTS, chosen, parameters
+from rtloop.experiments.robustness import Outcome, stable_range
+from rtloop.experiments.step_response import fitted_ringing
+from rtloop.experiments.verdict import Row, Said
+from rtloop.prepare import prepare
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+PAPER = load(DEPLOY / "paper.toml")
+RATE_HZ = 10_000.0
+
+
+def setting(virgin: bool = True) -> Setting:
+    return Setting(PAPER.loop.rate_hz, PAPER.axes[0], virgin)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_a_run_is_a_configuration_that_can_be_prepared(name: str) -> None:
+    experiment = EXPERIMENTS[name]
+    options = experiment.options()
+    run = experiment.runs(options, setting())[-1]
+    plan = prepare(derived(PAPER, "x", name, options.model_dump(mode="json"), run, 1), paced=False).plan
+    assert plan.mode.name.lower() == run.timeline.segments[0].mode
+    assert len(plan.schedule) >= len(run.timeline.segments) - 1
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_limits_and_interlocks_stay_as_they_are(name: str) -> None:
+    base = tomllib.loads(PAPER.text)
+    for run in EXPERIMENTS[name].runs(EXPERIMENTS[name].options(), setting()):
+        made = tomllib.loads(derived(PAPER, "x", name, {}, run, 1).text)
+        for part in ("limits", "interlocks", "feedforward", "controller", "model"):
+            assert made["axis"][0][part] == base["axis"][0][part]
+        assert made["driver"]["channels"] == base["driver"]["channels"]
+        assert made["loop"]["rate_hz"] == base["loop"]["rate_hz"]
+
+
+def test_segments_follow_each_other_without_a_gap() -> None:
+    for experiment in EXPERIMENTS.values():
+        for run in experiment.runs(experiment.options(), setting(virgin=False)):
+            ends = [segment.start_tick + segment.ticks for segment in run.timeline.segments]
+            assert [segment.start_tick for segment in run.timeline.segments] == [0, *ends[:-1]]
+
+
+def test_an_actuator_with_a_memory_is_depolarised_first() -> None:
+    options = EXPERIMENTS["steps"].options()
+    (run,) = EXPERIMENTS["steps"].runs(options, setting(virgin=False))
+    first = run.timeline.references[:100]
+    assert [reference["amplitude"] for reference in first] == pytest.approx(np.arange(10.0, 0.05, -0.1))
+    assert run.timeline.segments[99].mode == "raw"
+    assert run.timeline.segments[100].mode == "closed_loop"
+
+
+def test_a_configuration_says_what_it_is_for() -> None:
+    (run,) = EXPERIMENTS["compensation"].runs(EXPERIMENTS["compensation"].options(), setting())
+    said = about(derived(PAPER, "x", "compensation", {"cycles": 2.0}, run, 1).text)
+    assert said is not None
+    assert said["name"] == "compensation"
+    assert said["parameters"] == {"cycles": 2.0}
+    assert said["segments"][1][:4] == ["sine", "feedforward", 1000, 200_000]
+    assert about(PAPER.text) is None
+    assert about("# rtloop experiment {") is None
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("steps.dwell=1", "steps.dwell: unknown key; did you mean dwell_s"),
+        ("steps.dwell_s=0", "steps.dwell_s: 0"),
+        ("steps.dwell_s", "EXPERIMENT.KEY=VALUE is needed"),
+        ("harmonic.amplitude_um=1", "with one of steps"),
+        ("steps.levels_um=much", "is no value"),
+    ],
+)
+def test_wrong_parameters_are_named(setting: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        parameters([EXPERIMENTS["steps"]], [setting])
+
+
+def test_parameters_and_names() -> None:
+    found = parameters(chosen(["sines", "steps"]), ["steps.levels_um=[1, 2.5]"])
+    assert found["steps"].model_dump()["levels_um"] == (1.0, 2.5)
+    assert [experiment.name for experiment in chosen(["sines", "steps"])] == ["steps", "sines"]
+    with pytest.raises(ConfigError, match=r"'step': there is no such experiment"):
+        chosen(["step"])
+
+
+@pytest.mark.parametrize(
+    ("run", "paper", "model", "verdict"),
+    [
+        (5.0, (4.0, 6.0), 5.1, "as the paper says, and its model"),
+        (5.0, (4.0, 6.0), 9.0, "as the paper says; its model is off (-4 V)"),
+        (5.0, (6.0, 7.0), 5.1, "not as the paper says, but as its own model"),
+        (5.0, (6.0, 7.0), 9.0, "not as the paper says, nor as its model (-4 V)"),
+        (5.0, None, 5.1, "as the paper's model"),
+        (5.0, None, 9.0, "not as the paper's model (-4 V)"),
+        (5.0, (6.0, 7.0), None, "not as the paper says"),
+        (np.nan, (4.0, 6.0), 5.0, "not to be had from this run"),
+        (5.0, None, None, ""),
+    ],
+)
+def test_a_verdict_answers_for_paper_and_model(
+    run: float, paper: tuple[float, float] | None, model: float | None, verdict: str
+) -> None:
+    assert Row("q", "V", run, Said("", paper), model, 0.2).verdict == verdict
+
+
+def test_the_ringing_of_a_known_system_is_found() -> None:
+    omega, zeta = 2 * np.pi * 412.0, 0.0123
+    time_s = np.arange(2000) / RATE_HZ
+    _, x = signal.step(signal.lti([omega**2], [1, 2 * zeta * omega, omega**2]), T=time_s)
+    found = fitted_ringing(40 * x + np.random.default_rng(1).normal(0, 0.01, x.size), RATE_HZ)
+    assert found.frequency_hz == pytest.approx(412.0, abs=0.05)
+    assert found.damping == pytest.approx(zeta, rel=0.01)
+    assert found.level == pytest.approx(40.0, abs=0.01)
+
+
+def test_bandwidth_of_a_first_order_lag() -> None:
+    hz = np.geomspace(0.01, 1000, 200)
+    magnitude = -10 * np.log10(1 + (hz / 50) ** 2)
+    assert bandwidth(np.stack([hz, magnitude], axis=1)) == pytest.approx(50.0, rel=0.01)
+    assert np.isnan(bandwidth(np.stack([hz, 0 * hz], axis=1)))
+
+
+def test_the_range_of_shifts_ends_at_the_first_that_does_not_settle() -> None:
+    trip = {"tick": 1, "causes": ["oscillation"]}
+    outcomes = [Outcome(shift, 2.0 if shift == -6 else 0.1, 20.0, trip if shift == 5 else None) for shift in
+                (-9, -6, -3, 0, 2, 5)]  # fmt: skip
+    assert stable_range(outcomes) == (-3, 2)
+    assert np.isnan(stable_range([Outcome(0.0, 9.0, 20.0, None)])).all()

@@ -1,0 +1,76 @@
+"""The conformance suite on the kernel's own comedi board, whose outputs are looped back to its inputs code for code."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+
+import pytest
+
+from drivers.base import Driver, Wiring
+from drivers.comedi import ComediDriver, ComediOptions
+from drivers.contract import DriverContract
+from drivers.errors import DriverError
+
+LIBRARY = ctypes.CDLL("libcomedi.so.0")
+LIBRARY.comedi_open.restype = ctypes.c_void_p
+INPUTS, PLUS_MINUS_10_V, GROUND = 0, 0, 0
+DEVICE = "/dev/comedi0"
+LSB_V = 20.0 / 65535
+
+
+def comedi(wiring: dict[str, Wiring], **options: object) -> ComediDriver:
+    return ComediDriver(ComediOptions.model_validate(options), wiring, 500.0)
+
+
+def looped_back_v(handle: int, channel: int) -> float:
+    code = ctypes.c_uint()
+    where = INPUTS, channel, PLUS_MINUS_10_V, GROUND
+    assert LIBRARY.comedi_data_read(ctypes.c_void_p(handle), *where, ctypes.byref(code)) == 1
+    return -10.0 + code.value * LSB_V
+
+
+class TestOneAxis(DriverContract):
+    tolerance_v = LSB_V
+    wiring = {"x": Wiring("ai0", "ao0")}  # noqa: RUF012
+
+    def driver(self) -> Driver:
+        return comedi(self.wiring)
+
+    def outputs(self, driver: Driver) -> Sequence[float] | None:
+        """By a handle of the test's own; by the driver's while that has the board to itself."""
+        assert isinstance(driver, ComediDriver)
+        channels = [int(channel.name[2:]) for channel in driver.facts.outputs]
+        if driver._board is not None:
+            return [looped_back_v(driver._board.addresses[0], channel) for channel in channels]
+        handle = LIBRARY.comedi_open(DEVICE.encode())
+        try:
+            return [looped_back_v(handle, channel) for channel in channels]
+        finally:
+            LIBRARY.comedi_close(ctypes.c_void_p(handle))
+
+
+class TestThreeAxes(TestOneAxis):
+    wiring = {"z": Wiring("ai5", "ao5"), "x": Wiring("ai7", "ao7"), "y": Wiring("ai0", "ao0")}  # noqa: RUF012
+
+
+@pytest.mark.parametrize(
+    ("wiring", "options", "message"),
+    [
+        ({"x": Wiring("ai0", "ao8")}, {}, r"ao8 is not a channel of this board; it has ao0 … ao7"),
+        ({"x": Wiring("ai0", "ao0")}, {"input_range_v": [-7, 7]}, r"ai0 has no range \[-7\.0, 7\.0\] V; it has \[-10"),
+        ({"x": Wiring("ai0", "ao0")}, {"device": "/dev/comedi9"}, "/dev/comedi9: No such file or directory"),
+        ({"x": Wiring("ai0", "ao0")}, {"device": "/dev/null"}, "/dev/null: .*no comedi device"),
+    ],
+)  # fmt: skip
+def test_what_the_board_does_not_have(wiring, options, message):
+    with pytest.raises(DriverError, match=message):
+        comedi(wiring, **options).open()
+
+
+def test_a_board_in_use():
+    first = comedi(TestOneAxis.wiring)
+    first.open()
+    with pytest.raises(DriverError, match="/dev/comedi0: subdevice 0: another program uses it"):
+        comedi(TestOneAxis.wiring).open()
+    first.close()

@@ -1,0 +1,142 @@
+"""Supervision over a bus, against frames that cantools makes and reads: a real service, a real board."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools.database
+import pytest
+
+import rtloop
+from tests.drivers.can_bench import free_port
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+
+DBC: Any = cantools.database.load_file(Path(__file__).resolve().parents[2] / "deploy" / "rtloop.dbc")
+GROUP = "239.74.163.78"
+TIMEOUT_S = 20.0
+SECTION = """[service]
+arm = true
+[service.can]
+interface = "udp_multicast"
+channel = "{group}"
+settings = {{ port = {port}, hop_limit = 0 }}
+[recording]"""
+
+
+class Supervisor:
+    """A supervisor on the bus."""
+
+    def __init__(self, port: int) -> None:
+        self.bus = can.Bus(GROUP, "udp_multicast", ignore_config=True, port=port, hop_limit=0)
+
+    def say(self, name: str, **signals: float) -> None:
+        message = DBC.get_message_by_name(name)
+        self.raw(message.frame_id, message.encode(signals))
+
+    def raw(self, identifier: int, data: bytes) -> None:
+        self.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def hear(self, name: str, wanted: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+        """The next such frame that is as wanted."""
+        identifier, deadline_s, last = DBC.get_message_by_name(name).frame_id, time.monotonic() + TIMEOUT_S, None
+        while time.monotonic() < deadline_s:
+            message = self.bus.recv(0.5)
+            if message is not None and message.arbitration_id == identifier:
+                last = DBC.decode_message(identifier, message.data)
+                if wanted(last):
+                    return last
+        raise AssertionError(f"no {name} as wanted; the last was {last}")
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Bench]:
+    section = SECTION.format(group=GROUP, port=port)
+    with Bench(tmp_path_factory.mktemp("can"), ("[recording]", section)) as bench:
+        yield bench
+
+
+@pytest.fixture
+def supervisor(bench: Bench, port: int) -> Iterator[Supervisor]:
+    one = Supervisor(port)
+    yield one
+    one.bus.shutdown()
+
+
+def recorded(bench: Bench, kind: str, tick_from: int) -> list[dict[str, Any]]:
+    def found() -> list[dict[str, Any]]:
+        path = next((bench.folder / "recordings").glob("*.mcap.part"))
+        return [e for e in rtloop.load(path).events if e["kind"] == kind and e["tick"] >= tick_from]
+
+    return wait_for(found, f"{kind} in the file")
+
+
+def test_heartbeat_and_status(bench, supervisor):
+    first = supervisor.hear("Heartbeat")
+    second = supervisor.hear("Heartbeat")
+    assert second["Counter"] == (first["Counter"] + 1) % 2**16
+    assert second["Tick"] > first["Tick"]
+    status = supervisor.hear("Status")
+    assert (str(status["State"]), str(status["Mode"]), status["Causes"]) == ("stopped", "off", 0)
+
+
+def test_modes_setpoints_trip_and_reset_are_followed_and_recorded(bench, supervisor):
+    bench.client.post("/arm")
+    start = bench.ticks
+    supervisor.say("Setpoint", Axis=0, Value=12.5)
+    supervisor.say("Mode", Mode=3)
+    supervisor.hear("Status", lambda s: str(s["State"]) == "running" and str(s["Mode"]) == "closed_loop")
+    wait_for(lambda: bench.status()["axes"]["x"]["reference_um"] == 12.5, "the setpoint")
+    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 5.0}})
+    trip = supervisor.hear("Trip")
+    assert trip["Causes"] & 1 << 10
+    supervisor.hear("Status", lambda s: str(s["State"]) == "tripped" and s["Causes"] & 1 << 10)
+    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 60.0}})
+    wait_for(lambda: not bench.status()["axes"]["x"]["drive_v"], "a ramp")
+    supervisor.say("TripReset", Confirm=1)
+    supervisor.hear("Status", lambda s: str(s["State"]) == "stopped" and not s["Causes"])
+    for kind in ("set_mode", "set_reference", "reset_trip"):
+        who = [event["who"] for event in recorded(bench, kind, start) if event["who"] == "can"]
+        assert who == ["can"], kind
+    assert recorded(bench, "load_law", start)[-1]["who"] == "operator"
+
+
+def test_what_cannot_be_followed_is_counted_and_changes_nothing(bench, supervisor):
+    before = supervisor.hear("Status")["Refused"]
+    reference = bench.status()["axes"]["x"]["reference_um"]
+    bad = [
+        (0x300, b"\0"),  # too short
+        (0x300, bytes(8)),  # too long
+        (0x300, b"\7" + bytes(4)),  # no such axis
+        (0x300, b"\0" + (10_000_000).to_bytes(4, "little")),  # 1000 µm: outside the envelope
+        (0x090, b"\x09"),  # no such mode
+        (0x090, b"\x03"),  # not armed
+        (0x081, b"\x00"),  # not confirmed
+    ]
+    for identifier, data in bad:
+        supervisor.raw(identifier, data)
+    after = supervisor.hear("Status", lambda s: s["Refused"] == before + len(bad))
+    supervisor.raw(0x7FF, b"nobody's")
+    assert supervisor.hear("Status")["Refused"] == after["Refused"]
+    report = bench.status()
+    assert (report["state"], report["mode"], report["axes"]["x"]["reference_um"]) == ("stopped", "off", reference)
+    assert "service.can" not in bench.log()
+    assert "CAN bus udp_multicast" in bench.log()
+
+
+def test_a_bus_that_is_not_there_is_said_once(tmp_path):
+    section = SECTION.replace("udp_multicast", "socketcan").format(group="can-nowhere", port=1)
+    bench = Bench(tmp_path, ("[recording]", section), board=False)
+    service = bench.rtloop("serve", bench.config)
+    assert service.wait(60) == 69, bench.log()
+    assert "service.can: CAN bus socketcan can-nowhere: " in bench.log()
+    assert "Traceback" not in bench.log()

@@ -1,0 +1,90 @@
+"""Ctrl-C at random moments of `rtloop experiment paper`: outputs parked, recordings complete. `make soak-aborts`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import rtloop
+from rtloop.recording.summary import summarise
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT_S = 300.0
+PARKED_V = 1e-6
+LONGEST_S = 40.0
+"""About as long as all experiments take in virtual time."""
+
+
+class Aborted(NamedTuple):
+    """What an interrupted command left behind."""
+
+    exit_code: int
+    error: str
+    recordings: list[Path]
+    report: bool
+
+
+def abort(folder: Path, after_s: float, config: Path = ROOT / "deploy" / "paper.toml") -> Aborted:
+    """Start the experiments, interrupt them `after_s` after the first recording began, wait for the end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rtloop", "experiment", "paper", str(config), "--out", str(folder)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        deadline = time.monotonic() + TIMEOUT_S
+        while not any(folder.glob("*.mcap*")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(after_s)
+        process.send_signal(signal.SIGINT)
+        error = process.communicate(timeout=TIMEOUT_S)[1]
+    finally:
+        process.kill()
+        process.wait()
+    return Aborted(process.returncode, error, sorted(folder.glob("*.mcap")), (folder / "report.html").exists())
+
+
+def check(found: Aborted, folder: Path) -> str:
+    """Raise AssertionError where something is not as it must be; else a line about it."""
+    assert "Traceback" not in found.error, found.error
+    assert found.exit_code in (0, 1), found
+    assert found.exit_code == 0 or "interrupted; outputs are parked" in found.error, found.error
+    assert found.recordings, found.error
+    assert found.report, found.error
+    assert not list(folder.glob("*.part")), "a recording was left unfinished"
+    for path in found.recordings:
+        assert summarise(path)["complete"], path
+    last = found.recordings[int(np.argmax([path.stat().st_mtime for path in found.recordings]))]
+    drive = rtloop.load(last)["x_drive_v"]
+    if found.exit_code:
+        assert drive.size == 0 or abs(drive[-1]) < PARKED_V, f"{last}: ends at {drive[-1]} V"
+    return f"exit {found.exit_code}, {len(found.recordings)} recordings, last {last.name} of {drive.size:,} ticks"
+
+
+def main() -> None:
+    """As many as asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    random = np.random.default_rng(given.seed)
+    for number in range(given.count):
+        after_s = float(random.uniform(0.0, LONGEST_S))
+        with tempfile.TemporaryDirectory() as name:
+            line = check(abort(Path(name), after_s), Path(name))
+        print(f"{number + 1}/{given.count}: after {after_s:.2f} s: {line}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
