@@ -32,7 +32,7 @@ HEARTBEAT_PERIOD_S = 0.02
 POLL_S = 0.005
 LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
-START_TIMEOUT_S = 120.0
+START_TIMEOUT_S = 300.0
 ATTENDED_STALL_S = 2.0
 """Somebody watches a run: a host that stalls one processor for half a second is no reason to end it."""
 START_TIME_FIELD = 19
