@@ -1,64 +1,108 @@
-"""`python -m tests.benchmarks [NAME …] [--json FILE]`: run the benchmarks named, or all, and print a table."""
+"""`python -m tests.benchmarks [NAME …]`: run the benchmarks named, or all, print their figures and keep them."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-from collections.abc import Mapping
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hil.compiled import cpu_identity
-from tests.benchmarks import kernels, processes
+from tests.benchmarks import (
+    backends,
+    history,
+    kernels,
+    lateness,
+    linear,
+    memory,
+    overhead,
+    page,
+    processes,
+    rates,
+    recordings,
+    writers,
+)
+from tests.benchmarks.measure import FULL, QUICK, Effort, NotMeasured
+from tests.benchmarks.targets import Figure, figures, number
 
-BENCHMARKS = {
+BENCHMARKS: dict[str, Callable[[Effort], dict[str, Any]]] = {
     "law": kernels.law,
     "loop": kernels.loop,
     "axes": kernels.axes,
+    "overhead": overhead.overhead,
+    "linear": linear.linear,
+    "backends": backends.backends,
+    "writers": writers.writers,
+    "lateness": lateness.lateness,
+    "latency": lateness.latency,
+    "rates": rates.rates,
     "recorded": processes.recorded,
     "recorder": processes.recorder,
+    "replay": recordings.replay,
+    "export": recordings.export,
     "start": processes.start,
+    "memory": memory.memory,
 }
+NOT_MEASURED, FAILED = "not measured", "failed"
 
 
-def rows(results: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Name and text of every figure, a spread as its median and (smallest … largest)."""
-    found: list[tuple[str, str]] = []
-    for name, value in results.items():
-        if isinstance(value, Mapping) and "median" in value:
-            spread = f"{value['median']:9.3f}   ({value['minimum']:.3f} … {value['maximum']:.3f})"
-            found.append((prefix + name, spread))
-        elif isinstance(value, Mapping):
-            found += rows(value, f"{prefix}{name}  ")
-        else:
-            found.append((prefix + name, f"{value:9.3f}"))
-    return found
-
-
-def main() -> None:
-    """Print each benchmark's figures as soon as they are known."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description="\n".join(_descriptions()))
+def main() -> int:
+    """Print each benchmark's figures as soon as they are known; 1 where one failed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(BENCHMARKS)}; without: all")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE too")
-    arguments = parser.parse_args()
-    unknown = [name for name in arguments.names if name not in BENCHMARKS]
+    parser.add_argument("--quick", action="store_true", help="a few short repetitions: whether it works, not how fast")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write this run's figures to FILE too")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="run nothing: put the newest figures into FILE")
+    given = parser.parse_args()
+    unknown = [name for name in given.names if name not in BENCHMARKS]
     if unknown:
         parser.error(f"{', '.join(unknown)}: there are {', '.join(BENCHMARKS)}")
-    results: dict[str, Any] = {}
-    for name in arguments.names or BENCHMARKS:
-        results[name] = BENCHMARKS[name]()
-        for figure, text in rows(results[name]):
-            print(f"{name:9} {figure:28} {text}", flush=True)
-    if arguments.json:
-        host = {"cpu": cpu_identity(), "cpus": os.cpu_count(), "kernel": platform.release()}
-        arguments.json.write_text(json.dumps({"host": host, **results}, indent=2) + "\n")
+    if given.page and (given.names or given.quick or given.json):
+        parser.error("--page runs nothing: it goes without NAME, --quick and --json")
+    if given.page:
+        try:
+            page.rewrite(given.page, history.newest(), BENCHMARKS)
+        except (OSError, page.NoPlace) as error:
+            parser.error(str(error))
+        return 0
+    entries = _run(given.names or list(BENCHMARKS), QUICK if given.quick else FULL)
+    if given.json:
+        given.json.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    return 1 if any(FAILED in entry["results"] for entry in entries) else 0
 
 
-def _descriptions() -> list[str]:
-    return [f"{name}: {function.__doc__}" for name, function in BENCHMARKS.items()]
+def _run(names: list[str], effort: Effort) -> list[dict[str, Any]]:
+    around, entries = history.surroundings(), []
+    for number_, name in enumerate(names, start=1):
+        print(f"{number_} of {len(names)}: {name}", file=sys.stderr, flush=True)
+        begin_s = time.monotonic()
+        try:
+            results = BENCHMARKS[name](effort)
+        except NotMeasured as reason:
+            results = {NOT_MEASURED: str(reason)}
+        except (AssertionError, OSError, RuntimeError) as error:  # the figures of the others must not go with it
+            results = {FAILED: str(error)}
+        _clear_line()
+        entries.append(history.entry(name, effort, results, time.monotonic() - begin_s, around))
+        history.append(entries[-1])
+        for figure in figures(name, results):
+            print(f"{name:9} {_line(figure)}", flush=True)
+    return entries
+
+
+def _line(figure: Figure) -> str:
+    if isinstance(figure.value, str):
+        return f"{figure.name:36} {figure.value}"
+    span = "" if figure.low is None or figure.high is None else f"({number(figure.low)} … {number(figure.high)})"
+    return f"{figure.name:36} {number(figure.value):>10}  {span:24} {figure.verdict}".rstrip()
+
+
+def _clear_line() -> None:
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

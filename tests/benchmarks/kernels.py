@@ -11,13 +11,13 @@ from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, Records, initial_state, records
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
-from tests.benchmarks.measure import Spread, alternately, seconds
+from tests.benchmarks.measure import Effort, Spread, alternately, seconds
 from tests.benchmarks.scenario import NativeLoop, PythonLoop, paper_plan, plan_of_axes, tripping_plan
 
 CHECKED_TICKS = 200_000
 CHUNK = 50_000
 TIMED_TICKS = 400_000
-AXES_TICKS, AXES_REPEATS = 100_000, 12
+AXES_TICKS = 100_000
 WANTED = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.RAMPING | Flag.TRIP_POSITION
 
 
@@ -75,8 +75,8 @@ def check_law(coefficients: Records, adc_v: np.ndarray[Any, Any], references: np
         raise Differs(f"the law's check saw only {Flag(int(flags))!r}")
 
 
-def law() -> dict[str, Any]:
-    """ns a tick of the law, closed loop, beside C."""
+def law(effort: Effort) -> dict[str, Any]:
+    """ns a tick of the law alone in closed loop, beside the same in C; both must give the same bits."""
     coefficients, adc_v, references = law_inputs(CHECKED_TICKS)
     check_law(coefficients, adc_v, references)
     modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
@@ -88,6 +88,7 @@ def law() -> dict[str, Any]:
     pair = alternately(
         lambda: run_law(coefficients, axes, loop[0], adc_v, references, modes, conditions, out),
         lambda: native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, out),
+        effort.pairs,
     )
     if loop["mode"][0] != Mode.CLOSED_LOOP or axes["controller"].tobytes() != native_axes["controller"].tobytes():
         raise Differs("the law left closed loop, or its states differ")
@@ -108,8 +109,8 @@ def check_loop() -> None:
         raise Differs(f"the loop's check saw only {Flag(flags)!r}")
 
 
-def loop() -> dict[str, Any]:
-    """ns a tick of the whole unpaced loop with the rig, without recording, beside C."""
+def loop(effort: Effort) -> dict[str, Any]:
+    """ns a tick of the whole unpaced loop with the rig, without recording, beside the same in C, equal in bits."""
     check_loop()
     plan = paper_plan()
     loops = PythonLoop(plan), NativeLoop(plan)
@@ -119,19 +120,19 @@ def loop() -> dict[str, Any]:
         ticks[number] += TIMED_TICKS
         loops[number].run(ticks[number])
 
-    pair = alternately(lambda: further(0), lambda: further(1))
+    pair = alternately(lambda: further(0), lambda: further(1), effort.pairs)
     _require_equal("loop, at the end", loops[0].rows, loops[1].rows)
     period_ns = 1e9 / plan.pacing.rate_hz
     result = _compared(pair, TIMED_TICKS)
     return result | {"times_real_time": period_ns / result["ns_per_tick"]["median"]}
 
 
-def axes() -> dict[str, Any]:
+def axes(effort: Effort) -> dict[str, Any]:
     """ns a tick of the unpaced loop with 1, 2, 4 and 8 axes, and what a further axis costs."""
     counts = 1, 2, 4, 8
     loops = {count: PythonLoop(plan_of_axes(count)) for count in counts}
     taken: dict[int, list[float]] = {count: [] for count in counts}
-    for repeat in range(1, AXES_REPEATS + 1):
+    for repeat in range(1, effort.pairs + 2):
         for count, loop in loops.items():
             until = repeat * AXES_TICKS
             taken[count].append(seconds(lambda loop=loop, until=until: loop.run(until)) * 1e9 / AXES_TICKS)

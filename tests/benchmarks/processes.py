@@ -1,68 +1,142 @@
-"""The whole program: `rtloop run` as an operator starts it, with loop, recorder and supervisor as processes."""
+"""The whole program: `rtloop` as an operator starts it, with loop, recorder and supervisor as processes."""
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.measure import Spread
-from tests.benchmarks.scenario import PAPER
+from tests.benchmarks.configurations import PAPER, ROOT, TEXT, write
+from tests.benchmarks.measure import Effort, NotMeasured, spread
 
-ROOT = Path(__file__).parents[2]
 RATE_HZ = 10_000
-REPEATS = 3
 UNPACED_S, PACED_S = 100.0, 10.0
+AROUND_S, SETTLE_S = 3.0, 1.0
+"""A run lasts so much longer than it is looked at; it is looked at so long after the recorder has its file."""
 ONE_TICK_S = 1 / RATE_HZ
+TIMEOUT_S = 600.0
 
 
-def run(duration_s: float, *, paced: bool) -> dict[str, Any]:
-    """The summary of one run of the paper's loop, and its wall time as `wall_s`."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "rtloop", "run", str(PAPER), "--json"]
-        command += ["--duration", str(duration_s), "--out", folder, *([] if paced else ["--unpaced"])]
-        begin = time.perf_counter()
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        return json.loads(done.stdout) | {"wall_s": time.perf_counter() - begin}
+class Failed(RuntimeError):
+    """A command ended with another code than 0."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
 
 
-def recorded() -> dict[str, Any]:
+def rtloop(*arguments: str | Path, environment: Mapping[str, str] | None = None) -> tuple[dict[str, Any], float]:
+    """What a command with --json prints, and its wall time in s. Raises Failed."""
+    command = [sys.executable, "-m", "rtloop", *map(str, arguments), "--json"]
+    begin = time.perf_counter()
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | (environment or {}), capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    wall_s = time.perf_counter() - begin
+    if done.returncode != 0:
+        said = done.stderr.strip() or done.stdout
+        raise Failed(f"{' '.join(command)} ended with {done.returncode}: {said}", done.returncode)
+    return json.loads(done.stdout), wall_s
+
+
+def run(duration_s: float, *, paced: bool, text: str = TEXT) -> dict[str, Any]:
+    """The summary of one run of a configuration, and its wall time as `wall_s`; the recording is gone afterwards."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        config = PAPER if text is TEXT else write(folder, text)
+        pacing = [] if paced else ["--unpaced"]
+        summary, wall_s = rtloop("run", config, "--duration", str(duration_s), "--out", folder, *pacing)
+    if summary["ticks_lost"] or summary["ticks_logged"] != round(duration_s * summary["rate_hz"]):
+        raise RuntimeError(f"{summary['ticks_lost']} ticks lost, {summary['ticks_logged']} logged")
+    return summary | {"wall_s": wall_s}
+
+
+def paced_run(duration_s: float, text: str = TEXT) -> dict[str, Any]:
+    """The same, paced. Raises NotMeasured where the host grants no real-time scheduling."""
+    summary = run(duration_s, paced=True, text=text)
+    if summary["realtime"]["scheduler"] != "SCHED_FIFO":
+        raise NotMeasured(f"the host refused {'; '.join(summary['realtime']['refused'])}")
+    return summary
+
+
+def recorded(effort: Effort) -> dict[str, Any]:
     """Unpaced with recording: times real time from the first tick on, the end of a run of one tick taken off."""
     run(ONE_TICK_S, paced=False)
-    rates = []
-    for _ in range(REPEATS):
+    rates, duration_s = [], effort.seconds(UNPACED_S)
+    for _ in range(effort.pairs):
         end_s = _since_first_tick(run(ONE_TICK_S, paced=False))
-        summary = run(UNPACED_S, paced=False)
-        if summary["ticks_lost"] or summary["ticks_logged"] != round(UNPACED_S * RATE_HZ):
-            raise AssertionError(f"{summary['ticks_lost']} ticks lost, {summary['ticks_logged']} logged")
-        rates.append(UNPACED_S / (_since_first_tick(summary) - end_s))
-    return {"times_real_time": Spread.of(rates)._asdict()}
+        rates.append(duration_s / (_since_first_tick(run(duration_s, paced=False)) - end_s))
+    return {"times_real_time": spread(rates)}
 
 
 def _since_first_tick(summary: dict[str, Any]) -> float:
     return summary["wall_s"] - summary["startup_s"]
 
 
-def recorder() -> dict[str, Any]:
-    """At 10 kHz, paced: the recorder's share of a processor in %, its start taken off, and bytes a tick."""
-    shares, sizes = [], []
-    for _ in range(REPEATS):
-        start_s = run(ONE_TICK_S, paced=True)["recorder"]["cpu_s"]
-        summary = run(PACED_S, paced=True)
-        shares.append(100 * (summary["recorder"]["cpu_s"] - start_s) / PACED_S)
-        sizes.append(summary["bytes_per_tick"])
-    return {"cpu_percent": Spread.of(shares)._asdict(), "bytes_per_tick": Spread.of(sizes)._asdict()}
+def recorder(effort: Effort) -> dict[str, Any]:
+    """At 10 kHz, paced: the share of a processor in % that the recorder takes while it records, by the kernel's account
+    of its thread, and bytes a tick of the whole file."""
+    shares, sizes, duration_s = [], [], effort.seconds(PACED_S)
+    for _ in range(effort.pairs):
+        with ThreadPoolExecutor(1) as pool:
+            running = pool.submit(run, duration_s + AROUND_S, paced=True)
+            shares.append(_recorder_share(running, duration_s))
+            sizes.append(running.result()["bytes_per_tick"])
+    return {"cpu_percent": spread(shares), "bytes_per_tick": spread(sizes)}
 
 
-def start() -> dict[str, Any]:
+def _recorder_share(running: Future[Any], duration_s: float) -> float:
+    """% of a processor over `duration_s`, from when the recorder of our only run has a file to write to."""
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while not (pids := _recorders_of(os.getpid())):
+        if running.done() or time.monotonic() > deadline_s:
+            raise RuntimeError(f"recorder: no process was seen; the run ended with {running.exception()}")
+        time.sleep(0.05)
+    time.sleep(SETTLE_S)
+    begin_s, begin_ns = time.monotonic(), _cpu_ns(pids[0])
+    time.sleep(duration_s)
+    return (_cpu_ns(pids[0]) - begin_ns) / (time.monotonic() - begin_s) / 1e7
+
+
+def _recorders_of(ancestor: int) -> list[int]:
+    """Recorders among the grandchildren that have opened a recording."""
+    children = [child for pid in _children(ancestor) for child in _children(pid)]
+    return [pid for pid in children if any(link.endswith(".mcap.part") for link in _open_files(pid))]
+
+
+def _children(pid: int) -> list[int]:
+    found = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):
+            found += [int(child) for child in task.read_text().split()]
+    return found
+
+
+def _open_files(pid: int) -> list[str]:
+    links = []
+    for fd in Path(f"/proc/{pid}/fd").glob("*"):
+        with suppress(OSError):
+            links.append(os.readlink(fd))
+    return links
+
+
+def _cpu_ns(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0])
+
+
+def start(effort: Effort) -> dict[str, Any]:
     """Warm start: seconds of a whole run of one tick, and from its beginning to the first tick as it reports them."""
     run(ONE_TICK_S, paced=True)
-    summaries = [run(ONE_TICK_S, paced=True) for _ in range(REPEATS)]
+    summaries = [run(ONE_TICK_S, paced=True) for _ in range(effort.pairs)]
     return {
-        "run_of_one_tick_s": Spread.of([summary["wall_s"] for summary in summaries])._asdict(),
-        "to_first_tick_s": Spread.of([summary["startup_s"] for summary in summaries])._asdict(),
+        "run_of_one_tick_s": spread([summary["wall_s"] for summary in summaries]),
+        "to_first_tick_s": spread([summary["startup_s"] for summary in summaries]),
     }

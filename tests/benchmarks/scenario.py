@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,8 @@ from rtloop.engine.plan import Plan
 from rtloop.law.layout import Records
 from rtloop.prepare import prepare
 from tests.benchmarks import native
+from tests.benchmarks.configurations import PAPER
 
-PAPER = Path(__file__).parents[2] / "deploy" / "paper.toml"
 NO_RECORDER = 1 << 60
 
 

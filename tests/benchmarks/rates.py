@@ -1,0 +1,128 @@
+"""How fast the loop can be paced before ticks overrun."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import rtloop
+from rtloop.errors import LoopFault
+from rtloop.signals import Flag
+from tests.benchmarks import plain_driver
+from tests.benchmarks.board import board, on_a_board
+from tests.benchmarks.configurations import RIG, SINE, STEPS, at_rate, changed, last_cpu, pinned, write
+from tests.benchmarks.measure import Effort, NotMeasured, say
+from tests.benchmarks.processes import Failed
+from tests.benchmarks.processes import rtloop as command
+
+RATES_HZ = (5_000, 10_000, 20_000, 30_000, 50_000, 70_000, 100_000, 140_000, 200_000)
+WINDOW_NS = 1e9
+WINDOWS = 7
+ALLOWED = 0.001
+SPIN_US = 60.0
+GENTLE = ("gain = 0.016", "gain = 0.004")
+"""The paper's controller has hardly any margin: with another plant, or a board's delay, it would trip."""
+PLAIN = f"""[driver]
+kind = "{plain_driver.LagDriver.kind}"
+[driver.channels.x]
+input = "in"
+output = "out"
+um_per_v = {plain_driver.SENSOR_UM_PER_V}
+
+"""
+
+Signal = np.ndarray[Any, Any]
+Configure = Callable[[list[tuple[str, str]]], str]
+
+
+class Late(NamedTuple):
+    """Shares in the median one-second window: ticks that overran, and periods that were overrun or skipped."""
+
+    overrun: float
+    lost: float
+
+
+NOT_KEPT = Late(1.0, 1.0)
+
+
+def late_shares(deadline_ns: Signal, flags: Signal, missed: Signal) -> Late:
+    """Of the signals of a recording, its last window, which is not whole, left out."""
+    window = (deadline_ns / WINDOW_NS).astype(np.int64)
+    overrun = (flags.astype(np.int64) & int(Flag.OVERRUN)) != 0
+    ticks, late, skipped = (np.bincount(window, weights)[:-1] for weights in (None, overrun, missed))
+    due = ticks + skipped
+    shares = (late[due > 0] / np.maximum(ticks, 1)[due > 0], (late + skipped)[due > 0] / due[due > 0])
+    return Late(*(float(np.median(share)) for share in shares))
+
+
+def highest_rates(configure: Configure, spin_us: float, windows: int) -> dict[str, float]:
+    """Hz, for each share: the last rate of the ladder before the first one that is not kept; 0 where none is."""
+    highest, kept = dict.fromkeys(Late._fields, 0.0), set(Late._fields)
+    for rate_hz in RATES_HZ:
+        text = configure([at_rate(rate_hz), (STEPS, SINE), GENTLE, *pinned(last_cpu(), spin_us)])
+        late = _run(text, windows + 0.5)
+        say(f"{rate_hz} Hz, spin_us = {spin_us:g}: overrun {late.overrun:.3%}, overrun or skipped {late.lost:.3%}")
+        kept &= {name for name, share in late._asdict().items() if share < ALLOWED}
+        highest |= dict.fromkeys(kept, float(rate_hz))
+        if not kept:
+            break
+    return {f"{name}_hz": rate_hz for name, rate_hz in highest.items()}
+
+
+def _run(text: str, duration_s: float) -> Late:
+    """The shares of a run; all of it where ticks were lost to the recording, or an interlock ended the run."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        plain_driver.install(folder)
+        arguments = "run", write(folder, text), "--duration", str(duration_s), "--out", folder
+        try:
+            summary, _ = command(*arguments, environment={"PYTHONPATH": str(folder)})
+        except Failed as error:
+            if error.code != LoopFault.exit_code:
+                raise
+            say(str(error))
+            return NOT_KEPT
+        if summary["realtime"]["scheduler"] != "SCHED_FIFO":
+            raise NotMeasured(f"the host refused {'; '.join(summary['realtime']['refused'])}")
+        if summary["ticks_lost"]:
+            return NOT_KEPT
+        signals = rtloop.load(summary["recording"]).read("deadline_ns", "flags", "periods_missed")
+    return late_shares(*signals)
+
+
+@contextmanager
+def _sim() -> Iterator[Configure]:
+    yield lambda changes: changed(*changes)
+
+
+@contextmanager
+def _plain() -> Iterator[Configure]:
+    yield lambda changes: changed((RIG, PLAIN), *changes)
+
+
+@contextmanager
+def _shm() -> Iterator[Configure]:
+    with board() as file:
+        yield lambda changes: on_a_board(file, *changes)
+
+
+def rates(effort: Effort) -> dict[str, Any]:
+    """The highest rate in Hz, of a ladder from 5 kHz to 200 kHz, at which in the median one-second window less than 0.1
+    % of the ticks `overrun` (the record's flag: the tick ended after its period), and the highest at which less than
+    0.1 % of the periods were `lost`, overrun or skipped: a tick that a stall delays by many periods is one overrun, and
+    they are all lost. `rtloop run` with the paper's law (a quarter of its gain) and with recording, on the simulated
+    rig, a driver in plain Python, and a board in shared memory with a clock of its own at 10 kHz; sleeping, and
+    spinning for the last 60 µs, which above 16 kHz is always: then the kernel takes 5 % for whatever else waits for
+    this processor."""
+    windows = max(round(effort.seconds(WINDOWS)), 2)
+    found: dict[str, Any] = {}
+    for name, kind in {"sim": _sim, "python": _plain, "shm": _shm}.items():
+        with kind() as configure:
+            spins = {"sleeping": 0.0, "spinning": SPIN_US}
+            found[name] = {way: highest_rates(configure, spin_us, windows) for way, spin_us in spins.items()}
+    return found

@@ -1,0 +1,70 @@
+"""The least that a driver and a clock can do, as C functions: what the engine costs shows best around these."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import types
+
+from drivers.base import Channel, Facts, Pointers
+from hil.compiled import cfunc
+from hil.pointers import SIGNATURE, address_pointer, carray
+from rtloop.engine.clock import CLOCK_MONOTONIC, CONTEXT, SECOND_NS, Clock, clock_context, paced_now
+
+TAPE = np.dtype([("address", np.int64), ("count", np.int64), ("index", np.int64), ("written_v", np.float64)])
+
+_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+
+
+@cfunc(SIGNATURE)
+def tape_read(context, values):
+    """The next reading [V], age 0, and two observed signals that are 0; from the beginning again after the last."""
+    tape = carray(context, 1, TAPE)[0]
+    readings = carray(address_pointer(tape.address), tape.count, np.float64)
+    out = carray(values, 4)
+    out[0], out[1], out[2], out[3] = readings[tape.index], 0.0, 0.0, 0.0
+    tape.index = tape.index + 1 if tape.index + 1 < tape.count else 0
+    return 0
+
+
+@cfunc(SIGNATURE)
+def tape_write(context, values):
+    """Keep what was written."""
+    carray(context, 1, TAPE)[0].written_v = carray(values, 1)[0]
+    return 0
+
+
+@cfunc(SIGNATURE)
+def due_wait(context, timing):
+    """The paced clock's reading without its wait: every tick is due when it is asked for."""
+    clock = carray(context, 1, CONTEXT)[0]
+    out = carray(timing, 4)
+    _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
+    now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    out[0] = out[1] = float(now_ns - clock.start_ns)
+    out[2] = 0.0
+    out[3] = float(now_ns)
+    clock.index += 1
+    return 0
+
+
+class Tape:
+    """Readings as a driver, with the facts of the simulated rig."""
+
+    facts = Facts((Channel("adc0"),), (Channel("dac0"),), ("x_true_position_um", "x_hysteresis_um"), real=False)
+
+    def __init__(self, readings_v: npt.NDArray[np.float64]) -> None:
+        self._readings_v, self._context = readings_v, np.zeros(1, TAPE)
+        self._context["address"], self._context["count"] = readings_v.ctypes.data, readings_v.size
+
+    def pointers(self) -> Pointers:
+        """Of the compiled functions."""
+        return Pointers(self._context.ctypes.data, tape_read.address, tape_write.address)
+
+
+def due_clock(rate_hz: float) -> tuple[Clock, np.recarray[Any, Any]]:
+    """Reads the clock as often as the paced one, and never waits; the context must be kept."""
+    context = clock_context(rate_hz)
+    return Clock(due_wait.address, paced_now.address, context.ctypes.data), context

@@ -1,0 +1,76 @@
+"""What the figures are to be: named as the results name them, from the benchmark to the figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+
+class Target(NamedTuple):
+    """A limit; `most` False is a least."""
+
+    value: float
+    most: bool = True
+
+    def met_by(self, figure: float) -> bool:
+        """Whether a figure keeps it."""
+        return figure <= self.value if self.most else figure >= self.value
+
+    def __str__(self) -> str:
+        return f"{'≤' if self.most else '≥'} {self.value:g}"
+
+
+TARGETS = {
+    "lateness sleeping p50_ratio": Target(1.1),
+    "lateness sleeping p99_ratio": Target(1.3),
+    "lateness spinning p50_ratio": Target(0.05),
+    "latency sleeping read_to_write_us": Target(0.3),
+    "latency spinning read_to_write_us": Target(0.3),
+    "overhead engine_ns": Target(100.0),
+    "linear times_faster_than_forced_response": Target(20.0, most=False),
+    "linear times_faster_than_dlsim": Target(20.0, most=False),
+    "recorder cpu_percent": Target(1.5),
+    "recorder bytes_per_tick": Target(80.0),
+    "writers foxglove cpu_ratio": Target(1.0),
+    "writers mcap cpu_ratio": Target(1.0),
+    "writers h5py_lzf cpu_ratio": Target(1.0),
+    "replay times_real_time": Target(60.0, most=False),
+    "rates sim spinning overrun_hz": Target(100_000.0, most=False),
+}
+
+
+class Figure(NamedTuple):
+    """One row of a table: a name, its value (or why there is none), its range over the repetitions, its target."""
+
+    name: str
+    value: float | str
+    low: float | None
+    high: float | None
+    target: Target | None
+
+    @property
+    def verdict(self) -> str:
+        """The target and whether it is met; empty without one."""
+        if self.target is None or isinstance(self.value, str):
+            return ""
+        return f"{self.target} {'met' if self.target.met_by(self.value) else 'MISSED'}"
+
+
+def figures(benchmark: str, results: Mapping[str, Any]) -> list[Figure]:
+    """The rows of a benchmark's results, in their order."""
+    return [Figure(name, *value, TARGETS.get(f"{benchmark} {name}")) for name, value in _leaves(results)]
+
+
+def _leaves(results: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, tuple[Any, Any, Any]]]:
+    for name, value in results.items():
+        if isinstance(value, Mapping) and "median" in value:
+            yield prefix + name, (value["median"], value["minimum"], value["maximum"])
+        elif isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name} ")
+        else:
+            yield prefix + name, (value, None, None)
+
+
+def number(value: float) -> str:
+    """Four digits, without an exponent."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"

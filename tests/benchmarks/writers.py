@@ -1,0 +1,178 @@
+"""What it costs to write ticks to a file, beside the fastest writers of MCAP and HDF5 that are known."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as StockWriter
+
+from rtloop.recording import format
+from rtloop.recording.chunkfile import LEVEL
+from rtloop.recording.contents import Message
+from rtloop.recording.writer import Writer
+from tests.benchmarks.kernels import Differs
+from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, spread
+from tests.benchmarks.scenario import PythonLoop, paper_plan
+
+TICKS = 200_000
+SLICE = 25_000
+START_UNIX_NS = 1_700_000_000_000_000_000
+SCHEMA = "rtloop.Tick"
+
+
+class Stream:
+    """The same ticks as rows, and as encoded messages with their times."""
+
+    def __init__(self, ticks: int) -> None:
+        plan = paper_plan()
+        self.columns, loop = list(plan.columns), PythonLoop(plan)
+        self.rows = np.empty((ticks, len(self.columns)))
+        for begin in range(0, ticks, SLICE):
+            loop.run(begin + SLICE)
+            slots = np.arange(begin, begin + SLICE) % loop.rows.shape[0]
+            self.rows[begin : begin + SLICE] = loop.rows[slots]
+        _with_times(self.rows)
+        self.chunk = format.chunk_rows(self.columns)
+        self.blocks = [self.rows[begin : begin + self.chunk] for begin in range(0, ticks, self.chunk)]
+        records = format.blank_ticks(self.columns, ticks)
+        format.fill_ticks(records, self.columns, self.rows, START_UNIX_NS)
+        data, size = records.tobytes(), records.dtype.itemsize
+        head = records.dtype.fields["_publish_time"][1] + 8  # type: ignore[index]
+        self.messages = [data[begin + head : begin + size] for begin in range(0, len(data), size)]
+        self.times = records["_log_time"].tolist()
+        self.schema = format.tick_schema(self.columns)
+
+
+def _with_times(rows: np.ndarray[Any, Any]) -> None:
+    """Measured times in place of the NaN of virtual time, in whole ns as a clock gives them: they compress badly."""
+    random = np.random.default_rng(1)
+    for column, typical_ns in ((2, 15_000), (3, 350), (4, 230), (5, 140), (6, 850)):
+        rows[:, column] = np.rint(random.gamma(20.0, typical_ns / 20.0, len(rows))) * 1e-3
+
+
+def rtloop(stream: Stream, path: Path) -> None:
+    """The recorder's writer, with the index of messages that it writes by default."""
+    writer = Writer(path, {"columns": stream.columns}, START_UNIX_NS, message_index=True)
+    for block in stream.blocks:
+        writer.write_ticks(block)
+    writer.finish(lambda ticks: Message(format.EVENTS, stream.times[-1], b"{}"))
+
+
+def foxglove(stream: Stream, path: Path) -> None:
+    """foxglove-sdk, in Rust: message by message, compressed in the same thread."""
+    import foxglove as sdk
+    from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+
+    options = MCAPWriteOptions(
+        compression=MCAPCompression.Zstd,
+        compression_level=LEVEL,
+        compression_threads=0,
+        chunk_size=format.MAX_CHUNK_BYTES,
+    )
+    context = sdk.Context()
+    writer = sdk.open_mcap(path, context=context, writer_options=options)
+    schema = sdk.Schema(name=SCHEMA, encoding="protobuf", data=stream.schema)
+    channel = sdk.Channel("/ticks", message_encoding="protobuf", schema=schema, context=context)
+    for message, log_time in zip(stream.messages, stream.times, strict=True):
+        channel.log(message, log_time=log_time)
+    writer.close()
+
+
+def mcap(stream: Stream, path: Path) -> None:
+    """The stock writer in Python, message by message."""
+    with path.open("wb") as file:
+        writer = StockWriter(file, chunk_size=format.MAX_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start()
+        schema = writer.register_schema(SCHEMA, "protobuf", stream.schema)
+        channel = writer.register_channel("/ticks", "protobuf", schema)
+        for message, log_time in zip(stream.messages, stream.times, strict=True):
+            writer.add_message(channel, log_time, message, log_time)
+        writer.finish()
+
+
+def h5py_plain(stream: Stream, path: Path) -> None:
+    """HDF5 without compression, in chunks of rows."""
+    _h5py(stream, path, chunks=(stream.chunk, len(stream.columns)))
+
+
+def h5py_lzf(stream: Stream, path: Path) -> None:
+    """HDF5, each column in chunks of its own, bytes shuffled, LZF: the fastest that comes to our size."""
+    _h5py(stream, path, chunks=(stream.chunk, 1), compression="lzf", shuffle=True)
+
+
+def _h5py(stream: Stream, path: Path, **options: Any) -> None:
+    import h5py
+
+    columns = len(stream.columns)
+    with h5py.File(path, "w") as file:
+        ticks = file.create_dataset("ticks", (0, columns), "f8", maxshape=(None, columns), **options)
+        for block in stream.blocks:
+            begin = len(ticks)
+            ticks.resize(begin + len(block), axis=0)
+            ticks[begin:] = block
+
+
+WRITERS = {
+    "rtloop": rtloop, "foxglove": foxglove, "mcap": mcap, "h5py_plain": h5py_plain, "h5py_lzf": h5py_lzf
+}  # fmt: skip
+
+
+def writers(effort: Effort) -> dict[str, Any]:
+    """CPU time of writing the same ticks from memory to a file, open to close, by all threads of the process: µs a
+    tick, which at 10 kHz is % of a processor, and bytes a tick. The ticks are a closed loop's, its measured times drawn
+    at random, for they compress badly and virtual time has none. `rtloop` is the recorder's writer: it encodes rows.
+    `foxglove` (foxglove-sdk, in Rust) and `mcap` (the stock Python writer) write the same protobuf messages with zstd
+    and chunks of 1 MiB; their messages are encoded beforehand, which favours them. `h5py` writes the same rows in
+    blocks, without compression and with LZF over shuffled columns, which comes to a similar size. Ratios: rtloop over
+    the other. HDF5 without compression takes more than twice the bytes, and no target compares with it."""
+    try:
+        import foxglove  # noqa: F401
+        import h5py  # noqa: F401
+    except ImportError as error:
+        raise NotMeasured(f"{error.name} is not installed; the extra `bench` has it") from None
+    stream = Stream(TICKS)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "ticks"
+        actions = {name: lambda write=write: _written(write, stream, path) for name, write in WRITERS.items()}
+        for name, action in actions.items():  # imports, and the first use of everything
+            action()
+            _require_whole(name, stream, path)
+        taken = in_turn(actions, effort.pairs)
+    found: dict[str, Any] = {}
+    cpu_us = {name: [1e6 * cpu_s / TICKS for cpu_s, _ in results] for name, results in taken.items()}
+    for name, results in taken.items():
+        found[name] = {"cpu_us_per_tick": spread(cpu_us[name]), "bytes_per_tick": results[0][1] / TICKS}
+        if name != "rtloop":
+            found[name]["cpu_ratio"] = ratio(cpu_us["rtloop"], cpu_us[name])
+    return found
+
+
+def _require_whole(name: str, stream: Stream, path: Path) -> None:
+    """The file has every tick, as the library of its format sees it. Raises Differs."""
+    if name.startswith("h5py"):
+        import h5py
+
+        with h5py.File(path) as file:
+            whole = np.array_equal(file["ticks"][()], stream.rows)  # type: ignore[index]
+    else:
+        with path.open("rb") as file:
+            found = [message.data for _, _, message in make_reader(file).iter_messages(topics=["/ticks"])]
+        whole = found == stream.messages
+    if not whole:
+        raise Differs(f"writers: the file of {name} does not hold the ticks")
+
+
+def _written(write: Callable[[Stream, Path], None], stream: Stream, path: Path) -> tuple[float, int]:
+    """CPU seconds, and bytes of the file."""
+    path.unlink(missing_ok=True)
+    begin_s = time.process_time()
+    write(stream, path)
+    cpu_s = time.process_time() - begin_s
+    return cpu_s, path.stat().st_size
