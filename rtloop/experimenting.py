@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import click
 
@@ -19,6 +18,7 @@ from hil.options import RigOptions
 from rtloop.config import Configuration, load
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
+from rtloop.experiments.interruption import Interruption
 from rtloop.experiments.page import page
 from rtloop.experiments.procedure import Experiment, Run, Setting
 from rtloop.experiments.registry import chosen, parameters
@@ -43,35 +43,6 @@ class Planned(NamedTuple):
     def label(self) -> str:
         """For people."""
         return f"{self.experiment.name} {self.run.label}".rstrip()
-
-
-class Interruption:
-    """SIGINT and SIGTERM stop the present run and all that would follow; a second one ends what is no run."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._supervisor: Supervisor | None = None
-
-    def __enter__(self) -> Self:
-        self._previous = {name: signal.signal(name, self._handle) for name in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for name, handler in self._previous.items():
-            signal.signal(name, handler)
-
-    def attend(self, supervisor: Supervisor | None) -> None:
-        """What is to be stopped from now on."""
-        self._supervisor = supervisor
-        if supervisor is not None and self.requested:
-            supervisor.stop()
-
-    def _handle(self, *_: object) -> None:
-        if self.requested and self._supervisor is None:
-            raise KeyboardInterrupt
-        self.requested = True
-        if self._supervisor is not None:
-            self._supervisor.stop()
 
 
 def run_experiments(

@@ -79,7 +79,7 @@ def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysi
         curves["sines"].append((hz, left_nm))
     curves["amplitude_um"] = options.amplitude_um
     notes = ["Ω is added before D(s), as in eq (7); D(0) makes 3.321 µm of it at rest. The model is S·D of eqs (5) and "
-             "(20): its 100 nm hold below 2.9 Hz only, whatever the controller's text says.",
+             "(20): the 100 nm that are asked for hold below 2.9 Hz only.",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
              "remainders decay more slowly than the linear model's."]  # fmt: skip
     tables = (Table("Sines", ("f / Hz", "amplitude left / nm", "per Ω"), table),) if table else ()

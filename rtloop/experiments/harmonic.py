@@ -32,6 +32,7 @@ LEAST_CYCLE = 0.1
 """A frequency of which less would pass in `settle_s` is measured from its first cycle on."""
 LOW_HZ, BEYOND_HZ = 1.0, 300.0
 LEAST_COHERENCE = 0.5
+NEAR_HZ = (530.0, 660.0)
 AMPLITUDE_UM = 2.0
 """More than that would swing in closed loop, at some hundred Hz, as far as the oscillation interlock of
 deploy/paper.toml allows; it cannot know that the ringing is meant."""
@@ -146,40 +147,42 @@ def bandwidth(found: Real) -> float:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
-    """Magnitude, phase and coherence over frequency."""
-    magnitude, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=(4, 2, 1.2))
-    colors = dict(zip(MODES, (ink.error, ink.drive, ink.measured), strict=True))
-    highest = max(one[-1, 0] for one in curves["found"].values())
-    hz = np.geomspace(0.01, max(highest, 10.0), 3000)
-    held = np.sinc(hz / curves["rate_hz"])
-    for mode, found in curves["found"].items():
-        trusted = np.where(found[:, 3] >= LEAST_COHERENCE, 1.0, np.nan)
-        magnitude.semilogx(
-            found[:, 0],
-            found[:, 1] * trusted,
-            "o-",
-            color=colors[mode],
-            markersize=3.5,
-            linewidth=0.9,
-            label=NAMES[mode],
-        )
-        phase.semilogx(
-            found[:, 0], unwrapped(found[:, 2], trusted), "o-", color=colors[mode], markersize=3, linewidth=0.9
-        )
-        coherence.semilogx(found[:, 0], found[:, 3], "o-", color=colors[mode], markersize=3, linewidth=0.9)
-    for number, shift_db in enumerate(curves["shifts_db"]):
-        model = 20 * np.log10(np.abs(paper.dynamics(hz)) / 1.01086) + shift_db
-        magnitude.semilogx(hz, model + 20 * np.log10(held), color=ink.model, linewidth=0.8, linestyle="--",
-                           label="D(s) of eq (5), eq (4) at this amplitude" if number == 0 else None)  # fmt: skip
-    closed = 20 * np.log10(np.abs(1 - paper.sensitivity(hz)))
-    magnitude.semilogx(hz, closed, color=ink.model, linewidth=0.8, label="T(s) of eqs (5) and (20)")
-    magnitude.axvline(400.0, color=ink.paper, linewidth=1.0, linestyle=":", label="400 Hz, the paper's resonance")
+    """Magnitude, phase and coherence over frequency, and again near the resonance."""
+    panels = figure.subplots(3, 2, sharex="col", sharey="row", height_ratios=(4, 2, 1.2), width_ratios=(3, 1.3))
+    for column in panels.T:
+        _draw_column(column, curves, ink)
+    (magnitude, near), (phase, _), (coherence, near_coherence) = panels
+    magnitude.set_xscale("log")
+    near.set_xlim(*NEAR_HZ)
     magnitude.set_ylim(bottom=-30)
     coherence.set_ylim(-0.05, 1.1)
     ink.label(magnitude, "", "magnitude / dB", "Fig 12: harmonic response")
+    ink.label(near, "", "", "near the resonance")
     ink.label(phase, "", "phase / °")
     ink.label(coherence, "frequency / Hz", "γ²")
+    ink.label(near_coherence, "frequency / Hz", "")
     ink.legend(magnitude, loc="upper left")
+
+
+def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+    magnitude, phase, coherence = panels
+    for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):
+        hz, decibels, degrees, part = curves["found"][mode].T
+        trusted = np.where(part >= LEAST_COHERENCE, 1.0, np.nan)
+        style = {"color": color, "markersize": 3, "linewidth": 0.9}
+        magnitude.plot(hz, decibels * trusted, "o-", label=NAMES[mode], **style)
+        phase.plot(hz, unwrapped(degrees, trusted), "o-", **style)
+        coherence.plot(hz, part, "o-", **style)
+    highest = max(found[-1, 0] for found in curves["found"].values())
+    hz = np.union1d(np.geomspace(0.01, max(highest, 10.0), 2000), np.linspace(*NEAR_HZ, 500))
+    held = 20 * np.log10(np.sinc(hz / curves["rate_hz"]))
+    for number, shift_db in enumerate(curves["shifts_db"]):
+        model = 20 * np.log10(np.abs(paper.dynamics(hz) / paper.dynamics(np.zeros(1)))) + shift_db + held
+        label = "D(s) of eq (5), eq (4) at this amplitude" if number == 0 else None
+        magnitude.plot(hz, model, color=ink.model, linewidth=0.8, linestyle="--", label=label)
+    closed = 20 * np.log10(np.abs(1 - paper.sensitivity(hz)))
+    magnitude.plot(hz, closed, color=ink.model, linewidth=0.8, label="T(s) of eqs (5) and (20)")
+    magnitude.axvline(400.0, color=ink.paper, linewidth=1.0, linestyle=":", label="400 Hz, the paper's resonance")
 
 
 def unwrapped(degrees: Real, trusted: Real) -> Real:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,8 @@ from click.testing import CliRunner, Result
 
 from rtloop.cli import main
 from rtloop.experiments.report import report, take
-from tests.service.test_run import PAPER, finish, start
-from tests.soak.aborts import abort, check
+from tests.service.test_run import ENVIRONMENT, PAPER
+from tests.soak.aborts import TIMEOUT_S, abort, check
 
 BOARD = PAPER.with_name("board.toml")
 QUICK = (
@@ -31,9 +33,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     """Folder and JSON of a run of three quick experiments, one of them with a run that trips."""
     folder = tmp_path_factory.mktemp("experiments")
     names = ("step-response", "compensation", "robustness")
-    code, content, error = finish(start("experiment", "run", *names, PAPER, *QUICK, "--out", folder, "--json"))
-    assert code == 0, error
-    return folder, content
+    command = [sys.executable, "-m", "rtloop", "experiment", "run", *names, str(PAPER), *QUICK, "--json", "--out"]
+    ran = subprocess.run([*command, str(folder)], env=ENVIRONMENT, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert ran.returncode == 0, ran.stderr
+    assert "Traceback" not in ran.stderr
+    return folder, json.loads(ran.stdout)
 
 
 def rows(content: dict[str, Any], name: str) -> dict[str, Any]:

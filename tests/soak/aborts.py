@@ -18,7 +18,7 @@ import rtloop
 from rtloop.recording.summary import summarise
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMEOUT_S = 300.0
+TIMEOUT_S = 280.0
 PARKED_V = 1e-6
 LONGEST_S = 40.0
 """About as long as all experiments take in virtual time."""
@@ -64,7 +64,7 @@ def check(found: Aborted, folder: Path) -> str:
     assert found.report, found.error
     assert not list(folder.glob("*.part")), "a recording was left unfinished"
     for path in found.recordings:
-        assert summarise(path)["complete"], path
+        assert summarise(path)["complete"], (path, found.error)
     last = found.recordings[int(np.argmax([path.stat().st_mtime for path in found.recordings]))]
     drive = rtloop.load(last)["x_drive_v"]
     if found.exit_code:

@@ -1,0 +1,37 @@
+"""Ctrl-C while several runs follow each other."""
+
+from __future__ import annotations
+
+import signal
+from typing import Self
+
+from rtloop.service.supervisor import Supervisor
+
+
+class Interruption:
+    """SIGINT and SIGTERM stop the present run and all that would follow; a second one ends what is no run."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._supervisor: Supervisor | None = None
+
+    def __enter__(self) -> Self:
+        self._previous = {name: signal.signal(name, self._handle) for name in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name, handler in self._previous.items():
+            signal.signal(name, handler)
+
+    def attend(self, supervisor: Supervisor | None) -> None:
+        """What is to be stopped from now on."""
+        self._supervisor = supervisor
+        if supervisor is not None and self.requested:
+            supervisor.stop()
+
+    def _handle(self, *_: object) -> None:
+        if self.requested and self._supervisor is None:
+            raise KeyboardInterrupt
+        self.requested = True
+        if self._supervisor is not None:
+            self._supervisor.stop()
