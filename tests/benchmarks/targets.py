@@ -26,7 +26,7 @@ TARGETS = {
     "loop times_real_time": Target(700.0, most=False),
     "recorded times_real_time": Target(100.0, most=False),
     "axes ns_per_further_axis": Target(150.0),
-    "start first_tick_s": Target(2.0),
+    "start to_first_tick_s": Target(2.0),
     "lateness sleeping p50_ratio": Target(1.1),
     "lateness sleeping p99_ratio": Target(1.3),
     "lateness spinning p50_ratio": Target(0.05),
