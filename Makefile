@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings soak-chain soak-aborts check install uninstall test-systemd rig clean soak-identification
+.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -46,6 +46,10 @@ soak-identification: $(READY)
 # Recordings, identification, synthesis and a run on ten rigs drawn at random: about four minutes.
 soak-chain: $(READY)
 	$(BIN)/python -m tests.soak.chain
+
+# One configuration on every backend that needs no hardware, side by side: two minutes.
+soak-backends: $(READY)
+	$(BIN)/python -m tests.soak.backends
 
 # Ctrl-C at twenty random moments of all experiments: about ten minutes.
 soak-aborts: $(READY)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ import rtloop
 from drivers.base import Driver, Wiring
 from drivers.contract import DriverContract
 from drivers.registry import driver_class
+from tests.drivers.installing import install
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """
@@ -47,19 +46,7 @@ dwell_s = 0.5
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that the package is installed in, as its own pyproject.toml says and as pip would leave it."""
-    source, target = Path(__file__).with_name("third_party"), tmp_path_factory.mktemp("installed")
-    pyproject = tomllib.loads((source / "pyproject.toml").read_text())
-    project, modules = pyproject["project"], pyproject["tool"]["setuptools"]["py-modules"]
-    for module in modules:
-        shutil.copy(source / f"{module}.py", target)
-    info = target / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
-    lines = [f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
-             for group, points in project["entry-points"].items()]  # fmt: skip
-    (info / "entry_points.txt").write_text("".join(lines))
-    return target
+    return install(tmp_path_factory.mktemp("installed"))
 
 
 def run(installed: Path, *arguments: str) -> str:

@@ -1,0 +1,23 @@
+"""The third party's package as pip would leave it: files and entry points, as its own pyproject.toml says."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from pathlib import Path
+
+
+def install(target: Path) -> Path:
+    """Put the package into the folder `target`, which then belongs on the path; returns it."""
+    source = Path(__file__).with_name("third_party")
+    pyproject = tomllib.loads((source / "pyproject.toml").read_text())
+    project, modules = pyproject["project"], pyproject["tool"]["setuptools"]["py-modules"]
+    for module in modules:
+        shutil.copy(source / f"{module}.py", target)
+    info = target / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    lines = [f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
+             for group, points in project["entry-points"].items()]  # fmt: skip
+    (info / "entry_points.txt").write_text("".join(lines))
+    return target

@@ -1,0 +1,133 @@
+"""One configuration on every backend, [driver] alone exchanged, and what came of each. `make soak-backends`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+import rtloop
+from rtloop.steps import step_metrics
+from rtloop.terminal import table
+from tests.drivers.can_bench import GROUP, free_port
+from tests.drivers.installing import install
+
+ROOT = Path(__file__).resolve().parents[2]
+DURATION_S = 8.0
+WIDTH = 140
+LAW = """
+[loop]
+rate_hz = {rate_hz}
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.controller]
+form = "zpk"
+gain = 60.0
+poles = [[0.0, 0.0]]
+[axis.interlocks]
+sample_age_us = 500000.0
+[axis.reference]
+kind = "steps"
+levels = [10.0, -10.0]
+dwell_s = 1.0
+"""
+
+
+class Backend(NamedTuple):
+    """`section` follows [driver]; `board` is what must run beside the loop; `rates_hz` where it is compared."""
+
+    name: str
+    section: str
+    channels: tuple[str, str] = ("adc0", "dac0")
+    board: tuple[str, ...] | None = None
+    rates_hz: tuple[int, ...] = (2_000, 10_000)
+
+
+def backends(folder: Path) -> list[Backend]:
+    """The four kinds that can run on any machine."""
+    bus = f'interface = "udp_multicast"\nchannel = "{GROUP}"\nsettings = {{ port = {free_port()}, hop_limit = 0 }}\n'
+    return [
+        Backend("sim", 'kind = "sim"\n'),
+        Backend("shm", f'kind = "shm"\nfile = "{folder}/board"\nboard_rate_hz = 20000\n', board=("hil", "serve")),
+        Backend("can", f'kind = "can"\n{bus}hold_ticks = 800\nwatchdog_ms = 1000\nwait_s = 60\n',
+                board=("hil", "serve", "--can"), rates_hz=(2_000,)),
+        Backend("third party", 'kind = "bench_card"\n', channels=("in", "out")),
+    ]  # fmt: skip
+
+
+@contextmanager
+def beside(arguments: tuple[str, ...] | None, config: Path, environment: dict[str, str]) -> Iterator[None]:
+    """A board or node as a process of its own, for as long as it is needed."""
+    if arguments is None:
+        yield
+        return
+    command = [sys.executable, "-m", "rtloop", *arguments, str(config)]
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        process.stderr.readline()  # it says that it is there
+        yield
+        process.send_signal(signal.SIGTERM)
+
+
+def measure(backend: Backend, rate_hz: int, folder: Path, environment: dict[str, str]) -> dict[str, Any]:
+    """Run, replay, judge the steps."""
+    source, sink = backend.channels
+    wiring = f'[driver.channels.x]\ninput = "{source}"\noutput = "{sink}"\num_per_v = 10.0\n'
+    config = folder / f"{backend.name.replace(' ', '-')}.toml"
+    config.write_text(f"{LAW.format(rate_hz=rate_hz)}[driver]\n{backend.section}{wiring}")
+    with beside(backend.board, config, environment):
+        summary = said(environment, "run", config, "--duration", DURATION_S, "--out", folder / "recordings")
+    verdict = said(environment, "replay", summary["recording"])
+    recording = rtloop.load(summary["recording"])
+    steps = step_metrics(recording["x_reference_um"], recording["x_position_um"], rate_hz)
+    assert steps is not None
+    return summary | {"identical": verdict["identical"], "steps": steps}
+
+
+def said(environment: dict[str, str], *arguments: object) -> dict[str, Any]:
+    """What a command prints as JSON; it must end well."""
+    command = [sys.executable, "-m", "rtloop", *map(str, arguments), "--json"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(command)}: {done.returncode}: {done.stderr}{done.stdout}"
+    return json.loads(done.stdout)
+
+
+def main() -> None:
+    """Print the table; fail where a tick is lost or a replay differs."""
+    rows = table("driver", "Hz", "ticks", "lost", "missed", "replay", "late p50 µs", "p99", "max", "overshoot %",
+                 "settling ms", "static error %")  # fmt: skip
+    good = True
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = os.pathsep.join([str(ROOT), str(install(folder))])
+        environment = os.environ | {"PYTHONPATH": path}
+        for backend in backends(folder):
+            for rate_hz in backend.rates_hz:
+                found = measure(backend, rate_hz, folder, environment)
+                late, steps = found["lateness_us"], found["steps"]
+                good &= found["complete"] and found["ticks_lost"] == 0 and found["identical"]
+                rows.add_row(
+                    backend.name, str(rate_hz), str(found["ticks_logged"]), str(found["ticks_lost"]),
+                    str(found["periods_missed"]), "identical" if found["identical"] else "DIFFERS",
+                    *(f"{late[key]:.1f}" for key in ("p50", "p99", "max")),
+                    f"{steps.overshoot_percent:.2f}", f"{steps.settling_time_ms:.1f}",
+                    f"{steps.static_error_percent:.3f}",
+                )  # fmt: skip
+    Console(highlight=False, width=WIDTH).print(rows)
+    sys.exit(0 if good else 1)
+
+
+if __name__ == "__main__":
+    main()
