@@ -77,7 +77,7 @@ def _staircase(
 ) -> AxisOptions:
     """The axis without its controller, asking for steps about the safe value, and no further."""
     output = outputs[index_of(outputs, configuration.channels[axis.name].output)]
-    lowest = max(output.safe_v - amplitude_v, output.minimum_v, -axis.limits.drive_v)
+    lowest = max(output.safe_v - amplitude_v, output.minimum_v, axis.limits.lowest_v)
     highest = min(output.safe_v + amplitude_v, output.maximum_v, axis.limits.drive_v)
     slew = min(axis.limits.slew_v_per_s or math.inf, axis.limits.trip_slew_v_per_s)
     dwell_s = max(SHORTEST_DWELL_S, SHORTEST_DWELL_TICKS / configuration.loop.rate_hz, 4.0 * (highest - lowest) / slew)

@@ -149,12 +149,16 @@ def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
 
 def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Mapping[str, float]:
     """Limits per tick. Raises ValueError for a drive beyond the channel's range."""
-    if -options.drive_v < output.minimum_v or options.drive_v > output.maximum_v:
-        largest = min(-output.minimum_v, output.maximum_v)
-        raise ValueError(f"limits.drive_v: {options.drive_v} is outside the driver's ±{largest} V")
+    lowest_v, highest_v = output.minimum_v, output.maximum_v
+    allowed = f"±{highest_v}" if lowest_v == -highest_v else f"{lowest_v} … {highest_v}"
+    if options.drive_v > highest_v:
+        raise ValueError(f"limits.drive_v: {options.drive_v} is outside the driver's {allowed} V")
+    if options.lowest_v < lowest_v:
+        given = "drive_v: −" if options.drive_min_v is None else "drive_min_v: −"
+        raise ValueError(f"limits.{given}{-options.lowest_v} is outside the driver's {allowed} V; set drive_min_v")
     slew = float("inf") if options.slew_v_per_s is None else options.slew_v_per_s * period_s
     return {
-        "drive_min_v": -options.drive_v,
+        "drive_min_v": options.lowest_v,
         "drive_max_v": options.drive_v,
         "safe_v": output.safe_v,
         "command_limit_um": options.command_um,

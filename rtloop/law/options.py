@@ -152,6 +152,8 @@ class LimitsOptions(Options):
     """What the law may ask for."""
 
     drive_v: float = Field(default=10.0, gt=0)
+    drive_min_v: float | None = Field(default=None, le=0)
+    """Lowest drive; -drive_v by default, 0 for an amplifier without a negative side."""
     command_um: float = Field(default=42.0, gt=0)
     slew_v_per_s: float | None = Field(default=None, gt=0)
     """Running slew; none by default, because it breaks a loop that needs fast steps."""
@@ -159,6 +161,11 @@ class LimitsOptions(Options):
     """Ramp of a trip, a stop and mode off."""
     bump_s: float = Field(default=0.02, gt=0)
     """Time constant with which the offset of a bumpless change of mode dies out."""
+
+    @property
+    def lowest_v(self) -> float:
+        """Lowest drive in V."""
+        return -self.drive_v if self.drive_min_v is None else self.drive_min_v
 
 
 class InterlockOptions(Options):

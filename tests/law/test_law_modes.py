@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy import signal
 
+from drivers.base import Channel
 from rtloop.signals import Flag, Mode
 from tests.law.harness import EQ_4, EQ_20, PERIOD_S, LawBench, coefficients_of
 from tests.law.oracle import Hysteresis, P, R, sine
@@ -51,6 +54,22 @@ def test_limited_commands_and_drives_say_so():
     assert flags[1] == Flag.DRIVE_LIMITED
     assert flags[2] == flags[3] == Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED
     assert bench.axes.drive_v[0] == -5.0
+
+
+def test_an_amplifier_without_a_negative_side():
+    """0 … 5 V: below and above it is limited, and each limit that leaves the channel is refused by its name."""
+    channel = Channel("ao0", 0.0, 5.0)
+    bench = LawBench(coefficients_of(channel, limits={"drive_v": 5.0, "drive_min_v": 0.0}), Mode.RAW)
+    signals = bench.run([3.0, -0.1, 5.0, 7.0])
+    assert list(signals.drive_v) == [3.0, 0.0, 5.0, 5.0]
+    assert list(signals.flags) == [0, Flag.DRIVE_LIMITED, 0, Flag.DRIVE_LIMITED]
+    for limits, fault in (
+        ({"drive_v": 5.0}, "limits.drive_v: −5.0 is outside the driver's 0.0 … 5.0 V; set drive_min_v"),
+        ({"drive_v": 6.0, "drive_min_v": 0.0}, "limits.drive_v: 6.0 is outside the driver's 0.0 … 5.0 V"),
+        ({"drive_v": 5.0, "drive_min_v": -1.0}, "limits.drive_min_v: −1.0 is outside the driver's 0.0 … 5.0 V"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(fault)):
+            coefficients_of(channel, limits=limits)
 
 
 def test_off_ramps_to_the_safe_value_and_stays():
