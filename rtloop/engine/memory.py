@@ -23,7 +23,7 @@ from rtloop.engine.ring import Ring
 
 DIRECTORY_BYTES = 8192
 ATTACH_POLL_S = 0.001
-RING_SECONDS = 6.0
+RING_SECONDS = 10.0
 # numbers of slots are powers of two: the rings rely on it
 MIN_RING_TICKS = 4096
 EVENT_SLOTS = 4096

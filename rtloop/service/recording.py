@@ -15,7 +15,7 @@ from rtloop.service.child import Child
 from rtloop.service.stall import StallWatch
 
 MODULE = "rtloop.recording.recorder"
-STALL_S = 1.5
+STALL_S = 3.0
 LONGEST_STEP_S = 0.1
 END_TIMEOUT_S = 30.0
 MAX_REPLACEMENTS = 10

@@ -14,7 +14,7 @@ from tests.benchmarks.measure import Effort, spread
 from tests.faults.bench import Bench
 
 SETTLE_S, APART_S = 8.0, 0.5
-"""The ring of records, which holds six seconds, is then in memory as a whole."""
+"""The ring of records, which holds ten seconds, is then in memory as a whole."""
 ROLES = ("rt", "recorder", "service")
 
 

@@ -12,11 +12,12 @@ from pathlib import Path
 
 from rtloop.engine.memory import ProcessState, Word
 from tests.faults.bench import Bench
+from tests.faults.configuration import BOARD_RATE_HZ
 from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 
 SMALL = "size=900k"
-OVERRUN_S = 12.0
+ROUNDS = 1.4
 
 
 @contextmanager
@@ -50,7 +51,7 @@ def ring_overrun(bench: Bench) -> Measured:
     """Every recorder that comes is stopped at once, until the ring has gone round."""
     words, stopped = bench.blocks[-1].words, set[int]()
     bench.strike()
-    until_s = time.monotonic() + OVERRUN_S
+    until_s = time.monotonic() + ROUNDS * len(bench.blocks[-1]["ticks_slots"]) / BOARD_RATE_HZ
     while time.monotonic() < until_s:
         pid = int(words[Word.RECORDER_PID])
         if pid and pid not in stopped:
