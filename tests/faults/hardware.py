@@ -103,8 +103,9 @@ SHIFTED = (
     ("[loop]\nrate_hz = 4000", "[loop]\nrate_hz = 10000"),
     ("board_rate_hz = 8000", "board_rate_hz = 10000"),
     ("\nslew_v_per_s = 1000.0", ""),
+    ('"sine"\namplitude = 8.0\noffset = 20.0\nfrequency_hz = 5.0', '"steps"\nlevels = [0.0, 20.0]\ndwell_s = 1.0'),
 )
-"""As the paper has it: at 10 kHz, without a running slew limit."""
+"""As the paper has it: at 10 kHz, without a running slew limit, steps of 20 µm."""
 FAULTS = (
     Fault("board SIGKILL", "trip: stale; goes on with another board", board_killed),
     Fault("board SIGSTOP", "trip: stale; code to 0 V", board_paused),
