@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.recording.events import RECOVERED
 from rtloop.recording.histogram import Histogram
 from rtloop.recording.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.reader import Reader
@@ -83,6 +84,11 @@ def summarise(path: Files, progress: Progress | None = None) -> dict[str, Any]:
         return _report(readers, totals)
 
 
+def _seamless(end: dict[str, Any] | None) -> bool:
+    """Whether a file leaves nothing out: it was finished, or its recorder was replaced and the next file goes on."""
+    return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
+
+
 def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
@@ -91,7 +97,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
     executed = finished["ticks_executed"] if finished else int(totals.last[0]) + 1 if totals.first else 0
     lost = executed - header.get("first_tick", 0) - totals.ticks
     problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
-    whole = all(end and end["complete"] for end in ends) and lost == 0 and not problems
+    whole = bool(finished and finished["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
     size_bytes = sum(reader.size_bytes for reader in readers)
     return {
