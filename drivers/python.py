@@ -1,6 +1,6 @@
 """Base of drivers written in plain Python: their methods become C functions.
 
-A call costs about 0.4 µs while the interpreter is otherwise idle, as it is in the loop's process. An exception is
+A call costs about 0.8 µs while the interpreter is otherwise idle, as it is in the loop's process. An exception is
 kept for `error`, and the loop sees a failed driver; so it does where an output is outside its channel's range.
 """
 
