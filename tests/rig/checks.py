@@ -78,9 +78,9 @@ def closed_loop(config: Path, duration_s: float, settled_um: float) -> str:
     require("ticks_lost" in summary, told)
     require(summary["ticks_lost"] == 0 and summary["complete"], f"{summary['ticks_lost']} ticks lost; {told}")
     require(not summary["trips"], f"tripped: {summary['trips']}")
-    verdict = json.loads(as_service(BIN / "rtloop", "replay", summary["recording"], "--json"))
+    verdict = json.loads(as_service(BIN / "rtloop", "replay", *summary["parts"], "--json"))
     require(verdict["identical"], f"replay: {verdict}")
-    recording = rtloop.load(summary["recording"])
+    recording = rtloop.load(summary["parts"])
     reference, error = recording["x_reference_um"], recording["x_error_um"]
     ends = np.flatnonzero(np.diff(reference))
     require(ends.size >= 2, "the reference never changed")
