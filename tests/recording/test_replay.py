@@ -94,9 +94,9 @@ def test_a_gap_is_passed_by_the_next_snapshot_and_said(tmp_path: Path):
         loop.run(13_500)
         recorder.wait_until(lambda: _cursor(recorder) == 13_500)
         recorder.process.send_signal(signal.SIGSTOP)
-        loop.run(90_000)
+        loop.run(160_000)
         recorder.process.send_signal(signal.SIGCONT)
-        recorder.wait_until(lambda: _cursor(recorder) == 103_500)
+        recorder.wait_until(lambda: _cursor(recorder) == 173_500)
         loop.run(14_200)
         loop.end()
         _, totals = recorder.result()
@@ -108,7 +108,7 @@ def test_a_gap_is_passed_by_the_next_snapshot_and_said(tmp_path: Path):
     report = replayed(tmp_path / "run.mcap")
     assert report.gaps == [{"first_tick": 13_500, "count": lost}]
     assert 0 < report.unverified < 10_000
-    assert report.ticks + report.unverified + lost == 117_700
+    assert report.ticks + report.unverified + lost == 187_700
     assert report.snapshots > 4
 
 
