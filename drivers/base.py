@@ -99,3 +99,13 @@ def index_of(channels: Sequence[Channel], name: str) -> int:
     if name not in names:
         raise ValueError(f"{name!r} is not a channel of this driver; it has {', '.join(names)}")
     return names.index(name)
+
+
+def require_channels(wiring: Mapping[str, Wiring], facts: Facts) -> None:
+    """Raise ValueError, naming the axis, for a channel that a driver does not have."""
+    for axis, (source, sink) in wiring.items():
+        for name, channels in ((source, facts.inputs), (sink, facts.outputs)):
+            try:
+                index_of(channels, name)
+            except ValueError as error:
+                raise ValueError(f"channels.{axis}: {error}") from None

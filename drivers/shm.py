@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from drivers.base import Channel, Driver, Facts, Pointers, Wiring, index_of
+from drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
 from drivers.errors import DriverError
 from hil import board
 from hil.board import HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, BoardMemory, latest_sample
@@ -87,12 +87,7 @@ class ShmDriver(Driver):
         self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
         if len(wiring) > MAX_CHANNELS:
             raise ValueError(f"channels: {len(wiring)} axes; a board has at most {MAX_CHANNELS} channels")
-        for axis, (source, sink) in wiring.items():
-            for name, channels in ((source, self.facts.inputs), (sink, self.facts.outputs)):
-                try:
-                    index_of(channels, name)
-                except ValueError as error:
-                    raise ValueError(f"channels.{axis}: {error}") from None
+        require_channels(wiring, self.facts)
 
     @property
     def facts(self) -> Facts:

@@ -96,10 +96,8 @@ def _print(
 
 def _print_latency(latency: Latency) -> None:
     pacing, out = latency.pacing, console()
-    quantiles = ", ".join(
-        f"{name} {latency.quantile_us(share):.2f}"
-        for name, share in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999), ("max", 1.0))
-    )
+    p50_us, p99_us, p999_us, max_us = latency.quantiles_us.values()
+    quantiles = f"p50 {p50_us:.2f}, p99 {p99_us:.2f}, p99.9 {p999_us:.2f}, max {max_us:.2f}"
     spin = f"the last {pacing.spin_us:g} µs spinning" if pacing.spin_us else "sleeping"
     seconds = latency.lateness_us.size / pacing.rate_hz
     out.print(
@@ -128,10 +126,7 @@ def _report(examination: Examination, delays: list[AxisDelay], found: list[str],
             "rate_hz": latency.pacing.rate_hz,
             "spin_us": latency.pacing.spin_us,
             "findings": [asdict(finding) for finding in examination.findings],
-            "lateness_us": {
-                name: latency.quantile_us(share)
-                for name, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999), ("max", 1.0))
-            },
+            "lateness_us": latency.quantiles_us,
             "lateness_histogram": _classes(latency),
             "ticks": latency.lateness_us.size,
             "periods_missed": int(latency.missed.sum()),

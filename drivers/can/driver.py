@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 
-from drivers.base import Channel, Facts, Wiring, index_of
+from drivers.base import Channel, Facts, Wiring, require_channels
 from drivers.can.bus import FAILURES, described, open_bus, require_interface
 from drivers.can.extra import can
 from drivers.can.frames import exchange, load_frames
@@ -41,12 +41,7 @@ class CanDriver(PythonDriver):
         require_interface(options)
         self._exchange = exchange(load_frames(options), len(wiring), options)
         self._bus: can.BusABC | None = None
-        for axis, (source, sink) in wiring.items():
-            for name, channels in ((source, self.facts.inputs), (sink, self.facts.outputs)):
-                try:
-                    index_of(channels, name)
-                except ValueError as error:
-                    raise ValueError(f"channels.{axis}: {error}") from None
+        require_channels(wiring, self.facts)
 
     @property
     def facts(self) -> Facts:

@@ -40,6 +40,12 @@ class Latency:
         return float(np.quantile(self.lateness_us, share))
 
     @property
+    def quantiles_us(self) -> dict[str, float]:
+        """p50, p99, p999 and max."""
+        shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+        return {name: self.quantile_us(share) for name, share in shares.items()}
+
+    @property
     def late_share(self) -> float:
         """Share of ticks later than a period, the median of windows of a second: a single stall does not count."""
         late = self.lateness_us > self.period_us
