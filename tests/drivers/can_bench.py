@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.can.options import CanOptions
+from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUP = "239.74.163.77"
@@ -31,15 +32,7 @@ um_per_v = 10.0
 LAW = """
 [loop]
 rate_hz = {rate_hz}
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
-[axis.controller]
-form = "zpk"
-gain = 60.0
-poles = [[-0.5, 0.0]]
+{axis}
 [axis.interlocks]
 sample_age_us = 1e7
 [axis.reference]
@@ -64,7 +57,9 @@ def configuration(folder: Path, port: int, rate_hz: float = 500.0, hold_ticks: i
     """A file; a stall of this machine is bridged by `hold_ticks`."""
     path = folder / "lab.toml"
     driver = DRIVER.format(group=GROUP, port=port, hold_ticks=hold_ticks)
-    path.write_text(LAW.format(rate_hz=rate_hz, folder=folder / "recordings") + driver + more)
+    path.write_text(
+        LAW.format(rate_hz=rate_hz, axis=one_axis(60.0, pole_rad_s=-0.5), folder=folder / "recordings") + driver + more
+    )
     return path
 
 

@@ -16,6 +16,7 @@ from drivers.base import Driver, Wiring
 from drivers.contract import DriverContract
 from drivers.registry import driver_class
 from tests.drivers.installing import install
+from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """
@@ -28,15 +29,7 @@ seed = 3
 input = "in"
 output = "out"
 um_per_v = 10.0
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
-[axis.controller]
-form = "zpk"
-gain = 20.0
-poles = [[0.0, 0.0]]
+{axis}
 [axis.reference]
 kind = "steps"
 levels = [10.0, -10.0]
@@ -74,7 +67,7 @@ def test_it_is_listed(installed):
 @pytest.mark.parametrize("rate_hz", [2_000, 10_000])
 def test_it_closes_the_loop_and_replays(installed, tmp_path, rate_hz):
     config = tmp_path / "bench.toml"
-    config.write_text(CONFIG.format(rate_hz=rate_hz))
+    config.write_text(CONFIG.format(rate_hz=rate_hz, axis=one_axis(20.0)))
     summary = json.loads(run(installed, "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"))
     assert summary["ticks_logged"] == summary["ticks_expected"] == 2 * rate_hz
     assert summary["ticks_lost"] == 0

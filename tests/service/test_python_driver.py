@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
+from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -54,15 +55,7 @@ kind = "lag"
 input = "in"
 output = "out"
 um_per_v = 10.0
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
-[axis.controller]
-form = "zpk"
-gain = 400.0
-poles = [[0.0, 0.0]]
+{axis}
 [axis.model]
 form = "zpk"
 gain = 1000.0
@@ -81,7 +74,7 @@ def test_a_plain_python_driver_closes_the_loop_at_10_khz(tmp_path: Path) -> None
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: lag-driver\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text("[rtloop.drivers]\nlag = lag_driver:LagDriver\n")
     config = tmp_path / "lag.toml"
-    config.write_text(CONFIG)
+    config.write_text(CONFIG.format(axis=one_axis(400.0)))
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     command = [sys.executable, "-m", "rtloop", "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)

@@ -20,6 +20,7 @@ from rtloop.steps import step_metrics
 from rtloop.terminal import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install
+from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 DURATION_S = 8.0
@@ -27,15 +28,7 @@ WIDTH = 140
 LAW = """
 [loop]
 rate_hz = {rate_hz}
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
-[axis.controller]
-form = "zpk"
-gain = 60.0
-poles = [[0.0, 0.0]]
+{axis}
 [axis.interlocks]
 sample_age_us = 500000.0
 [axis.reference]
@@ -86,7 +79,7 @@ def measure(backend: Backend, rate_hz: int, folder: Path, environment: dict[str,
     source, sink = backend.channels
     wiring = f'[driver.channels.x]\ninput = "{source}"\noutput = "{sink}"\num_per_v = 10.0\n'
     config = folder / f"{backend.name.replace(' ', '-')}.toml"
-    config.write_text(f"{LAW.format(rate_hz=rate_hz)}[driver]\n{backend.section}{wiring}")
+    config.write_text(f"{LAW.format(rate_hz=rate_hz, axis=one_axis(60.0))}[driver]\n{backend.section}{wiring}")
     with beside(backend.board, config, environment):
         summary = said(environment, "run", config, "--duration", DURATION_S, "--out", folder / "recordings")
     verdict = said(environment, "replay", summary["recording"])
