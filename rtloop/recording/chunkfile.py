@@ -21,6 +21,7 @@ from rtloop.errors import OutputError
 from rtloop.recording.container import (
     CHUNK_HEAD,
     MAGIC,
+    indexed_span,
     pack_chunk,
     pack_end,
     pack_records,
@@ -41,7 +42,9 @@ class Content(NamedTuple):
 
 
 class _Written(NamedTuple):
-    entry: ChunkIndex
+    """Kept for every chunk of a file, therefore small: its packed record of the index, and what undoing it needs."""
+
+    record: bytes
     counts: dict[int, int]
     crc_before: int
 
@@ -55,6 +58,7 @@ class ChunkFile:
         self._repeated = repeated
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
         self._chunks: list[_Written] = []
+        self._distinct_counts: dict[tuple[tuple[int, int], ...], dict[int, int]] = {}
         self._crc = 0
         self._fd = self._open()
         self._append(MAGIC + pack_records([header]))
@@ -81,14 +85,16 @@ class ChunkFile:
             message_start_time=content.start,
             uncompressed_size=len(content.records),
         )
-        written = _Written(entry, content.counts, self._crc)
+        counts = self._distinct_counts.setdefault(tuple(content.counts.items()), content.counts)
+        written = _Written(pack_records([entry]), counts, self._crc)
         self._append(chunk + b"".join(content.indexes.values()))
         self._chunks.append(written)
 
     def drop_last(self) -> dict[int, int]:
         """Take the last chunk off the file; returns its messages by channel."""
         chunk = self._chunks.pop()
-        self.size, self._crc = chunk.entry.chunk_start_offset, chunk.crc_before
+        _, _, self.size = indexed_span(chunk.record)
+        self._crc = chunk.crc_before
         try:
             os.ftruncate(self._fd, self.size)
         except OSError as error:
@@ -97,7 +103,8 @@ class ChunkFile:
 
     def write_end(self) -> None:
         """The index and the footer."""
-        self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), self._index()))
+        index = b"".join(chunk.record for chunk in self._chunks)
+        self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), index))
 
     def publish(self) -> None:
         """Make the file durable and give it its final name; never replaces a file."""
@@ -145,10 +152,8 @@ class ChunkFile:
         self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)
 
-    def _index(self) -> list[ChunkIndex]:
-        return [chunk.entry for chunk in self._chunks]
-
     def _statistics(self) -> Statistics:
+        starts, ends, _ = zip(*(indexed_span(chunk.record) for chunk in self._chunks), strict=True)
         counts: dict[int, int] = {}
         for chunk in self._chunks:
             for channel, count in chunk.counts.items():
@@ -159,8 +164,8 @@ class ChunkFile:
             channel_message_counts=counts,
             chunk_count=len(self._chunks),
             message_count=sum(counts.values()),
-            message_end_time=max(entry.message_end_time for entry in self._index()),
-            message_start_time=min(entry.message_start_time for entry in self._index()),
+            message_end_time=max(ends),
+            message_start_time=min(starts),
             metadata_count=0,
             schema_count=sum(isinstance(record, Schema) for record in self._repeated),
         )

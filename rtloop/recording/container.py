@@ -28,6 +28,7 @@ from mcap.records import (
 MAGIC = b"\x89MCAP0\r\n"
 PREFIX = struct.Struct("<BQ")
 CHUNK_HEAD = struct.Struct("<BQQQQII4sQ")
+CHUNK_INDEX_HEAD = struct.Struct("<BQQQQ")
 CHUNK_MARK = struct.pack("<I4s", 4, b"zstd")
 """Compression's name inside every chunk record: what a search for chunks looks for."""
 CHUNK_MARK_OFFSET = 37
@@ -119,16 +120,18 @@ def split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def pack_end(
-    data_crc: int, data_end: int, repeated: Sequence[McapRecord], statistics: Statistics, index: Sequence[ChunkIndex]
+    data_crc: int, data_end: int, repeated: Sequence[McapRecord], statistics: Statistics, index: bytes
 ) -> bytes:
-    """Everything after the last chunk: data end, summary, footer, magic. `data_end`: bytes in front of it."""
+    """Everything after the last chunk: data end, summary, footer, magic.
+
+    `data_end`: bytes in front of it; `index`: the chunk index records, packed.
+    """
     start = data_end + DATA_END_BYTES
     summary, offsets = b"", []
     groups: dict[type[McapRecord], list[McapRecord]] = {}
-    for record in (*repeated, statistics, *index):
+    for record in (*repeated, statistics):
         groups.setdefault(type(record), []).append(record)
-    for group in groups.values():
-        packed = pack_records(group)
+    for packed in filter(None, (*map(pack_records, groups.values()), index)):
         offsets.append(SummaryOffset(packed[0], start + len(summary), len(packed)))
         summary += packed
     offsets_start = start + len(summary)
@@ -136,6 +139,12 @@ def pack_end(
     head = FOOTER_HEAD.pack(Opcode.FOOTER, 20, start, offsets_start)
     footer = Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))
     return pack_records([DataEnd(data_crc)]) + summary + pack_records([footer]) + MAGIC
+
+
+def indexed_span(record: bytes) -> tuple[int, int, int]:
+    """Of a packed chunk index record: its first and last log time, and where in the file its chunk begins."""
+    _, _, start, end, offset = CHUNK_INDEX_HEAD.unpack_from(record)
+    return start, end, offset
 
 
 def parse_summary(data: bytes) -> list[ChunkIndex]:
