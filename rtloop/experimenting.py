@@ -70,13 +70,17 @@ def run_experiments(
     folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
     with Interruption() as interruption:
         paths, problems = _record_all(planned, folder, paced or prepared.facts.real, interruption)
-        for problem in problems:
-            click.echo(f"rtloop: {problem}", err=True)
-        if interruption.requested:
-            click.echo("rtloop: interrupted; outputs are parked, and what was recorded is reported", err=True)
-        if not paths:
-            raise LoopFault("nothing was recorded")
+    for problem in problems:
+        click.echo(f"rtloop: {problem}", err=True)
+    if interruption.requested:
+        click.echo("rtloop: interrupted; outputs are parked, and what was recorded is reported", err=True)
+    if not paths:
+        raise LoopFault("nothing was recorded")
+    try:
         made, files = _write(take_and_report(paths), folder, skipped)
+    except KeyboardInterrupt:
+        hint = f"`rtloop experiment report {folder}` makes it from the recordings, which are complete"
+        raise LoopFault(f"interrupted, and the report left out: {hint}") from None
     whole = made.whole and not interruption.requested and not problems
     _show(made, files, skipped, as_json, {"interrupted": interruption.requested, "skipped": skipped})
     return 0 if whole else LoopFault.exit_code

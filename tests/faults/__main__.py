@@ -26,7 +26,8 @@ def cells(row: Row) -> tuple[str, ...]:
     )  # fmt: skip
     drive = f"{row.largest_v:.2f} V, {row.step_v:.3f} V ({row.bound_v:.3f})"
     verdict = f"not possible here: {row.skipped}" if row.skipped else ("holds" if not row.problems else "FAILS")
-    notes = [measured.note] if measured.note else []
+    exempt = f"any step allowed: {measured.step_exempt}" if measured.step_exempt else ""
+    notes = filter(None, (measured.note, exempt))
     return (row.fault.name, row.fault.must, safe, f"{ticks.lost} / {ticks.executed}", drive,
             "; ".join([verdict, *notes, *(problem[:LONGEST] for problem in row.problems)]))  # fmt: skip
 
