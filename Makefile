@@ -55,7 +55,7 @@ soak-chain: $(READY)
 soak-backends: $(READY)
 	$(BIN)/python -m tests.soak.backends
 
-# Ctrl-C at twenty random moments of all experiments: about ten minutes.
+# Ctrl-C at twenty random moments of experiments, in virtual and in real time: about ten minutes.
 soak-aborts: $(READY)
 	$(BIN)/python -m tests.soak.aborts
 

@@ -113,4 +113,4 @@ def test_what_cannot_be_done_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path, seed: int) -> None:
     after_s = float(np.random.default_rng(seed).uniform(0.0, 4.0))
-    check(abort(tmp_path, after_s), tmp_path)
+    check(abort(tmp_path, after_s, "paper", str(PAPER)), tmp_path)

@@ -59,7 +59,7 @@ def output_stuck(bench: Bench) -> Measured:
     bench.ask_for(board.NO_FAULT)
     wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
     bench.recover()
-    return Measured(step_exempt=STUCK, note="code at 0 V; " + STUCK)
+    return Measured(step_exempt=STUCK, note="code at 0 V")
 
 
 def on_the_card(fault: int, safe_ms: float, *causes: str, new_loop: bool):

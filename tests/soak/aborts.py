@@ -1,4 +1,8 @@
-"""Ctrl-C at random moments of `rtloop experiment paper`: outputs parked, recordings complete. `make soak-aborts`."""
+"""Ctrl-C at random moments of experiments: outputs parked, recordings complete. `make soak-aborts`.
+
+In turn all of them in virtual time, where most moments fall between two runs, and one in real time, where they fall
+into a drive.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +19,15 @@ from typing import NamedTuple
 import numpy as np
 
 import rtloop
+from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.recording.summary import summarise
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 280.0
 PARKED_V = 1e-6
-LONGEST_S = 40.0
-"""About as long as all experiments take in virtual time."""
+CONFIG = str(ROOT / "deploy" / "paper.toml")
+ALL_S, ONE_S = 40.0, 15.0
+"""About as long as all experiments take in virtual time; within one in real time."""
 
 
 class Aborted(NamedTuple):
@@ -33,10 +39,10 @@ class Aborted(NamedTuple):
     report: bool
 
 
-def abort(folder: Path, after_s: float, config: Path = ROOT / "deploy" / "paper.toml") -> Aborted:
-    """Start the experiments, interrupt them `after_s` after the first recording began, wait for the end."""
+def abort(folder: Path, after_s: float, *arguments: str) -> Aborted:
+    """Start `rtloop experiment`, interrupt it `after_s` after its first recording began, and wait for its end."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "rtloop", "experiment", "paper", str(config), "--out", str(folder)],
+        [sys.executable, "-m", "rtloop", "experiment", *arguments, "--out", str(folder)],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -83,10 +89,15 @@ def main() -> None:
     given = parser.parse_args()
     random = np.random.default_rng(given.seed)
     for number in range(given.count):
-        after_s = float(random.uniform(0.0, LONGEST_S))
+        if number % 2:
+            arguments, longest_s = ("run", str(random.choice(list(EXPERIMENTS))), CONFIG, "--paced"), ONE_S
+        else:
+            arguments, longest_s = ("paper", CONFIG), ALL_S
+        after_s = float(random.uniform(0.0, longest_s))
         with tempfile.TemporaryDirectory() as name:
-            line = check(abort(Path(name), after_s), Path(name))
-        print(f"{number + 1}/{given.count}: after {after_s:.2f} s: {line}", flush=True)
+            line = check(abort(Path(name), after_s, *arguments), Path(name))
+        what = " ".join(argument for argument in arguments if argument != CONFIG)
+        print(f"{number + 1}/{given.count}: {what}, after {after_s:.2f} s: {line}", flush=True)
 
 
 if __name__ == "__main__":
