@@ -42,7 +42,7 @@ class Bench:
         self.options = options_on(1, watchdog_ms=WATCHDOG_MS, park_slew_v_per_s=SLEW_V_PER_S)
         self.drive = exchange(load_frames(self.options), 1, self.options).drive
         self.wire = Wire()
-        self.node = RigNode(self.wire, self.options, ["x"])  # type: ignore[arg-type]
+        self.node = RigNode(self.wire, self.options, ["x"])
         self._hear(0, 0.0)
         self.node.step()
 
