@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -188,3 +189,19 @@ def test_space_that_is_to_stay_free_ends_the_file_well(tmp_path: Path, rows: np.
     with Reader(tmp_path / "run.mcap") as reader:
         assert np.concatenate(list(reader.blocks())).tobytes() == rows[:2000].tobytes()
         assert reader.totals == {"n": 2000}
+
+
+def test_a_growing_file_keeps_little_of_each_chunk_in_memory(tmp_path: Path):
+    """A day without rotation is 350 000 chunks."""
+    chunks = 400
+    rows = make_rows(chunks)
+    writer = Writer(tmp_path / "run.mcap", make_header(), START_UNIX_NS, message_index=True)
+    writer.write_ticks(rows[:1])
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for number in range(1, chunks):
+        writer.write_ticks(rows[number : number + 1])
+    kept = (tracemalloc.get_traced_memory()[0] - before) / (chunks - 1)
+    tracemalloc.stop()
+    writer.close()
+    assert 50 < kept < 400
