@@ -20,7 +20,7 @@ test: $(READY)
 	$(BIN)/pytest -n 2 $(COMPUTING)
 	$(BIN)/pytest $(addprefix --ignore=,$(COMPUTING))
 
-# Some thirty faults on real processes, and a table of what came of them: ten minutes, as root for the full disk.
+# Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)
 	$(BIN)/python -m tests.faults
 
@@ -81,7 +81,7 @@ test-systemd: $(READY)
 	PYTHON='$(abspath $(BIN)/python)' tests/systemd/run
 
 # As root, with debootstrap and qemu-system-x86: the kernel's comedi board, SocketCAN and systemd on a PREEMPT_RT kernel, in
-# an emulated machine: about half an hour.
+# an emulated machine: a quarter of an hour to half an hour.
 rig: $(READY)
 	PYTHON='$(abspath $(BIN)/python)' tests/rig/run
 
