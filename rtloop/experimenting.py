@@ -79,7 +79,7 @@ def run_experiments(
     try:
         made, files = _write(take_and_report(paths), folder, skipped)
     except KeyboardInterrupt:
-        hint = f"`rtloop experiment report {folder}` makes it from the recordings, which are complete"
+        hint = f"`rtloop experiment report {folder}` makes it from the recordings"
         raise LoopFault(f"interrupted, and the report left out: {hint}") from None
     whole = made.whole and not interruption.requested and not problems
     _show(made, files, skipped, as_json, {"interrupted": interruption.requested, "skipped": skipped})

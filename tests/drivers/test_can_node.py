@@ -21,7 +21,7 @@ SILENT = None
 
 
 class Wire:
-    """A bus with one node: messages for it, one at a time; its answers are counted by it."""
+    """A bus with one node: messages for it, one at a time; nobody hears its answers."""
 
     def __init__(self) -> None:
         self.messages: deque[Any] = deque()
