@@ -61,3 +61,15 @@ def test_real_hardware_is_not_run_unpaced(monkeypatch):
     facts = SimDriver.facts.fget
     monkeypatch.setattr(SimDriver, "facts", property(lambda driver: replace(facts(driver), real=True)))
     assert faults(paced=False) == ["driver 'sim' moves real hardware: it cannot run unpaced, in virtual time"]
+
+
+@pytest.mark.parametrize(("slew", "good"), [(1e-12, False), (1e-9, False), (1.999, False), (2.0, True), (1e6, True)])
+def test_every_ramp_to_safe_ends_within_seconds(slew, good):
+    """From 10 V, the end of the channel, in 5 s at most."""
+    change = ("trip_slew_v_per_s = 1000.0", f"trip_slew_v_per_s = {slew}")
+    if good:
+        built(change)
+    else:
+        (found,) = faults(change)
+        assert found.startswith(f"axis.x.limits.trip_slew_v_per_s: {slew:g} takes ")
+        assert found.endswith("from 10 V to safe; 5 s, so at least 2 V/s, are allowed")

@@ -13,7 +13,14 @@ import pytest
 
 MAGIC, OUTPUTS, HIGHEST_CODE = 0xDA9, 4, 65535
 HARDWARE = np.dtype(
-    [("magic", "u4"), ("fail_read", "u4"), ("fail_write", "u4"), ("code", "u4", OUTPUTS), ("range", "u4", OUTPUTS)]
+    [
+        ("magic", "u4"),
+        ("fail_read", "u4"),
+        ("fail_write", "u4"),
+        ("code", "u4", OUTPUTS),
+        ("range", "u4", OUTPUTS),
+        ("mute", "u4"),
+    ]
 )
 OUTPUT_RANGES_V = ((-10.0, 10.0), (0.0, 5.0))
 
@@ -31,10 +38,10 @@ def stub_library() -> Path:
     return library
 
 
-def new_board(path: Path) -> Path:
-    """Hardware as somebody left it: outputs at 7 V."""
+def new_board(path: Path, mute: bool = False, share: float = 0.85) -> Path:
+    """Hardware as somebody left it: outputs at 7 V, or at another share of their range; `mute`: not to be read back."""
     hardware = np.zeros(1, HARDWARE)
-    hardware["magic"], hardware["code"] = MAGIC, round(0.85 * HIGHEST_CODE)
+    hardware["magic"], hardware["code"], hardware["mute"] = MAGIC, round(share * HIGHEST_CODE), mute
     path.write_bytes(hardware.tobytes())
     return path
 

@@ -2,7 +2,7 @@
  *
  * The file is the hardware: it outlives every process, and a test looks at it. Subdevice 0 has eight inputs of 16 bit
  * with the ranges ±10, ±5 and 0 … 5 V, subdevice 1 four outputs of 16 bit with ±10 and 0 … 5 V, subdevice 2 is digital.
- * Input i sees output i; those beyond see 0 V.
+ * Input i sees output i; those beyond see 0 V. Outputs can be read back unless the board is mute.
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -17,7 +17,7 @@
 enum { INPUTS = 8, OUTPUTS = 4, MAXDATA = 65535, AI = 1, AO = 2, DIO = 5 };
 
 typedef struct { double min, max; unsigned unit; } range;
-typedef struct { uint32_t magic, fail_read, fail_write, code[OUTPUTS], range[OUTPUTS]; } hardware;
+typedef struct { uint32_t magic, fail_read, fail_write, code[OUTPUTS], range[OUTPUTS], mute; } hardware;
 typedef struct { int fd; hardware *board; } comedi_t;
 
 static range input_ranges[] = {{-10, 10, 0}, {-5, 5, 0}, {0, 5, 0}, {0, 20, 1}};
@@ -78,6 +78,7 @@ unsigned comedi_get_maxdata(comedi_t *it, unsigned subdevice, unsigned channel) 
 int comedi_data_read(comedi_t *it, unsigned subdevice, unsigned channel, unsigned index, unsigned aref, unsigned *data)
 {
     if (it->board->fail_read) { it->board->fail_read--; return failed(EIO); }
+    if (subdevice == 1 && channel < OUTPUTS && !it->board->mute) { *data = it->board->code[channel]; return 1; }
     if (subdevice != 0 || channel >= INPUTS) return failed(EINVAL);
     range in = input_ranges[index], out = {0};
     double volts = 0.0;

@@ -188,6 +188,29 @@ class OpensWithOutputsAsTheyWere(LoopBack):
         """Leaves the outputs alone."""
 
 
+class MovesWhatItKnows(LoopBack):
+    def start(self) -> None:
+        self.volts = [1.0, 1.0]
+
+    def outputs_v(self) -> Sequence[float]:
+        return self.volts
+
+
+class MovesWhatItCannotKnow(LoopBack):
+    def outputs_v(self) -> None:
+        return None
+
+
+class TellsOfOneOutputOnly(LoopBack):
+    def outputs_v(self) -> Sequence[float]:
+        return self.volts[:1]
+
+
+class IsAtNaN(LoopBack):
+    def outputs_v(self) -> Sequence[float]:
+        return [math.nan, math.nan]
+
+
 class DoesNotPark(LoopBack):
     def close(self) -> None:
         self._callbacks = ()

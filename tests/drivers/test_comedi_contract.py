@@ -41,6 +41,14 @@ class TestOneAxis(DriverContract):
         return [output_v(self.device, int(channel.name[2:])) for channel in driver.facts.outputs]
 
 
+class TestMuteBoard(TestOneAxis):
+    """Its driver in the kernel keeps no record of the outputs."""
+
+    @pytest.fixture(autouse=True)
+    def _board(self, tmp_path: Path) -> None:
+        self.device = new_board(tmp_path / "comedi0", mute=True)
+
+
 class TestTwoAxesAndAnEnableInput(TestOneAxis):
     wiring = CROSSED
     options = {"more_inputs": ["ai7"], "input_subdevice": 0, "output_subdevice": 1, "aref": "diff"}  # noqa: RUF012
@@ -48,6 +56,11 @@ class TestTwoAxesAndAnEnableInput(TestOneAxis):
 
 class TestUnipolarOutput(TestOneAxis):
     """Its lowest code is 0 V; the others cover another range and must stay as they were."""
+
+    @pytest.fixture(autouse=True)
+    def _board(self, tmp_path: Path) -> None:
+        self.device = new_board(tmp_path / "comedi0")
+        hardware(self.device)["range"][0, 0] = 1
 
     options = {"output_range_v": [0, 5], "input_range_v": [0.0, 5.0], "safe_v": 1.0}  # noqa: RUF012
 
@@ -67,6 +80,19 @@ def test_codes_are_the_nearest_and_come_back(tmp_path, volts):
     status, (read_v, age_us) = calls.read()
     assert (status, age_us) == (0, 0.0)
     assert read_v == pytest.approx(output_v(device, 2), abs=1e-9)
+    driver.close()
+
+
+@pytest.mark.parametrize(
+    ("mute", "share", "told_v"), [(False, 0.85, 7.0), (True, 0.85, 0.0), (False, 0.0, 0.0)],
+    ids=["read back", "mute", "the code of a channel that nobody has written"],
+)  # fmt: skip
+def test_an_output_stays_where_it_is_known_to_be(tmp_path, mute, share, told_v):
+    device = new_board(tmp_path / "comedi0", mute, share)
+    driver = comedi(device)
+    driver.open()
+    assert driver.outputs_v() == pytest.approx([told_v], abs=LSB_V)
+    assert output_v(device, 0) == pytest.approx(told_v, abs=LSB_V)
     driver.close()
 
 

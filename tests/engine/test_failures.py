@@ -91,11 +91,36 @@ def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
     assert bench.outcome is Outcome.DRIVER_FAILED
     drive = bench.column(rows, "x_drive_v")
     assert np.all(drive[:26] == 3.0)  # the tick that failed is recorded
-    np.testing.assert_allclose(drive[26:], RAMP, rtol=0, atol=1e-12)
-    assert driver.written == (drive[:25].tolist() if for_good else [*drive[:25], *drive[26:]])
+    if for_good:  # and so are those after it, where the output stays; after a second of them nobody tries any more
+        assert np.all(drive == 3.0)
+        assert len(drive) == 25 + 10_001
+    else:
+        np.testing.assert_allclose(drive[26:], RAMP, rtol=0, atol=1e-12)
+    failed = bench.column(rows, "flags").astype(int) & Flag.WRITE_FAILED != 0
+    assert np.array_equal(failed, np.arange(len(drive)) >= 25 if for_good else np.arange(len(drive)) == 25)
+    assert driver.written == drive[~failed].tolist()
     assert len(tries) == len(drive)
     assert bench.events() == [(25, Kind.DRIVER_FAILED, -1.0, 1.0), (26, Kind.STOP, 0.0, 0.0)]
     assert str(driver.error) == "no such device"
+
+
+@pytest.mark.parametrize("refused", [1, 2, 20, 200])
+def test_a_card_that_refuses_for_a_while_is_not_stepped(refused: int):
+    """It goes on from where it was when it takes values again: each that it takes is one step of the ramp further."""
+    tries: list[int] = []
+
+    def refuse(k: int) -> None:
+        tries.append(k)
+        if 26 <= len(tries) < 26 + refused:
+            raise OSError("busy")
+
+    driver = ScriptedDriver(lambda k: 0.0, refuse)
+    bench = LoopBench(RAW, driver)
+    rows = bench.run(FOR_EVER)
+    assert bench.outcome is Outcome.DRIVER_FAILED
+    assert np.abs(np.diff([3.0, *driver.written])).max() <= 0.1 + 1e-12
+    assert driver.written[-1] == 0.0
+    assert np.count_nonzero(bench.column(rows, "flags").astype(int) & Flag.WRITE_FAILED) == refused
 
 
 def test_a_nan_from_the_driver_holds_then_ramps():

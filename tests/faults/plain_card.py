@@ -37,6 +37,9 @@ class PlainCard(PythonDriver):
     def start(self) -> None:
         self.memory = np.memmap(self.options.file, MEMORY, "r+", shape=(1,))[0]
 
+    def outputs_v(self) -> list[float]:
+        return [float(self.memory["last_v"])]
+
     def read(self) -> tuple[float, float]:
         memory, fault = self.memory, int(self.memory["fault"])
         memory["position_um"] += LAG * (UM_PER_V * memory["last_v"] - memory["position_um"])

@@ -1,18 +1,22 @@
 """Parking after a service that died: what is done about a loop that outlived it. The loop is a real process."""
 
+import mmap
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+import warnings
+from collections.abc import Callable
 from contextlib import contextmanager
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
-from drivers.base import Channel, Facts, Wiring
+from drivers.base import Channel, Facts
 from drivers.python import PythonDriver
-from hil.options import Options
 from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import UnavailableError
 from rtloop.service import parking
@@ -84,31 +88,193 @@ def test_a_service_that_is_alive_is_left_alone(block):
     assert loop.returncode == 0
 
 
-@pytest.mark.parametrize(("parks_itself", "writes"), [(False, [1.5, 1.0, 0.5, 0.0]), (True, [])])
-def test_a_card_that_parks_itself_is_not_driven_back(parks_itself, writes):
-    """From 2 V at 50 V/s and 100 Hz; a card with a watchdog has left its last drive by the time it is parked."""
+class Hardware:
+    """What outlives every process: the output's volts, everything that was written to it, and a death to come.
 
-    class Card(PythonDriver):
-        kind = "card"
-        written: ClassVar[list[float]] = []
+    A process may die at two instants of every write: before it takes effect, and after.
+    """
 
-        @property
-        def facts(self):
-            return Facts((Channel("in"),), (Channel("out"),), hardware_watchdog=parks_itself)
+    def __init__(self, volts: float) -> None:
+        self._memory = np.frombuffer(mmap.mmap(-1, 8 * 4096))
+        self.volts, self.dies_at = volts, 0
 
-        def start(self):
-            self.written.clear()
+    volts = property(lambda self: float(self._memory[0]), lambda self, value: self._memory.__setitem__(0, value))
+    dies_at = property(lambda self: int(self._memory[1]), lambda self, value: self._memory.__setitem__(1, value))
+    instants = property(lambda self: int(self._memory[2]), lambda self, value: self._memory.__setitem__(2, value))
+    count = property(lambda self: int(self._memory[3]), lambda self, value: self._memory.__setitem__(3, value))
 
-        def read(self):
-            return [0.0]
+    @property
+    def written(self) -> list[float]:
+        return self._memory[4 : 4 + self.count].tolist()
 
-        def write(self, volts):
-            self.written.extend(volts)
+    def note(self, volts: float) -> None:
+        self._memory[4 + self.count] = self._memory[0] = volts
+        self.count += 1
 
-        def stop(self):
-            pass
+    def write(self, volts: float) -> None:
+        self._instant()
+        self.note(volts)
+        self._instant()
 
-    wiring = {"x": Wiring("in", "out")}
-    card = Card(Options(), wiring, 100.0)
-    parking.park(card, wiring, ["x"], [2.0], 50.0)
-    assert card.written == [*writes, 0.0]  # `close` writes the safe value
+    def _instant(self) -> None:
+        self.instants += 1
+        if self.instants == self.dies_at:
+            os._exit(9)
+
+    @property
+    def largest_step_v(self) -> float:
+        return max(np.abs(np.diff(self.written)), default=0.0)
+
+
+class Card(PythonDriver):
+    """Says nothing of its outputs: `start` makes them safe."""
+
+    kind = "card"
+    hardware: ClassVar[Hardware]
+    parks_itself = False
+
+    @property
+    def facts(self):
+        return Facts((Channel("in"),), (Channel("out"),), hardware_watchdog=self.parks_itself)
+
+    def start(self):
+        self.hardware.note(self.hardware.volts)
+        self.hardware.note(0.0)
+
+    def read(self):
+        return [0.0]
+
+    def write(self, volts):
+        self.hardware.write(volts[0])
+
+    def stop(self):
+        pass
+
+
+class ReadableCard(Card):
+    """Knows where its outputs are, and leaves them there."""
+
+    def start(self):
+        self.hardware.note(self.hardware.volts)
+
+    def outputs_v(self):
+        return [self.hardware.volts]
+
+
+class MuteCard(ReadableCard):
+    """Leaves its outputs where they are, and cannot be asked."""
+
+    def outputs_v(self):
+        return None
+
+
+class OwnWatchdog(Card):
+    """Goes to safe by itself, and not by our writes."""
+
+    parks_itself = True
+
+    def start(self):
+        self.hardware.volts = 0.0
+
+
+SLEW_V_PER_S, STEP_V, DRIVE_V = 50.0, 0.5, 6.5
+CONFIGURATION = """
+[loop]
+rate_hz = 100
+[driver]
+kind = "card"
+[driver.channels.x]
+input = "in"
+output = "out"
+um_per_v = 10.0
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.limits]
+trip_slew_v_per_s = 50.0
+"""
+
+
+@pytest.fixture
+def parked(tmp_path, monkeypatch):
+    """`rtloop park` for a service that died with its output at DRIVE_V: called with a card, it gives its hardware."""
+    config = tmp_path / "lab.toml"
+    config.write_text(CONFIGURATION.replace("rate_hz = 100", 'rate_hz = 100\nmode = "raw"'))
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    (tmp_path / "run").mkdir(mode=0o700)
+
+    def start(card: type[Card]) -> tuple[Hardware, Callable[[], str]]:
+        for module in ("rtloop.config", "rtloop.prepare", "rtloop.engine.plan"):
+            monkeypatch.setattr(f"{module}.driver_class", lambda kind: card)
+        (tmp_path / "run" / "lab.block").unlink(missing_ok=True)
+        fd = os.open(tmp_path / "run" / "lab.block", os.O_RDWR | os.O_CREAT, 0o600)
+        SharedBlock.create(SIZES, fd)["last_drive_v"][:] = DRIVE_V
+        os.close(fd)
+        Card.hardware = Hardware(DRIVE_V)
+        return Card.hardware, lambda: parking.park_configuration(config)
+
+    return start
+
+
+@pytest.mark.parametrize("card", [Card, ReadableCard, MuteCard, OwnWatchdog])
+def test_what_is_parked_stays_where_it_is(parked, card):
+    hardware, park = parked(card)
+    park()
+    assert hardware.volts == 0.0
+    hardware.count = 0
+    for _ in range(3):
+        park()
+    assert set(hardware.written) <= {0.0}
+
+
+@pytest.mark.parametrize("card", [ReadableCard, MuteCard])
+def test_a_card_that_keeps_its_outputs_is_ramped_from_where_they_are(parked, card):
+    hardware, park = parked(card)
+    assert "6.500 V" in park()
+    assert hardware.written[-1] == 0.0
+    np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
+
+
+def test_a_card_that_its_opening_makes_safe_is_not_driven_back(parked):
+    hardware, park = parked(Card)
+    park()
+    assert set(hardware.written) == {DRIVE_V, 0.0}
+    assert hardware.written.index(0.0) == 1
+
+
+def test_a_card_that_parks_itself_is_not_driven_back(parked):
+    """By the time it is parked, it has left the drive that was noted last."""
+    hardware, park = parked(OwnWatchdog)
+    park()
+    assert set(hardware.written) == {0.0}
+
+
+def in_a_process(work: Callable[[], object]) -> int:
+    """Exit code of a process of its own that does `work`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads, none of which is ours
+        pid = os.fork()
+    if pid == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+@pytest.mark.parametrize("card", [ReadableCard, MuteCard])
+def test_parking_that_dies_at_any_instant_is_gone_on_with(parked, card):
+    """Before or after each single write; whoever parks then begins where the output is."""
+    hardware, park = parked(card)
+    park()
+    instants = hardware.instants
+    assert instants >= 2 * 13
+    for instant in range(1, instants + 1):
+        hardware, park = parked(card)
+        hardware.dies_at = instant
+        assert in_a_process(park) == 9
+        park()
+        assert hardware.volts == 0.0
+        assert hardware.largest_step_v <= STEP_V + 1e-12, f"died at instant {instant}: {hardware.written}"

@@ -1,0 +1,107 @@
+"""Changes of a law that runs: its memory fits what it has become, whatever was longer or shorter before."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.config import parse
+from rtloop.engine.loop import Outcome
+from rtloop.engine.messages import Kind
+from rtloop.law.reference import Generator
+from rtloop.prepare import prepare
+from rtloop.signals import Mode
+from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text
+
+LENGTHS = 0, 1, 3, 64, 128
+SECTION = "[0.02, 0.04, 0.02, -1.56, 0.64]"
+REFERENCE = '[axis.reference]\nkind = "hold"\nvalue = 20.0\n'
+
+
+def prefilter(taps: int, sections: int = 0) -> str:
+    """A configuration with a moving average over so many ticks, and so many low-passes."""
+    average = ", ".join([repr(1 / taps)] * taps) if taps else ""
+    return f"[axis.prefilter]\ntaps = [{average}]\nsections = [{', '.join([SECTION] * sections)}]\n"
+
+
+def configuration(taps: int, sections: int = 0, mode: str = "closed_loop") -> str:
+    return text(IDEAL, AXIS, CONTROLLER, prefilter(taps, sections), REFERENCE, mode=mode)
+
+
+def load(bench: LoopBench, other: str) -> None:
+    """Have the running law replaced by that of another configuration."""
+    law = prepare(parse(other, "other", Path(), "other"), paced=False).plan.coefficients.tobytes()
+    bench.block["staged"][: len(law)] = np.frombuffer(law, np.uint8)
+    bench.send(Kind.LOAD_LAW, 1.0, axis=0)
+
+
+@pytest.mark.parametrize(("before", "after"), [*permutations(LENGTHS, 2)])
+def test_taps_of_any_length_follow_taps_of_any_other(before: int, after: int):
+    """The index stays within the taps, nothing behind them is written, and a constant reference stays where it is."""
+    bench = LoopBench(configuration(before))
+    bench.run(1999)
+    load(bench, configuration(after))
+    beyond = bench.law.axes["tap_history"][0, max(before, after) :].copy()
+    bench.run(1)
+    for _ in range(3):
+        index = int(bench.law.axes["tap_index"][0])
+        assert 0 <= index < max(after, 1)
+        rows = bench.run(77)
+        np.testing.assert_allclose(bench.column(rows, "x_error_um") + bench.column(rows, "x_position_um"), 20.0)
+    assert bench.law.axes["tap_history"][0, max(before, after) :].tobytes() == beyond.tobytes()
+
+
+@pytest.mark.parametrize(("before", "after"), [*permutations((0, 1, 2, 12), 2)])
+def test_sections_of_any_number_follow_any_other(before: int, after: int):
+    bench = LoopBench(configuration(5, before))
+    bench.run(4000)
+    load(bench, configuration(7, after))
+    rows = bench.run(500)
+    np.testing.assert_allclose(bench.column(rows, "x_error_um") + bench.column(rows, "x_position_um"), 20.0)
+
+
+def test_other_sections_begin_at_rest_too():
+    """A filter of another bandwidth would take the old one's memory for a jump of its own."""
+    bench = LoopBench(configuration(0, 1))
+    bench.run(4000)
+    load(bench, configuration(0, 1).replace(SECTION, "[0.25, 0.5, 0.25, 0.0, 0.0]"))
+    rows = bench.run(500)
+    np.testing.assert_allclose(bench.column(rows, "x_error_um") + bench.column(rows, "x_position_um"), 20.0)
+
+
+@pytest.mark.parametrize("sections", [0, 2])
+def test_a_closed_loop_is_entered_without_the_volts_that_the_taps_hold(sections: int):
+    """Raw mode at −5 V, then 20 µm in closed loop: the position comes to 20 µm and not beyond."""
+    bench = LoopBench(configuration(128, sections, mode="raw"))
+    bench.send(Kind.SET_REFERENCE, Generator.HOLD, -5.0)
+    bench.run(2000)
+    bench.send(Kind.SET_REFERENCE, Generator.HOLD, 20.0)
+    bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP)
+    rows = bench.run(6000)
+    asked = bench.column(rows, "x_error_um") + bench.column(rows, "x_position_um")
+    np.testing.assert_allclose(asked, 20.0)
+    assert bench.column(rows, "x_position_um").max() < 20.5
+    assert bench.column(rows, "x_position_um")[-1] == pytest.approx(20.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("play_count", 255), ("order", 32), ("tap_count", 4096), ("section_count", 1000), ("row_stop", 255)],
+)
+def test_a_count_beyond_its_record_is_a_trip_and_not_a_write(name: str, value: int):
+    """What no check has seen ends the run by a status; what lies behind the state is as it was."""
+    bench = LoopBench(configuration(4, 1))
+    bench.run(100)
+    bench.events()
+    drive_v = float(bench.block["last_drive_v"][0])
+    state = bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes()
+    bench.law.coefficients["coupled"] = 1
+    bench.law.coefficients[name] = value
+    bench.run(10)
+    assert bench.outcome is Outcome.LAW_FAILED
+    assert [kind for _, kind, *_ in bench.events()] == [Kind.TRIPPED]
+    assert bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes() == state
+    assert bench.block["last_drive_v"][0] == pytest.approx(drive_v, abs=0.05)

@@ -1,0 +1,91 @@
+"""A command that nobody waits for any more is withdrawn: it takes effect, or it was refused, and never both."""
+
+from __future__ import annotations
+
+import os
+import warnings
+
+import pytest
+
+from rtloop.engine.commands import QueueFull, send, withdraw
+from rtloop.engine.memory import COMMAND_SLOTS, URGENT_SLOTS, Word
+from rtloop.engine.messages import Kind, message
+from rtloop.errors import RtloopError
+from rtloop.service import desk as desk_module
+from rtloop.service.desk import Desk, Refused
+from rtloop.signals import Mode
+from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text
+
+TRIES = 3000
+RAW = text(IDEAL, AXIS, CONTROLLER, mode="raw")
+
+
+def hold(value: float):
+    return message(Kind.SET_REFERENCE, values=[0.0, value])
+
+
+def test_what_was_refused_is_not_applied_when_the_loop_goes_on(monkeypatch):
+    monkeypatch.setattr(desk_module, "ANSWER_TIMEOUT_S", 0.02)
+    bench = LoopBench(RAW)
+    bench.run(10)
+    with pytest.raises(Refused, match="did not answer within"):
+        Desk(bench.block).submit(Kind.SET_REFERENCE, axis=0, values=[0.0, 3.0])
+    rows = bench.run(10)
+    assert bench.column(rows, "x_reference_um").tolist() == [0.0] * 10
+    assert bench.events() == []
+
+
+def test_what_the_loop_has_taken_is_not_called_refused(monkeypatch):
+    """It stopped between taking the command and saying so: the answer must not be that nothing happens."""
+    monkeypatch.setattr(desk_module, "ANSWER_TIMEOUT_S", 0.02)
+    bench = LoopBench(RAW)
+    monkeypatch.setattr(desk_module, "withdraw", lambda block, position: False)
+    with pytest.raises(RtloopError, match="has taken it") as caught:
+        Desk(bench.block).submit(Kind.SET_REFERENCE, axis=0, values=[0.0, 3.0])
+    assert not isinstance(caught.value, Refused)
+
+
+def test_others_around_it_take_effect_in_their_order():
+    bench = LoopBench(RAW)
+    positions = [send(bench.block, hold(value)) for value in (1.0, 2.0, 3.0)]
+    assert withdraw(bench.block, positions[1])
+    assert not withdraw(bench.block, positions[1])
+    bench.run(1)
+    assert [event[3] for event in bench.events()] == [1.0, 3.0]
+    assert not withdraw(bench.block, positions[0])
+
+
+def test_exactly_one_of_loop_and_producer_gets_each_command():
+    """Both try at the same time, in processes of their own."""
+    bench = LoopBench(RAW)
+    bench.run(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads, none of which is ours
+        pid = os.fork()
+    if pid == 0:
+        while not bench.block.words[Word.STOP]:
+            bench.assembly.run(int(bench.assembly.loop.tick) + 1)
+        os._exit(0)
+    withdrawn = sum(withdraw(bench.block, send(bench.block, hold(0.0))) for _ in range(TRIES))
+    while bench.block.words[Word.COMMANDS_TAIL] != TRIES:
+        os.sched_yield()
+    bench.block.words[Word.STOP] = 1
+    os.waitpid(pid, 0)
+    taken = sum(event == Kind.SET_REFERENCE for event in bench.drain("events")["kind"])
+    assert taken + withdrawn == TRIES
+    assert withdrawn > 0
+
+
+def test_a_flood_leaves_room_for_what_makes_safe():
+    bench = LoopBench(RAW)
+    for _ in range(COMMAND_SLOTS):
+        send(bench.block, hold(1.0))
+    with pytest.raises(QueueFull):
+        send(bench.block, hold(1.0))
+    off = message(Kind.SET_MODE, values=[float(Mode.OFF)])
+    for _ in range(URGENT_SLOTS):
+        send(bench.block, off, urgent=True)
+    with pytest.raises(QueueFull):
+        send(bench.block, off, urgent=True)
+    rows = bench.run(COMMAND_SLOTS)
+    assert bench.column(rows, "mode")[-1] == Mode.OFF

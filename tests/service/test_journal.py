@@ -1,0 +1,69 @@
+"""Nobody waits for a log: a full pipe costs lines, and neither a tick nor a parking."""
+
+from __future__ import annotations
+
+import logging
+import os
+
+import pytest
+
+from rtloop.service.journal import Journal
+
+
+@pytest.fixture
+def pipe():
+    """Reading and writing end of a pipe that is full."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    size = 0
+    while True:
+        try:
+            size += os.write(writing, b"x" * 4096)
+        except BlockingIOError:
+            break
+    os.set_blocking(writing, True)
+    yield reading, writing, size
+    os.close(reading)
+
+
+def record(text: str) -> logging.LogRecord:
+    return logging.LogRecord("test", logging.INFO, __file__, 1, text, None, None)
+
+
+def read(reading: int, size: int) -> bytes:
+    data = b""
+    while len(data) < size:
+        data += os.read(reading, size - len(data))
+    return data
+
+
+def test_a_full_pipe_holds_nobody_up_and_what_was_lost_is_counted(pipe):
+    reading, writing, size = pipe
+    journal = Journal(writing, lines=3)
+    for number in range(10):
+        journal.emit(record(f"line {number}"))  # the test would stand still here
+    assert read(reading, size) == b"x" * size
+    found = read(reading, len(b"line 0\n"))
+    while b"lost here" not in found:
+        found += os.read(reading, 4096)
+    written = [line for line in found.decode().splitlines() if line.startswith("line")]
+    assert written == [f"line {number}" for number in range(len(written))]
+    assert f"({10 - len(written)} lines were lost here: nobody read them)" in found.decode()
+
+
+def test_a_reader_that_has_gone_is_no_error():
+    reading, writing = os.pipe()
+    os.close(reading)
+    journal = Journal(writing)
+    journal.emit(record("anybody there?"))
+    journal.flush()
+
+
+def test_what_was_said_last_is_written_before_the_end():
+    reading, writing = os.pipe()
+    journal = Journal(writing)
+    for number in range(100):
+        journal.emit(record(f"line {number}"))
+    journal.flush()
+    assert len(os.read(reading, 1 << 16).splitlines()) == 100
+    os.close(reading)
