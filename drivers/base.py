@@ -86,7 +86,19 @@ class Driver(ABC):
 
     @abstractmethod
     def open(self) -> Pointers:
-        """Take the hardware. Raises DriverError. What the pointers refer to lives until `close`."""
+        """Take the hardware. Raises DriverError. What the pointers refer to lives until `close`.
+
+        Outputs that the card can read back stay where they are; the others are at their safe values afterwards.
+        """
+
+    def outputs_v(self) -> Sequence[float] | None:
+        """Volts at the outputs (in the order of the facts) of a driver that was opened and has not written yet.
+
+        Read back where the card can. The default is for a card that cannot, and that `open` has made safe. None is for
+        one that keeps its outputs while it is opened and that nobody can ask: they are then taken to be at the drives
+        that the loop noted last. A card that parks itself (`hardware_watchdog`) counts as safe. Raises DriverError.
+        """
+        return [channel.safe_v for channel in self.facts.outputs]
 
     @abstractmethod
     def close(self) -> None:

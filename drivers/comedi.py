@@ -138,6 +138,7 @@ class ComediDriver(Driver):
         self._board: Board | None = None
         self._context = np.zeros(1, CONTEXT)
         self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
+        self._outputs_v: list[float] | None = None
         for axis, wire in wiring.items():
             _require_name(f"channels.{axis}.input", wire.input, Kind.INPUT)
             _require_name(f"channels.{axis}.output", wire.output, Kind.OUTPUT)
@@ -169,18 +170,25 @@ class ComediDriver(Driver):
         return DriverError(f"{self._options.device}: {where}: {self._board.last_error()}")
 
     def open(self) -> Pointers:
-        """Take the board's subdevices, outputs to `safe_v`. Raises DriverError."""
+        """Take the board's subdevices; outputs to `safe_v`, unless all can be read back. Raises DriverError."""
         options = self._options
         self._board = Board(options.library, options.device)
         try:
             inputs = self._lines(Kind.INPUT, options.input_subdevice, self._inputs)
             outputs = self._lines(Kind.OUTPUT, options.output_subdevice, self._outputs)
             self._fill(inputs, outputs, np.zeros(1, np.uint32))
-            self._park()
+            self._outputs_v = self._read_back(outputs)
+            if self._outputs_v is None:
+                self._park()
+                self._outputs_v = [options.safe_v] * len(self._outputs)
         except DriverError:
             self._release()
             raise
         return Pointers(self._context.ctypes.data, comedi_read.address, comedi_write.address)
+
+    def outputs_v(self) -> list[float] | None:
+        """Where `open` found the outputs, or put them."""
+        return self._outputs_v
 
     def close(self) -> None:
         """All outputs to `safe_v`, and the board free for another. Raises DriverError where they cannot be."""
@@ -208,6 +216,17 @@ class ComediDriver(Driver):
         context["inputs"], context["outputs"], context["code"] = (array.ctypes.data for array in self._arrays)
         context["input_count"], context["output_count"] = inputs.size, outputs.size
         context["failed_input"] = context["failed_output"] = -1
+
+    def _read_back(self, outputs: np.ndarray[Any, Any]) -> list[float] | None:
+        """Volts at the outputs; None where one of them cannot be known."""
+        assert self._board is not None
+        volts = []
+        for line in outputs:
+            code = self._board.code(tuple(line.tolist()))
+            if code is None:
+                return None
+            volts.append(float(line["lowest_v"] + code * line["lsb_v"]))
+        return volts
 
     def _park(self) -> None:
         safe = np.full(len(self._outputs), self._options.safe_v)

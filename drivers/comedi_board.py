@@ -118,6 +118,18 @@ class Board:
         lsb_v = (range_v[1] - range_v[0]) / highest_code
         return subdevice, channel, index, AREFS[aref], range_v[0], lsb_v, highest_code
 
+    def code(self, line: tuple) -> int | None:
+        """The code at an output, as the kernel remembers it; None where it does not.
+
+        Before anything was written it remembers 0, wherever the output is: that is not believed at the lower end of a
+        range with two signs.
+        """
+        subdevice, channel, index, aref, lowest_v, *_ = line
+        code = c_uint(0)
+        if self._library.comedi_data_read(self._handle, subdevice, channel, index, aref, ctypes.byref(code)) < 0:
+            return None
+        return None if code.value == 0 and lowest_v < 0 else code.value
+
     def close(self) -> None:
         """Let the board and its subdevices go."""
         self._library.comedi_close(self._handle)

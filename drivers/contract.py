@@ -116,10 +116,26 @@ class DriverContract:
         finally:
             driver.close()
 
-    def test_open_leaves_the_outputs_safe(self) -> None:
-        """Whatever they were before."""
-        with self.opened() as (driver, _):
-            self._require_outputs(driver, [channel.safe_v for channel in driver.facts.outputs], "open")
+    def test_open_says_where_the_outputs_are(self) -> None:
+        """Where somebody left them, if the card knows that; else at their safe values. `outputs_v` says it.
+
+        Parking ramps from there: a card that says otherwise is stepped. One that parks itself may be on its way.
+        """
+        driver = self.driver()
+        found = self.outputs(driver)
+        driver.open()
+        try:
+            told, now, channels = driver.outputs_v(), self.outputs(driver), driver.facts.outputs
+            if told is not None:
+                assert len(told) == len(channels), f"outputs_v() is {told}; {len(channels)} values are needed"
+                assert all(map(math.isfinite, told)), f"outputs_v() is {told}; finite numbers are needed"
+            if found is not None and now is not None and not driver.facts.hardware_watchdog:
+                self._require_outputs(driver, found if told is None else told, f"open, with outputs_v() {told},")
+                for channel, before, after in zip(channels, found, now, strict=True):
+                    stayed = min(abs(after - before), abs(after - channel.safe_v)) <= self.tolerance_v
+                    assert stayed, f"{channel}: open moved it from {before} V to {after} V, which is not safe_v"
+        finally:
+            driver.close()
 
     def test_read_fills_every_value(self) -> None:
         """Inputs within their ranges, an age of 0 µs or more, as many observed signals as the facts say; no more."""

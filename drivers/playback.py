@@ -9,7 +9,7 @@ from drivers.base import Pointers
 from hil.compiled import cfunc
 from hil.pointers import SIGNATURE, address_pointer, carray
 
-CONTEXT = np.dtype([("rows", np.int64), ("columns", np.int64), ("row", np.int64), ("address", np.int64)])
+CONTEXT = np.dtype([(name, np.int64) for name in ("rows", "columns", "row", "address", "refusals")])
 EXHAUSTED = 1
 TIMING_COLUMNS = 4
 """A row begins with what the clock said, as a driver's `wait` fills it; then the read's status; then its values."""
@@ -44,8 +44,12 @@ def playback_read(context, values):
 
 @cfunc(SIGNATURE)
 def playback_write(context, values):
-    """Accept and ignore: the caller compares what the loop recorded."""
-    return 0
+    """Refuse what was refused, and ignore the rest: the caller compares what the loop recorded."""
+    tape = carray(context, 1, CONTEXT)[0]
+    if tape.refusals == 0:
+        return 0
+    refused = carray(address_pointer(tape.refusals), tape.rows, np.bool_)
+    return -1 if refused[tape.row - 1] else 0
 
 
 class Playback:
@@ -54,10 +58,13 @@ class Playback:
     def __init__(self) -> None:
         self._context = np.zeros(1, CONTEXT)
         self._rows: npt.NDArray[np.float64] = np.empty((0, TIMING_COLUMNS + 1))
+        self._refused: npt.NDArray[np.bool_] | None = None
 
-    def load(self, rows: npt.NDArray[np.float64]) -> None:
-        """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed)."""
+    def load(self, rows: npt.NDArray[np.float64], refused: npt.NDArray[np.bool_] | None = None) -> None:
+        """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed); `refused` (n,) writes fail again."""
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
+        self._refused = None if refused is None else np.ascontiguousarray(refused)
+        self._context["refusals"] = 0 if self._refused is None else self._refused.ctypes.data
         self._context["rows"], self._context["columns"] = self._rows.shape
         self._context["row"], self._context["address"] = 0, self._rows.ctypes.data
 

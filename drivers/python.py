@@ -27,7 +27,7 @@ class PythonDriver(Driver):
 
     @abstractmethod
     def start(self) -> None:
-        """Take the hardware, outputs at their safe values. Raises DriverError."""
+        """Take the hardware; outputs at safe, unless `outputs_v` says where they are. Raises DriverError."""
 
     @abstractmethod
     def read(self) -> Sequence[float]:

@@ -15,14 +15,15 @@ from pydantic import Field
 from drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
 from drivers.errors import DriverError
 from hil import board
-from hil.board import HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, BoardMemory, latest_sample
+from hil.atomics import load_acquire, store_release
+from hil.board import FIFO, HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, WRITTEN, BoardMemory, latest_sample
 from hil.compiled import cfunc
 from hil.monotonic import monotonic_ns
 from hil.options import BoardOptions
 from hil.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype(
-    [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "adc_codes")]
+    [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "fifo", "adc_codes")]
     + [(name, np.int64) for name in ("copied", "held", "held_ns", "timespec")]
 )
 TRIES = 1000
@@ -63,13 +64,19 @@ def shm_read(context, values):
 
 @cfunc(SIGNATURE)
 def shm_write(context, values):
-    """Codes nearest to the volts."""
+    """Codes nearest to the volts, at the converters and in the card's record of its writes."""
     card = carray(context, 1, CONTEXT)[0]
     codes = carray(address_pointer(card.dac_codes), MAX_CHANNELS, np.int64)
+    words = carray(address_pointer(card.words), board.WORDS, np.uint64)
+    fifo = carray(address_pointer(card.fifo), (FIFO, MAX_CHANNELS), np.int64)
     out = carray(values, card.channels)
+    number = load_acquire(words, WRITTEN)
     for i in range(card.channels):
         code = np.int64(np.rint(out[i] / LSB_V))
-        codes[i] = LOWEST_CODE if code < LOWEST_CODE else (HIGHEST_CODE if code > HIGHEST_CODE else code)
+        code = LOWEST_CODE if code < LOWEST_CODE else (HIGHEST_CODE if code > HIGHEST_CODE else code)
+        fifo[np.int64(number % np.uint64(FIFO)), i] = code
+        codes[i] = code
+    store_release(words, WRITTEN, number + np.uint64(1))
     return 0
 
 
@@ -122,11 +129,17 @@ class ShmDriver(Driver):
         context = np.zeros(1, CONTEXT)
         context["channels"], context["held_ns"] = len(self.wiring), -1
         arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "dac_codes": memory.dac_codes,
-                  "adc_codes": memory.adc_codes, "copied": copied, "timespec": timespec, "held": held}  # fmt: skip
+                  "fifo": memory.fifo, "adc_codes": memory.adc_codes, "copied": copied, "timespec": timespec,
+                  "held": held}  # fmt: skip
         for name, array in arrays.items():
             context[name] = array.ctypes.data
         self._arrays = context, copied, held, timespec
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
+
+    def outputs_v(self) -> list[float]:
+        """What stands at the board's converters."""
+        assert self._memory is not None
+        return (self._memory.dac_codes[: len(self.wiring)] * LSB_V).tolist()
 
     def close(self) -> None:
         """All outputs to 0 V, and the board free for another."""

@@ -94,6 +94,10 @@ class SimDriver(Driver):
         self._context["coefficients"], self._context["state"] = coefficients.ctypes.data, state.ctypes.data
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
 
+    def outputs_v(self) -> list[float]:
+        """As the DACs render them."""
+        return self.dac_v
+
     @property
     def dac_v(self) -> list[float]:
         """What each DAC was given last, as it renders it."""

@@ -62,6 +62,11 @@ class Plan:
         samples = self.table.size + self.spare_samples
         return Sizes(len(self.columns), axes, self.pacing.rate_hz, snapshot_bytes(axes), samples)
 
+    @property
+    def trip_slew_v_per_s(self) -> float:
+        """Of the ramp of a trip, a stop or a parking: the slowest of the axes'."""
+        return float(np.min(self.coefficients["trip_slew_v_per_tick"])) * self.pacing.rate_hz
+
     def driver(self) -> Driver:
         """The driver, not open. Raises ValueError or DriverError."""
         kind = driver_class(self.driver_kind)

@@ -24,6 +24,7 @@ from rtloop.engine.clock import clock_context, paced_clock, unpaced_clock
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
+from rtloop.engine.ramp import found_v, ramp_to_safe
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
 from rtloop.engine.rehearsal import rehearse
 from rtloop.errors import ConfigError, LoopFault, RefusedError, RtloopError, UnavailableError
@@ -33,6 +34,7 @@ EXIT_CODES = {
     Outcome.STOPPED: 0,
     Outcome.DRIVER_FAILED: UnavailableError.exit_code,
     Outcome.HEARTBEAT_LOST: LoopFault.exit_code,
+    Outcome.LAW_FAILED: LoopFault.exit_code,
 }
 STDOUT = 1
 START_DELAY_NS = 20_000_000
@@ -96,7 +98,9 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
         die_with_parent()
         ring = block.ring("ticks")
         clock = unpaced_clock(context, ring.head, block.words, Word.RECORDER_CURSOR, ring.marks.size // 2)
-    assembly = Assembly(plan, block, facts, driver.open(), clock, law_at_rest(plan))
+    pointers = driver.open()
+    ramp_to_safe(driver, pointers, found_v(driver, None), plan.trip_slew_v_per_s)  # as somebody who died left them
+    assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
     freeze_garbage_collection()
     realtime = prepare_realtime(plan.pacing)
@@ -115,12 +119,15 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
         context.start_ns = time.monotonic_ns() + START_DELAY_NS
         block.words[Word.START_UNIX_NS] = time.time_ns() + START_DELAY_NS
     block.words[Word.LOOP_STATE] = ProcessState.RUNNING
-    outcome = assembly.run(UNLIMITED if plan.ticks is None else plan.ticks)
-    block.words[Word.FINISHED_TICKS] = assembly.loop.tick
-    if outcome is Outcome.DONE:
-        block.words[Word.STOP] = 1  # ramp down, after the ticks that are recorded
-        assembly.run(UNLIMITED)
-    return outcome
+    try:
+        outcome = assembly.run(UNLIMITED if plan.ticks is None else plan.ticks)
+        block.words[Word.FINISHED_TICKS] = assembly.loop.tick
+        if outcome is Outcome.DONE:
+            block.words[Word.STOP] = 1  # ramp down, after the ticks that are recorded
+            assembly.run(UNLIMITED)
+        return outcome
+    finally:
+        ramp_to_safe(driver, pointers, assembly.outputs_v, plan.trip_slew_v_per_s)  # where the loop did not
 
 
 def _driver_error(driver: Driver) -> str | None:

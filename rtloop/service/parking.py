@@ -1,29 +1,26 @@
-"""Parking: bring outputs to their safe values without the loop, ramping from the last known drive."""
+"""Parking: bring outputs to their safe values without the loop, ramping from where they are."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Driver, Wiring, index_of
+from drivers.base import Driver
 from drivers.errors import DriverError
 from rtloop.config import load
 from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
 from rtloop.errors import UnavailableError
 from rtloop.prepare import prepare
 from rtloop.service.paths import block_path
 
-_WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
-SHORTEST_PERIOD_S = 0.0001
-"""The ramp takes its steps at the loop's rate, like the loop's own, but no faster than an interpreter can."""
 POLL_S = 0.005
 KILL_S = 5.0
 MARGIN_S = 2.0
@@ -33,24 +30,18 @@ MARGIN_S = 2.0
 def park_configuration(config: Path) -> str:
     """Park the outputs of a configuration in place of a service that died; what was done, in words.
 
-    A loop that outlived its service is given the time to ramp down by itself, and killed if it does not. The last
-    drive comes from the service's shared block. Where there is none, nobody knows it, and the outputs go to their
-    safe values at once. Raises ConfigError, DriverError, UnavailableError while the service is alive.
+    A loop that outlived its service is given the time to ramp down by itself, and killed if it does not. Raises
+    ConfigError, DriverError, UnavailableError while the service is alive.
     """
     configuration = load(config)
     plan = prepare(configuration).plan
-    slew = float(np.min(plan.coefficients["trip_slew_v_per_tick"])) * plan.pacing.rate_hz
-    last_v: list[float] | None = None
     with _last_block(block_path(configuration)) as block:
+        noted_v = None
         if block is not None:
-            _await_end(block, plan.pacing.heartbeat_timeout_s, slew)
-            last_v = block["last_drive_v"].tolist()
-    if last_v is None or len(last_v) != len(plan.axes):
-        start, last_v = "an unknown drive", [0.0] * len(plan.axes)
-    else:
-        start = ", ".join(f"{value:.3f} V" for value in last_v)
-    park(plan.driver(), plan.wiring, plan.axes, last_v, slew)
-    return f"{configuration.name}: parked from {start}"
+            _await_end(block, plan.pacing.heartbeat_timeout_s, plan.trip_slew_v_per_s)
+            noted_v = block["last_drive_v"] if len(block["last_drive_v"]) == len(plan.axes) else None
+        from_v = park(plan.driver(), plan.trip_slew_v_per_s, noted_v)
+    return f"{configuration.name}: parked from {', '.join(f'{value:.3f} V' for value in from_v)}"
 
 
 @contextmanager
@@ -86,42 +77,22 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
         time.sleep(POLL_S)
 
 
-def ramp(
-    last_v: npt.NDArray[np.float64], safe_v: npt.NDArray[np.float64], step_v: float
-) -> list[npt.NDArray[np.float64]]:
-    """Rows from `last_v` (exclusive) to `safe_v` (inclusive), no value moving by more than `step_v` a row."""
-    rows = []
-    now_v = last_v
-    while not np.array_equal(now_v, safe_v):
-        now_v = np.clip(safe_v, now_v - step_v, now_v + step_v)
-        rows.append(now_v)
-    return rows
+def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:
+    """Ramp every output from where it is to its safe value, then close the driver; where they were, in V.
 
-
-def park(
-    driver: Driver,
-    wiring: Mapping[str, Wiring],
-    axes: Sequence[str],
-    last_drive_v: Sequence[float],
-    slew_v_per_s: float,
-) -> None:
-    """Ramp every axis from `last_drive_v` to its safe value, then close the driver. Raises DriverError.
-
-    A card with a watchdog of its own is no longer where it was: it has gone to its safe values, or is on its way.
+    `noted_v` (axes,) is where the axes' drives were noted last, and is kept up to date: it counts where the card cannot
+    say it. What is parked already does not move. Raises DriverError.
     """
-    outputs, parks_itself = driver.facts.outputs, driver.facts.hardware_watchdog
-    safe_v = np.array([channel.safe_v for channel in outputs])
-    last_v = safe_v.copy()
-    for axis, drive_v in zip(axes, last_drive_v, strict=True):
-        last_v[index_of(outputs, wiring[axis].output)] = drive_v
     pointers = driver.open()
     try:
-        write = _WRITE(pointers.write)
-        period_s = max(1.0 / driver.rate_hz, SHORTEST_PERIOD_S)
-        for row in [] if parks_itself else ramp(last_v, safe_v, slew_v_per_s * period_s):
-            values = np.ascontiguousarray(row)
-            if write(pointers.context, values.ctypes.data) < 0:
-                raise DriverError(f"{driver.kind}: write failed while parking at {row.tolist()} V")
-            time.sleep(period_s)
+        from_v, index = found_v(driver, noted_v), output_indices(driver)
+
+        def note(outputs_v: npt.NDArray[np.float64]) -> None:
+            if noted_v is not None:
+                noted_v[:] = outputs_v[index]
+
+        ramp_to_safe(driver, pointers, from_v, slew_v_per_s, note)
+        note(safe_outputs_v(driver))
+        return from_v.tolist()
     finally:
         driver.close()
