@@ -54,6 +54,22 @@ def store_release(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
+def exchanged(typingctx: Any, array: Any, index: Any, expected: Any, wanted: Any) -> Any:
+    """Set word `index` of a uint64 array to `wanted` if it is `expected`, at once; whether it was.
+
+    Of several that try, in whatever processes, exactly one gets True.
+    """
+    if not _is_words(array):
+        return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
+        return builder.extract_value(builder.cmpxchg(pointer, arguments[2], arguments[3], "seq_cst"), 1)
+
+    return types.boolean(array, types.intp, WORD, WORD), codegen
+
+
+@intrinsic
 def fence_acquire(typingctx: Any) -> Any:
     """No later load or store moves before an earlier load."""
 

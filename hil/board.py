@@ -26,7 +26,7 @@ from hil.options import BoardOptions
 from hil.rig import advance, build_rig, sample
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
-VERSION = 1
+VERSION = 2
 MAX_CHANNELS = 16
 BITS = 16
 FULL_SCALE_V = 10.0
@@ -38,20 +38,25 @@ BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
 """First in the file, written once."""
-WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS, DROPPED, REPEATED = 8, 0, 1, 2, 3, 4
+WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS, DROPPED, REPEATED, WRITTEN, TAKEN, UNSEEN = 8, *range(8)
 """uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, how late the board's own
-clock ever was (between two looks at its outputs lay at most so much more than its period), and how many samples were
-dropped and repeated."""
+clock ever was (between two looks at its outputs lay at most so much more than its period), how many samples were
+dropped and repeated, how many writes there were, how many of them the board has looked at, and how many it came too
+late to see."""
+FIFO = 1 << 14
+"""Writes that the card keeps until the board has seen them."""
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 SEEN = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("largest_step_v", np.float64), ("last_v", np.float64),
      ("true_position_um", np.float64), ("largest_position_um", np.float64), ("moved_ns", np.int64),
-     ("looked_ns", np.int64), ("largest_rate_v_per_s", np.float64)]
+     ("looked_ns", np.int64), ("largest_rate_v_per_s", np.float64), ("written_v", np.float64),
+     ("largest_write_step_v", np.float64)]
 )  # fmt: skip
 """What an output did; `moved_ns`: CLOCK_MONOTONIC when it last changed.
 
 `largest_rate_v_per_s` is the largest step over the time since the board looked before and two periods more: a ramp
 that moves by its slew once a period never exceeds its slew here, however late board or controller are.
+`largest_write_step_v` is the largest step from one write to the next, of all writes, however late the board sees them.
 """
 LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
 """How often samples are lost, and the state of the chance that decides."""
@@ -60,7 +65,7 @@ _UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
 class BoardMemory:
-    """Arrays over a board's file: `facts`, `words`, `dac_codes`, `adc_codes`, `sample_ns`, `seen`."""
+    """Arrays over a board's file: `facts`, `words`, `dac_codes`, `fifo`, `adc_codes`, `sample_ns`, `seen`."""
 
     def __init__(self, fd: int) -> None:
         self._map = mmap.mmap(fd, file_bytes())
@@ -71,6 +76,7 @@ class BoardMemory:
             offset += _aligned(dtype.itemsize * count)
         self.facts, self.words, self.sample_ns = arrays["facts"], arrays["words"], arrays["sample_ns"]
         self.dac_codes, self.adc_codes = arrays["dac_codes"], arrays["adc_codes"]
+        self.fifo = arrays["fifo"].reshape(FIFO, MAX_CHANNELS)
         self.seen = arrays["seen"].view(np.recarray)
         self._arrays = tuple(arrays.values())
 
@@ -87,6 +93,7 @@ _LAYOUT: dict[str, tuple[np.dtype, int]] = {
     "dac_codes": (np.dtype(np.int64), MAX_CHANNELS),
     "adc_codes": (np.dtype(np.int64), MAX_CHANNELS),
     "seen": (SEEN, MAX_CHANNELS),
+    "fifo": (np.dtype(np.int64), FIFO * MAX_CHANNELS),
 }
 
 
@@ -126,8 +133,8 @@ def serve(
         losses = np.zeros(1, LOSSES).view(np.recarray)
         losses.word = seed_word(options.seed, "losses")
         losses.dropped_share, losses.repeated_share = options.dropped_share, options.repeated_share
-        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.dac_codes, memory.adc_codes,
-                     memory.seen, losses, timespec.ctypes.data)  # fmt: skip
+        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.dac_codes, memory.fifo,
+                     memory.adc_codes, memory.seen, losses, timespec.ctypes.data)  # fmt: skip
         _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
@@ -162,6 +169,7 @@ def _run(
     words,
     sample_ns,
     dac_codes,
+    fifo,
     adc_codes,
     seen,
     losses,
@@ -193,6 +201,7 @@ def _run(
         if dated and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
+        _read_fifo(words, fifo, dac_codes, seen, coefficients.shape[0])
         look_ns = monotonic_ns(timespec)
         for i in range(coefficients.shape[0]):
             volts = seen[i].last_v if fault == STUCK_OUTPUT else dac_codes[i] * LSB_V
@@ -226,6 +235,30 @@ def _look(seen, state, index):
     seen.true_position_um = state.true_position_um
     if abs(state.true_position_um) > seen.largest_position_um:
         seen.largest_position_um = abs(state.true_position_um)
+
+
+@jit
+def _read_fifo(words, fifo, dac_codes, seen, channels):
+    """See every write that was not seen yet, and then what stands at the converters."""
+    written, taken = load_acquire(words, WRITTEN), words[TAKEN]
+    if written - taken > np.uint64(FIFO):
+        words[UNSEEN] += written - taken - np.uint64(FIFO)
+        taken = written - np.uint64(FIFO)
+    while taken < written:
+        for i in range(channels):
+            _written(seen[i], fifo[np.int64(taken % np.uint64(FIFO)), i] * LSB_V)
+        taken += np.uint64(1)
+    words[TAKEN] = taken
+    for i in range(channels):
+        _written(seen[i], dac_codes[i] * LSB_V)
+
+
+@jit
+def _written(seen, volts):
+    step_v = abs(volts - seen.written_v)
+    if step_v > seen.largest_write_step_v:
+        seen.largest_write_step_v = step_v
+    seen.written_v = volts
 
 
 @jit

@@ -81,6 +81,7 @@ class Flag(IntFlag):
     SLEW_LIMITED = 1 << 3
     RAMPING = 1 << 4
     HEARTBEAT_LOST = 1 << 5
+    WRITE_FAILED = 1 << 6
     TRIP_NON_FINITE = 1 << 8
     TRIP_SENSOR_RANGE = 1 << 9
     TRIP_POSITION = 1 << 10
@@ -92,6 +93,7 @@ class Flag(IntFlag):
     TRIP_OSCILLATION = 1 << 16
     TRIP_LATE = 1 << 17
     TRIP_ENABLE = 1 << 18
+    TRIP_LAW = 1 << 19
 
 
 TRIP_MASK = ~0xFF & 0xFFFFFFFF

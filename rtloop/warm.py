@@ -34,7 +34,7 @@ def _rehearse_others() -> None:
     import drivers.comedi  # noqa: F401  (compiled where it is imported)
     from drivers.shm import ShmOptions
     from hil.board import serve
-    from rtloop.engine.commands import send
+    from rtloop.engine.commands import send, withdraw
     from rtloop.engine.memory import SharedBlock, Sizes
     from rtloop.engine.messages import MESSAGE, Kind, message
     from rtloop.engine.ring import drain
@@ -43,7 +43,7 @@ def _rehearse_others() -> None:
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)
     drain(block.ring("events"), np.uint64(0), np.zeros(1, MESSAGE))
-    send(block, message(Kind.STOP))
+    withdraw(block, send(block, message(Kind.STOP)))
     with tempfile.TemporaryDirectory() as folder:
         serve(Path(folder) / "board", ShmOptions(), ["x"], 1000.0, lambda: True)
 

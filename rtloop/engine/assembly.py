@@ -61,6 +61,13 @@ class Assembly:
         """The reference generators that the loop reads, one GENERATOR record an axis."""
         return self._arrays["generators"]
 
+    @property
+    def outputs_v(self) -> np.ndarray[Any, Any]:
+        """Where the outputs are after the last write that succeeded, (outputs,)."""
+        outputs_v = self._arrays["outputs"].copy()
+        outputs_v[self._arrays["output_index"]] = self._arrays["last_drive_v"]
+        return outputs_v
+
     def run(self, until_tick: int) -> Outcome:
         """Run the compiled loop."""
         return Outcome(run_ticks(self.loop, until_tick))
@@ -89,13 +96,14 @@ class Assembly:
     def _share(self, plan: Plan, block: SharedBlock) -> None:
         """What lies in the shared block, the schedule and the generators."""
         loop = self.loop
-        for name in ("words", "last_drive_v", "commands", "table", "staged"):
+        for name in ("words", "last_drive_v", "commands", "commands_marks", "table", "staged"):
             self._point(name, block[name])
         for name in ("ticks", "events", "snapshots"):
             for part in ("head", "marks", "slots"):
                 self._point(f"{name}_{part}", block[f"{name}_{part}"])
             self._loops[f"{name}_capacity"] = block[f"{name}_marks"].size
         block["table"][: plan.table.size] = plan.table
+        block["last_drive_v"][:] = self._arrays["axes"]["drive_v"]
         loop.table_count, loop.command_count = block["table"].size, block["commands"].size
         loop.column_count, loop.snapshot_bytes = block["ticks_slots"].shape[1], block["snapshots_slots"].shape[1]
         self._point("generators", plan.generators.copy())

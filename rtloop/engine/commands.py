@@ -1,19 +1,32 @@
 """Commands at a tick: from the schedule, which is known beforehand, and from the queue, which is not.
 
 A queue has one producer and one consumer. The loop alone decides the tick at which a command takes effect, and says
-so by an event of the same kind and values.
+so by an event of the same kind and values. Until the loop has taken a command its producer may withdraw it: the mark of
+its slot is exchanged by whoever comes first.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hil.atomics import load_acquire, store_release
+from hil.atomics import exchanged, load_acquire, store_release
 from hil.compiled import jit, seldom
-from rtloop.engine.context import axes_of, event_ring, generators_of, messages, octets, state_of, words_of
-from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.context import (
+    axes_of,
+    coefficients_of,
+    event_ring,
+    generators_of,
+    messages,
+    octets,
+    staged_of,
+    state_of,
+    unsigned,
+    words_of,
+)
+from rtloop.engine.memory import COMMAND_SLOTS, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
+from rtloop.law.filters import fill_prefilter_anew
 from rtloop.law.law import reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.reference import GENERATOR_PARAMETERS
@@ -24,25 +37,40 @@ SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, LOAD_LAW, REFUSED = (
     int(kind) for kind in (Kind.SET_MODE, Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.STOP, Kind.LOAD_LAW, Kind.REFUSED)
 )
 COEFFICIENT_BYTES = COEFFICIENTS.itemsize
+GONE = np.uint64(0)
+"""Mark of a command that was taken or withdrawn."""
 
 
 class QueueFull(RuntimeError):
     """The loop has not taken the commands before this one."""
 
 
-def send(block: SharedBlock, command: np.ndarray) -> None:
-    """Put one MESSAGE record into the queue. Single producer. Raises QueueFull."""
+def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
+    """Put one MESSAGE record into the queue; its position. Single producer. Raises QueueFull."""
     head, tail = int(block.words[HEAD]), int(block.words[TAIL])
     slots = block["commands"]
-    if head - tail >= slots.size:
-        raise QueueFull(f"{slots.size} commands are waiting for the loop")
+    if head - tail >= (slots.size if urgent else COMMAND_SLOTS):
+        raise QueueFull(f"{head - tail} commands are waiting for the loop")
     slots[head % slots.size] = command[0]
-    _advance(block.words, head + 1)
+    _offer(block.words, block["commands_marks"], head)
+    return head
+
+
+def withdraw(block: SharedBlock, position: int) -> bool:
+    """Take the command at `position` back; False where the loop has taken it already."""
+    return bool(_exchange(block["commands_marks"], position))
 
 
 @jit
-def _advance(words, head):
-    store_release(words, HEAD, np.uint64(head))
+def _offer(words, marks, position):
+    store_release(marks, position % marks.size, np.uint64(position + 1))
+    store_release(words, HEAD, np.uint64(position + 1))
+
+
+@jit
+def _exchange(marks, position):
+    """Whether the caller is the one who takes, or withdraws, the command at `position`."""
+    return exchanged(marks, position % marks.size, np.uint64(position + 1), GONE)
 
 
 @jit
@@ -53,10 +81,12 @@ def apply_commands(loop):
         _apply(loop, schedule[loop.scheduled])
         loop.scheduled += 1
     words, queue = words_of(loop), messages(loop.commands, loop.command_count)
+    marks = unsigned(loop.commands_marks, loop.command_count)
     tail = words[TAIL]
     waiting = np.int64(load_acquire(words, HEAD) - tail)
     for _ in range(min(waiting, COMMANDS_PER_TICK)):
-        _apply(loop, queue[np.int64(tail % np.uint64(loop.command_count))])
+        if _exchange(marks, np.int64(tail)):
+            _apply(loop, queue[np.int64(tail % np.uint64(loop.command_count))])
         tail += ONE
         store_release(words, TAIL, tail)
 
@@ -69,13 +99,13 @@ def _apply(loop, command):
             values = (float(command.kind), command.values[0])
             publish_event(loop, REFUSED, command.axis, command.origin, command.identity, values)
             return
-        set_mode(axes_of(loop), state, np.int64(command.values[0]), loop.tick == 0)
+        set_mode(axes_of(loop), state, np.int64(command.values[0]), loop.tick == 0, command.values[1] == 0.0)
     elif command.kind == SET_REFERENCE:
         _set_reference(loop, command)
     elif command.kind == RESET_TRIP:
         reset_trip(state)
     elif command.kind == LOAD_LAW:
-        _load_law(loop, command.axis, command.values[0] != 0.0)
+        _load_law(loop, command.axis, command.values[0] != 0.0, command.values[1] == 0.0)
     elif command.kind == STOP:
         store_release(words_of(loop), STOP_WORD, ONE)  # the loop reports it when it stops
         return
@@ -105,12 +135,24 @@ def _set_reference(loop, command):
 
 
 @jit
-def _load_law(loop, axis, another):
-    """Take the staged coefficients of an axis; another controller continues from the command in force."""
+def _load_law(loop, axis, another, fitting):
+    """Take the staged coefficients of an axis and make its state fit.
+
+    Another controller continues from the command in force. Another pre-filter begins with the reference in force; where
+    not `fitting` (as in recordings of revision 1) it does so only where its memory would not fit.
+    """
     offset = axis * COEFFICIENT_BYTES
     size = (loop.axis_count) * COEFFICIENT_BYTES
     staged, active = octets(loop.staged, size), octets(loop.coefficients, size)
+    before, after = coefficients_of(loop)[axis], staged_of(loop)[axis]
+    refilled = before.tap_count != after.tap_count or before.section_count != after.section_count
+    if fitting and not refilled:
+        for i in range(after.section_count):
+            for j in range(after.sections.shape[1]):
+                refilled = refilled or before.sections[i, j] != after.sections[i, j]
     active[offset : offset + COEFFICIENT_BYTES] = staged[offset : offset + COEFFICIENT_BYTES]
+    if refilled:
+        fill_prefilter_anew(axes_of(loop)[axis])
     if another:
         set_controller(axes_of(loop)[axis])
     loop.next_snapshot = loop.tick

@@ -25,7 +25,7 @@ _ADDRESSES = (
     *("coefficients", "axes", "law_state", "generators", "table", "adc_v", "references", "input_index", "output_index"),
     "conditions",
     # shared block
-    *("words", "last_drive_v", "commands", "schedule", "staged"),
+    *("words", "last_drive_v", "commands", "commands_marks", "schedule", "staged"),
     *(f"{ring}_{part}" for ring in ("ticks", "events", "snapshots") for part in ("head", "marks", "slots")),
 )
 # of 32 bits and unsigned: sums of them are never negative, so that no index needs a check of its sign
@@ -41,7 +41,17 @@ _SETTINGS = (
     ("snapshot_ticks", np.int64),
     ("record_limit", np.int64),
 )
-_COUNTERS = ("tick", "events", "snapshots", "scheduled", "stopping", "failed", "next_late_event", "next_snapshot")
+_COUNTERS = (
+    "tick",
+    "events",
+    "snapshots",
+    "scheduled",
+    "stopping",
+    "failed",
+    "refused",
+    "next_late_event",
+    "next_snapshot",
+)
 
 LOOP = np.dtype(
     [
@@ -58,6 +68,12 @@ LOOP = np.dtype(
 def coefficients_of(loop):
     """Coefficients of all axes."""
     return carray(address_pointer(loop.coefficients), loop.axis_count, COEFFICIENTS)
+
+
+@jit
+def staged_of(loop):
+    """Coefficients that wait for all axes."""
+    return carray(address_pointer(loop.staged), loop.axis_count, COEFFICIENTS)
 
 
 @jit
@@ -100,6 +116,12 @@ def floats(address, count):
 def integers(address, count):
     """int64 values at an address."""
     return carray(address_pointer(address), count, np.int64)
+
+
+@jit
+def unsigned(address, count):
+    """uint64 values at an address."""
+    return carray(address_pointer(address), count, np.uint64)
 
 
 @jit

@@ -3,7 +3,7 @@
     wait ─► read ─► interlocks, reference, law ─► write ─► memories ─► record
 
 Snapshots and commands come before the wait, in the slack of the period. Driver and clock are C function pointers;
-nothing here allocates, locks, prints or can raise.
+nothing here allocates, locks or prints.
 """
 
 from __future__ import annotations
@@ -45,23 +45,41 @@ class Outcome(IntEnum):
     STOPPED = 1
     DRIVER_FAILED = 2
     HEARTBEAT_LOST = 3
+    LAW_FAILED = 4
 
 
 READ_FAILED, WRITE_FAILED = 1, 2
 STOP_WORD, HEARTBEAT_WORD = int(Word.STOP), int(Word.HEARTBEAT_NS)
 OFF = int(Mode.OFF)
-OVERRUN, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.TRIP_HEARTBEAT)
+TRIP_LAW = float(Flag.TRIP_LAW)
+OVERRUN, WRITE_FAILED_FLAG, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.WRITE_FAILED), int(Flag.TRIP_HEARTBEAT)
 LOOP_ORIGIN, SUPERVISOR = int(Origin.LOOP), int(Origin.SUPERVISOR)
 STOP_KIND = int(Kind.STOP)
 TRIPPED, DRIVER_FAILED, PERIODS_MISSED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED), int(Kind.PERIODS_MISSED)
-DONE, STOPPED, FAILURE, ORPHANED = (int(outcome) for outcome in Outcome)
+DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
 COEFFICIENT_BYTES, STATE_BYTES, LOOP_STATE_BYTES = COEFFICIENTS.itemsize, STATE.itemsize, LOOP_STATE.itemsize
 US_PER_NS = 1e-3
+GIVE_UP_S = 1.0
+"""A card that refuses every write for so long is left to whoever parks it."""
 
 
 @jit
 def run_ticks(loop, until_tick):
-    """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome."""
+    """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome.
+
+    An index beyond its array ends the run at once: whoever called brings the outputs down, for the law's memory is not
+    to be believed any more.
+    """
+    outcome = BROKEN
+    try:
+        outcome = _run_ticks(loop, until_tick)
+    except Exception:
+        publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, (TRIP_LAW, 0.0))
+    return outcome
+
+
+@jit
+def _run_ticks(loop, until_tick):
     while loop.tick < until_tick:
         _prepare(loop)
         if call(loop.wait, loop.wait_context, loop.timing) != 0:
@@ -69,6 +87,8 @@ def run_ticks(loop, until_tick):
         _tick(loop)
         loop.tick += 1
         state = state_of(loop)
+        if loop.refused * loop.period_s > GIVE_UP_S:
+            return FAILURE
         if state.settled != 0:
             if loop.failed != 0:
                 return FAILURE
@@ -108,6 +128,7 @@ def _tick(loop):
     written = call(loop.write, loop.driver_context, loop.outputs)
     write_ns = _now(loop)
 
+    _note(loop, written)
     state = state_of(loop)
     update(coefficients_of(loop), axes_of(loop), state)
     _report(loop, status, written, missed)
@@ -127,7 +148,7 @@ def _tick(loop):
     row[10] = float(status)
     row[6] = (_now(loop) - wake_ns) * US_PER_NS
     overrun = lateness_us + row[6] > loop.period_us
-    row[8] = float(state.tick_flags | (OVERRUN if overrun else 0))
+    row[8] = float(state.tick_flags | (OVERRUN if overrun else 0) | (WRITE_FAILED_FLAG if written < 0 else 0))
     publish(ring, position)
 
 
@@ -141,10 +162,25 @@ def _now(loop):
 
 
 @jit
+def _note(loop, written):
+    """Where the outputs are now: where they were, if the write failed; the law goes on from there."""
+    axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    if written < 0:
+        loop.refused += 1
+        state_of(loop).settled = 0
+        for a in range(loop.axis_count):
+            axes[a].drive_v = last_drive_v[a]
+    else:
+        loop.refused = 0
+        for a in range(loop.axis_count):
+            last_drive_v[a] = axes[a].drive_v
+
+
+@jit
 def _evaluate(loop, status, now_ns, lateness_us):
-    """References, interlocks and law; the drives go to the driver's outputs and to the shared block."""
+    """References, interlocks and law; the drives go to the driver's outputs."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
-    outputs, last_drive_v = floats(loop.outputs, loop.output_count), floats(loop.last_drive_v, loop.axis_count)
+    outputs = floats(loop.outputs, loop.output_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
     input_index, output_index = (
         integers(loop.input_index, loop.axis_count),
@@ -165,7 +201,6 @@ def _evaluate(loop, status, now_ns, lateness_us):
     evaluate(coefficients_of(loop), axes, state_of(loop), adc_v, references, conditions)
     for a in range(loop.axis_count):
         outputs[output_index[a]] = axes[a].drive_v
-        last_drive_v[a] = axes[a].drive_v
 
 
 @jit

@@ -29,6 +29,8 @@ MIN_RING_TICKS = 4096
 EVENT_SLOTS = 4096
 SNAPSHOT_SLOTS = 64
 COMMAND_SLOTS = 256
+URGENT_SLOTS = 16
+"""Of the command queue, for what makes the outputs safe: no flood of other commands fills them."""
 
 
 class Word(IntEnum):
@@ -162,7 +164,8 @@ def _specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ..
         "last_drive_v": (real, (sizes.axes,)),
         "table": (real, (max(sizes.table_samples, 1),)),
         "staged": (np.dtype(np.uint8), (sizes.snapshot_bytes,)),
-        "commands": (MESSAGE, (COMMAND_SLOTS,)),
+        "commands": (MESSAGE, (COMMAND_SLOTS + URGENT_SLOTS,)),
+        "commands_marks": (word, (COMMAND_SLOTS + URGENT_SLOTS,)),
     }
     slots: Sequence[tuple[str, np.dtype[Any], tuple[int, ...]]] = (
         ("ticks", real, (ticks, sizes.columns)),

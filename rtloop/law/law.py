@@ -12,7 +12,13 @@ that no controller meets a large error as a step. Another controller continues f
 from __future__ import annotations
 
 from hil.compiled import jit
-from rtloop.law.filters import controller_enter, controller_output, controller_update, prefilter
+from rtloop.law.filters import (
+    controller_enter,
+    controller_output,
+    controller_update,
+    fill_prefilter_anew,
+    prefilter,
+)
 from rtloop.law.hysteresis import follow_drive, inverse_drive
 from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
 from rtloop.law.watch import watch
@@ -29,11 +35,16 @@ ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
 
 
 @jit
-def set_mode(axes, loop, mode, at_rest):
-    """Change the mode; bumplessly, but from zero state `at_rest`, before anything was driven."""
+def set_mode(axes, loop, mode, at_rest, filled=True):
+    """Change the mode; bumplessly, but from zero state `at_rest`, before anything was driven.
+
+    A mode that drives begins with a pre-filter `filled` by the present reference: what it remembers may be volts.
+    """
     loop.mode = mode
     for a in range(axes.shape[0]):
         axes[a].entering = 0 if at_rest else ANOTHER_MODE
+        if filled and not at_rest and mode != OFF:
+            fill_prefilter_anew(axes[a])
 
 
 @jit

@@ -21,6 +21,8 @@ MAX_PLAYS = 64
 MAX_ORDER = 24
 MAX_TAPS = 128
 MAX_SECTIONS = 12
+ANEW = -1
+"""A tap index that says: fill the pre-filter's memory with the next reference."""
 
 Records = np.recarray[Any, Any]
 

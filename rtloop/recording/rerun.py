@@ -66,7 +66,8 @@ class Tape:
         tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
         # lateness was recorded in µs, from whole ns: the rounding restores these, and so the very same µs
         tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
-        lost = (rows[:, signals.FLAGS].astype(np.int64) & int(Flag.HEARTBEAT_LOST)) != 0
+        flags = rows[:, signals.FLAGS].astype(np.int64)
+        lost = (flags & int(Flag.HEARTBEAT_LOST)) != 0
         tape[:, 3] = np.where(lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again
         tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
         for axis in range(self._axes):
@@ -75,7 +76,7 @@ class Tape:
         tape[:, first + self._axes + 1] = rows[:, signals.SAMPLE_AGE]
         if self._observed:
             tape[:, first + self._axes + 2 :] = rows[:, self._columns - self._observed :]
-        self._playback.load(tape)
+        self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
 
 
 class Rerun:
