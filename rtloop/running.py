@@ -22,8 +22,6 @@ from rtloop.recording.summary import summarise
 from rtloop.report import RunView, print_run
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 
-PROGRESS_PERIOD_S = 0.1
-
 
 def run_configuration(config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool) -> int:
     """Run, record, report; returns the exit code."""
@@ -35,7 +33,7 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
         recover_leftovers(path.parent)
         supervisor = Supervisor(processes, prepared, path)
         with stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
-            result = supervisor.run(_every(PROGRESS_PERIOD_S, view.show))
+            result = supervisor.run(view.show)
     summary = run_summary(prepared, result)
     summary["startup_s"] = supervisor.startup_s
     if as_json:
@@ -106,16 +104,3 @@ def stopped_by_signals(supervisor: Supervisor) -> Any:
     finally:
         for name, handler in previous.items():
             signal.signal(name, handler)
-
-
-def _every(period_s: float, action: Any) -> Any:
-    """`action`, at most once a period."""
-    due = 0.0
-
-    def limited(supervisor: Supervisor) -> None:
-        nonlocal due
-        if time.monotonic() >= due:
-            due = time.monotonic() + period_s
-            action(supervisor)
-
-    return limited

@@ -10,6 +10,8 @@ import sys
 import threading
 from typing import Any
 
+END_TIMEOUT_S = 5.0
+
 
 class Child:
     """`python -m MODULE --fd N`, in a process group of its own so that a terminal's Ctrl-C reaches the parent alone."""
@@ -27,9 +29,12 @@ class Child:
         self._reader.start()
 
     def send(self, data: bytes) -> None:
-        """Write to the child's stdin; a child that has gone is noticed by its exit code."""
+        """Write to the child's stdin, as fast as it reads; a child that has gone is noticed by its exit code."""
+        threading.Thread(target=self._write, args=(data,), daemon=True).start()
+
+    def _write(self, data: bytes) -> None:
         assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
+        with contextlib.suppress(BrokenPipeError, ValueError):  # it has gone, or its stdin was closed meanwhile
             self.process.stdin.write(data)
             self.process.stdin.flush()
 
@@ -54,15 +59,20 @@ class Child:
         self._reader.join(timeout_s)
         return code
 
-    def end(self) -> None:
-        """Kill it if it still runs, and close its pipes."""
+    def kill(self) -> None:
+        """Kill it if it still runs, and wait for nothing: a process may hang in the kernel."""
         if self.process.poll() is None:
             self.process.kill()
-            self.process.wait()
-        self._reader.join()
+
+    def end(self) -> bool:
+        """Kill it if it still runs, and close its pipes; False where it does not die."""
+        self.kill()
+        if self.wait(END_TIMEOUT_S) is None:
+            return False
         self.close_stdin()
         if self.process.stdout is not None:
             self.process.stdout.close()
+        return True
 
     def close_stdin(self) -> None:
         """Say that nothing more will come; a child that waits for its orders ends."""

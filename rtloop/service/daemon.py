@@ -8,17 +8,16 @@ import logging
 import os
 import signal
 import socket
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import uvicorn
 
 from rtloop.errors import UnavailableError
 from rtloop.service.api import application
 from rtloop.service.can_bus import supervised_by_can
+from rtloop.service.journal import Journal
 from rtloop.service.paths import socket_path
 from rtloop.service.service import Service
 
@@ -33,8 +32,11 @@ def serve(config: Path) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
-    with _listening(service), supervised_by_can(service):
-        return service.run()
+    try:
+        with _listening(service), supervised_by_can(service):
+            return service.run()
+    finally:
+        logging.getLogger().handlers[0].flush()
 
 
 @contextlib.contextmanager
@@ -94,7 +96,7 @@ class _JournalFormatter(logging.Formatter):
 
 
 def _log_to_stderr() -> None:
-    handler: logging.StreamHandler[Any] = logging.StreamHandler(sys.stderr)
+    handler = Journal()
     under_systemd = "JOURNAL_STREAM" in os.environ
     handler.setFormatter(
         _JournalFormatter("%(message)s") if under_systemd else logging.Formatter("%(asctime)s %(message)s")

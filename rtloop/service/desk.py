@@ -1,4 +1,8 @@
-"""The desk where commands for the loop are handed in: one at a time, each answered by the event that it became."""
+"""The desk where commands for the loop are handed in, each answered by the event that it became.
+
+Callers do not wait for each other. A command that is not answered in time is withdrawn: it took effect, or it was
+refused, and never both.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.engine.commands import send
+from rtloop.engine.commands import send, withdraw
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
+from rtloop.signals import Mode
 
 ANSWER_TIMEOUT_S = 2.0
+ANSWER_PERIODS = 3.0
+"""A loop that is slower than ANSWER_TIMEOUT_S has so many periods to answer."""
 POLL_S = 0.001
 asked_by = ContextVar("asked_by", default=Origin.OPERATOR)
 """Who asks, in this thread: the origin that the recording shows."""
@@ -26,38 +33,46 @@ class Refused(RtloopError):
     """The loop did not take a command, or not in time."""
 
 
-class Desk:
-    """Commands to the loop of `block`. The queue has one producer, so callers take turns."""
+class Taken(RtloopError):
+    """The loop took a command and stands still: nobody knows its tick."""
 
-    def __init__(self, block: SharedBlock) -> None:
-        self._block = block
+
+class Desk:
+    """Commands to the loop of `block`, from any thread."""
+
+    def __init__(self, block: SharedBlock, rate_hz: float = 1e6) -> None:
+        self._block, self._period_s = block, 1.0 / rate_hz
         self._lock = threading.Lock()
         self._identity = 0
 
     def submit(self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = ()) -> int:
-        """Send a command and wait until its tick was executed, which it returns. Raises Refused."""
-        with self._lock:
+        """Send a command and wait until its tick was executed, which it returns. Raises Refused, Taken, QueueFull."""
+        command = message(kind, axis=axis, origin=asked_by.get(), values=values)
+        safe = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
+        with self._lock:  # the queue has one producer
             self._identity += 1
-            command = message(kind, axis=axis, origin=asked_by.get(), values=values)
-            command["identity"] = self._identity
+            command["identity"] = identity = self._identity
             cursor = int(self._block["events_head"][0])
-            send(self._block, command)
-            return self._answer(kind, cursor)
+            position = send(self._block, command, urgent=safe)
+        return self._answer(kind, identity, cursor, position)
 
-    def _answer(self, kind: Kind, cursor: int) -> int:
-        ring, deadline = self._block.ring("events"), time.monotonic() + ANSWER_TIMEOUT_S
+    def _answer(self, kind: Kind, identity: int, cursor: int, position: int) -> int:
+        timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
+        ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
         events: np.ndarray[Any, Any] = np.zeros(64, MESSAGE)
         while time.monotonic() < deadline:
             copied, first, _ = drain(ring, np.uint64(cursor), events)
             cursor = int(first) + copied
             for event in events[:copied]:
-                if event["identity"] == self._identity:
+                if event["identity"] == identity:
                     if event["kind"] == Kind.REFUSED:
                         raise Refused(f"{kind.name.lower()}: refused at tick {event['tick']}: tripped or stopping")
                     self._await_tick(int(event["tick"]), deadline)
                     return int(event["tick"])
             time.sleep(POLL_S)
-        raise Refused(f"{kind.name.lower()}: the loop did not answer within {ANSWER_TIMEOUT_S:g} s")
+        if withdraw(self._block, position):
+            raise Refused(f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; withdrawn")
+        raise Taken(f"{kind.name.lower()}: the loop has taken it and stands still; it takes effect if the loop goes on")
 
     def _await_tick(self, tick: int, deadline: float) -> None:
         """The event comes before its tick: what is read off the newest record is to show the command's effect."""

@@ -20,7 +20,7 @@ from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 from rtloop.prepare import Prepared, prepare
 from rtloop.references import TableOfSamples, generator_values, reach
-from rtloop.service.desk import Desk, Refused
+from rtloop.service.desk import Desk, Refused, Taken
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels")
 """Parts of a configuration that only a restart can change."""
@@ -41,6 +41,7 @@ class LiveLaw:
         self._lock = threading.Lock()
         self._first_spare = prepared.plan.table.size
         self._places = [0] * len(prepared.plan.axes)
+        self._unsettled_tick: int | None = None
 
     def axis_number(self, name: str) -> int:
         """Raises ConfigError for a name that is no axis."""
@@ -89,10 +90,7 @@ class LiveLaw:
     def play_raw(self, number: int, volts: np.ndarray[Any, Any]) -> int:
         """Play `volts` (n,) once, for raw mode; returns the tick. Raises Refused."""
         with self._lock:
-            first = self._store(number, volts)
-            return self._desk.submit(
-                Kind.SET_REFERENCE, axis=number, values=[float(Generator.TABLE), first, volts.size, 1.0, 0.0]
-            )
+            return self._submit_table(number, [Generator.TABLE, 0, volts.size, 1.0, 0.0], volts)
 
     def restore_reference(self, number: int) -> int:
         """The reference that the configuration gives; returns the tick."""
@@ -134,7 +132,11 @@ class LiveLaw:
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
         prepared = prepare(_with_axis(configuration, number, axis))
-        tick = self._stage(number, prepared)
+        try:
+            tick = self._stage(number, prepared)
+        except Taken:
+            self.prepared = prepared
+            raise
         self.prepared = prepared
         return tick
 
@@ -144,9 +146,24 @@ class LiveLaw:
         coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1].copy()
         coefficients["offset_v"] = self.offsets_v.get(number, float(coefficients["offset_v"][0]))
         size = COEFFICIENTS.itemsize
+        self._require_settled()
         self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller
-        return self._desk.submit(Kind.LOAD_LAW, axis=number, values=[float(another)])
+        return self._settling(Kind.LOAD_LAW, number, [float(another)])
+
+    def _require_settled(self) -> None:
+        """Raise Refused while the loop may still take what was staged before."""
+        if self._unsettled_tick is not None and int(self._block["ticks_head"][0]) <= self._unsettled_tick + 1:
+            raise Refused("an earlier change has been taken by the loop, which stands still")
+        self._unsettled_tick = None
+
+    def _settling(self, kind: Kind, number: int, values: list[float]) -> int:
+        """Submit what refers to shared memory, which must not change before the loop has read it. Raises Taken."""
+        try:
+            return self._desk.submit(kind, axis=number, values=values)
+        except Taken:
+            self._unsettled_tick = int(self._block["ticks_head"][0])
+            raise
 
     def _generator(self, options: ReferenceOptions) -> tuple[list[Any], np.ndarray[Any, Any]]:
         """Kind and parameters of a generator, and the samples of its table. Raises ConfigError."""
@@ -163,19 +180,22 @@ class LiveLaw:
         if not (most := reach(values, samples)) <= limit:
             raise _unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
         if samples.size:
-            values[1] = self._store(number, samples)
+            return self._submit_table(number, values, samples)
         return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
 
-    def _store(self, number: int, samples: np.ndarray[Any, Any]) -> int:
-        """Index of `samples` in the shared table, in the one of the axis's two places that does not play now."""
+    def _submit_table(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> int:
+        """Play `samples` from the one of the axis's two places in the shared table that does not play now."""
+        self._require_settled()
         table, fixed, axes = self._block["table"], self._first_spare, len(self.prepared.plan.axes)
         room = (table.size - fixed) // (2 * axes)
         if samples.size > room:
             raise _unsuitable(f"waveform: {samples.size} samples; at most {room} are allowed")
-        self._places[number] = 1 - self._places[number]
-        first = fixed + (2 * number + self._places[number]) * room
-        table[first : first + samples.size] = samples
-        return first
+        place = 1 - self._places[number]
+        values[1] = fixed + (2 * number + place) * room
+        table[values[1] : values[1] + samples.size] = samples
+        tick = self._settling(Kind.SET_REFERENCE, number, [float(value) for value in values])
+        self._places[number] = place
+        return tick
 
 
 def _unsuitable(message: str) -> ConfigError:

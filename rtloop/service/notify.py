@@ -24,8 +24,9 @@ class Notifier:
         if not self._address:
             return
         message = "\n".join(f"{name}={value}" for name, value in fields.items())
-        # a manager that went away is no reason to stop the loop
+        # a manager that went away, or does not read, is no reason to stop the loop
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel, contextlib.suppress(OSError):
+            channel.setblocking(False)
             channel.sendto(message.encode(), self._address)
 
     def limit_watchdog(self, limit_s: float | None = None) -> None:

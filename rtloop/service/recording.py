@@ -1,8 +1,13 @@
-"""The recorder as the supervisor keeps it: started, watched, replaced when it dies, its files put in order."""
+"""The recorder as the supervisor keeps it: started, watched, replaced when it dies, its files put in order.
+
+All of that may wait for a disk, and so it happens in a thread of its own: nobody who watches the loop, or parks it,
+waits for a file.
+"""
 
 from __future__ import annotations
 
 import json
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,13 +24,14 @@ STALL_S = 3.0
 LONGEST_STEP_S = 0.1
 END_TIMEOUT_S = 30.0
 MAX_REPLACEMENTS = 10
+POLL_S = 0.01
 
 
 class RecorderKeeper:
     """Keeps one recorder running on `block`, writing the file or files of `path`.
 
     A recorder that died or stands still is replaced; the next one goes on where the last one's file ends, so nothing
-    is lost while the ring still holds it.
+    is lost while the ring still holds it. `start`, then `finish`, and `totals` once that has come to its end.
     """
 
     def __init__(self, child: Child, block: SharedBlock, path: Path, options: RecordingOptions) -> None:
@@ -33,6 +39,14 @@ class RecorderKeeper:
         self._header: dict[str, Any] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
         self._ordered = False
+        self._finishing = threading.Event()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self.recording = False
+        """Whether the file is open."""
+        self.failure: RtloopError | None = None
+        """Why nothing can be recorded at all."""
+        self.totals: dict[str, Any] | None = None
+        """What was recorded, with all `paths`, once that is known."""
         self.replacements = 0
         self.notes: list[str] = []
 
@@ -47,8 +61,35 @@ class RecorderKeeper:
         return self._child.exit_code
 
     def start(self, header: dict[str, Any]) -> None:
-        """Hand over the header and wait until the file is open. Raises OutputError."""
+        """Hand over the header; `recording` once the file is open, or `failure`."""
         self._header = header
+        self._thread.start()
+
+    def finish(self) -> None:
+        """Have the recorder come to its end, and its files put in order."""
+        self._finishing.set()
+
+    def close(self) -> None:
+        """End it, whatever it is doing."""
+        self._finishing.set()
+        self._child.kill()
+
+    def _keep(self) -> None:
+        try:
+            self._open()
+            self.recording = True
+            while not self._finishing.wait(POLL_S):
+                self._replace_if_gone()
+            self.totals = self._finish()
+        except RtloopError as error:
+            self.failure = error
+        finally:
+            if self.totals is None:
+                reason = str(self.failure or "keeping the recorder failed")
+                self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
+
+    def _open(self) -> None:
+        """Give the recorder its orders and wait until the file is open. Raises OutputError."""
         self._order()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
@@ -56,7 +97,7 @@ class RecorderKeeper:
             self._child.wait(END_TIMEOUT_S)
             raise OutputError(f"{self._path}: cannot record: {self._totals().get('error') or 'the recorder ended'}")
 
-    def poll(self) -> None:
+    def _replace_if_gone(self) -> None:
         """Replace a recorder that died or stands still; give a new one its orders."""
         if not self._ordered:
             if self.state == ProcessState.READY:
@@ -67,19 +108,20 @@ class RecorderKeeper:
         stuck = self._watch.stalled(int(words[Word.RECORDER_CURSOR])) and behind
         if (self.exit_code is not None or stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
-            self._child.end()
+            if not self._child.end():
+                return  # it hangs in the kernel, where its file is: it may yet go on
             self.notes.append(f"the recorder {reason} and was replaced")
             self.replacements += 1
             words[Word.RECORDER_STATE] = ProcessState.STARTING
             self._child, self._ordered = Child(MODULE, self._block.fd), False
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 
-    def finish(self) -> dict[str, Any]:
+    def _finish(self) -> dict[str, Any]:
         """Wait for the end, repair what dead recorders left; the totals, with all `paths`."""
         deadline = time.monotonic() + END_TIMEOUT_S
         while not self._ordered and time.monotonic() < deadline and self.exit_code is None:
-            self.poll()
-            time.sleep(0.01)
+            self._replace_if_gone()
+            time.sleep(POLL_S)
         if self._child.wait(END_TIMEOUT_S) is None:
             self._child.end()
             self.notes.append("the recorder did not end and was killed")
@@ -93,10 +135,6 @@ class RecorderKeeper:
         """This run's files, in their order."""
         folder, stem = self._path.parent, self._path.stem
         return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
-
-    def close(self) -> None:
-        """End it, whatever it is doing."""
-        self._child.end()
 
     def _repair(self, part: Path) -> None:
         try:

@@ -77,6 +77,7 @@ class Service:
         self._ending, self._reload = threading.Event(), threading.Event()
         self._reloading = threading.Lock()
         self._deaths_s: list[float] = []
+        self._stopping = False
         self._offsets_v: dict[int, float] = {}
         self._ready = False
 
@@ -96,13 +97,18 @@ class Service:
         row = None if self.supervisor is None else self.supervisor.latest()
         if row is None:
             return State.TRIPPED if self.faults else State.STARTING
-        if self.faults or int(row[signals.FLAGS]) & signals.TRIP_MASK:
+        if self.faults or self._died or int(row[signals.FLAGS]) & signals.TRIP_MASK:
             return State.TRIPPED
         if row[signals.MODE] != Mode.OFF:
             return State.RUNNING
         if int(row[signals.FLAGS]) & Flag.RAMPING:
             return State.RAMPING
         return State.ARMED if self.armed else State.STOPPED
+
+    @property
+    def _died(self) -> bool:
+        """Whether the present loop's process has died; its outputs are parked, its recording may not be whole yet."""
+        return self.supervisor is not None and self.supervisor.error is not None
 
     @property
     def desk(self) -> Desk:
@@ -186,7 +192,7 @@ class Service:
             supervisor = Supervisor(processes, prepared, recording_path(prepared, None), options.stall_ms / 1000)
             try:
                 supervisor.start()
-                self._desk = Desk(supervisor.block)
+                self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz)
                 self.live = LiveLaw(prepared, supervisor.block, self._desk, self._offsets_v)
                 self.supervisor = supervisor
                 if preparing:
@@ -199,9 +205,10 @@ class Service:
     def _watch(self, supervisor: Supervisor) -> RunResult:
         said: State | None = None
         while (result := supervisor.poll()) is None:
-            if self._ending.is_set():
-                self.notifier.send(STOPPING=1, STATUS="ramping down")
+            if self._ending.is_set() and not self._stopping:
+                self._stopping = True
                 supervisor.stop()
+                self.notifier.send(STOPPING=1, STATUS="ramping down")
             if self._reload.is_set() and not self._reloading.locked():  # however many were asked for meanwhile
                 self._reload.clear()
                 self._aside(self._apply_reload)
@@ -223,7 +230,7 @@ class Service:
         return result
 
     def _tell(self, supervisor: Supervisor) -> None:
-        """READY after ticks really ran; WATCHDOG only while they advance; STATUS now and then."""
+        """READY after ticks really ran; WATCHDOG only while they advance, or have ended; STATUS now and then."""
         if not self._ready and supervisor.ticks >= READY_TICKS:
             self._ready = True
             self.notifier.send(READY=1)
@@ -231,7 +238,7 @@ class Service:
             self.notifier.limit_watchdog()
         if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4)):
             return
-        if supervisor.ticks > self._told_ticks or supervisor.block.words[Word.STOP]:
+        if supervisor.ticks > self._told_ticks or supervisor.ended or supervisor.block.words[Word.STOP]:
             self.notifier.send(WATCHDOG=1)
         self._told_ticks = supervisor.ticks
         rows = supervisor.newest(int(min(supervisor.prepared.plan.pacing.rate_hz, 20000)))

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 import time
 
+STALL_PERIODS = 3.0
+
+
+def stall_limit_s(limit_s: float, rate_hz: float) -> float:
+    """How long ticks may stand still: `limit_s`, but some periods of a loop that is slower than that."""
+    return max(limit_s, STALL_PERIODS / rate_hz)
+
 
 class StallWatch:
     """Watches a counter that ought to advance.

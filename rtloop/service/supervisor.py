@@ -26,10 +26,13 @@ from rtloop.service.child import Child
 from rtloop.service.header import recording_header
 from rtloop.service.parking import park
 from rtloop.service.recording import RecorderKeeper
-from rtloop.service.stall import StallWatch
+from rtloop.service.stall import StallWatch, stall_limit_s
 
+POLL_S, START_POLL_S = 0.005, 0.002
+PROGRESS_PERIOD_S = 0.1
 HEARTBEAT_PERIOD_S = 0.02
-POLL_S = 0.005
+WATCHED_S = 2.0
+"""The heart beats while the last look at the loop is not older than this."""
 LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
 START_TIMEOUT_S = 300.0
@@ -37,11 +40,16 @@ ATTENDED_STALL_S = 2.0
 """Somebody watches a run: a host that stalls one processor for half a second is no reason to end it."""
 START_TIME_FIELD = 19
 """Of /proc/PID/stat, counted after the process's name."""
+FAULTS = {
+    "heartbeat_lost": "the loop lost its heartbeat and parked by itself",
+    "law_failed": "the law reached beyond its arrays, a fault of rtloop; its outputs were brought to safe",
+}
+"""Outcomes that need saying."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended. `outcome`: done, stopped, driver_failed, heartbeat_lost, failed or killed."""
+    """How a run ended. `outcome`: done, stopped, driver_failed, heartbeat_lost, law_failed, failed or killed."""
 
     recordings: list[Path]
     outcome: str
@@ -74,7 +82,8 @@ class Processes:
 class Supervisor:
     """Runs a plan once in `processes`, recording to `recording` (without its `.part`).
 
-    `start`, then `poll` every few milliseconds until it returns a result, then `close`.
+    `start`, then `poll` every few milliseconds until it returns a result, then `close`. Nothing in it waits for a
+    disk, a log or a terminal; should it stop polling all the same, its heart stops too, and the loop parks itself.
     """
 
     def __init__(
@@ -84,14 +93,18 @@ class Supervisor:
         self.block = SharedBlock.create(prepared.plan.sizes, processes.fd)
         self.realtime: dict[str, Any] = {}
         self.startup_s: float | None = None
+        self.ended = False
+        """The loop has come to its end, and its outputs are parked as far as they can be; files may take longer."""
+        self.error: str | None = None
+        """Why the loop died, and what became of its outputs."""
         self._loop = processes.loop
         self.recorder = RecorderKeeper(processes.recorder, self.block, recording, prepared.configuration.recording)
-        self._stall = StallWatch(stall_s, LONGEST_STEP_S)
+        self._stall = StallWatch(stall_limit_s(stall_s, prepared.plan.pacing.rate_hz), LONGEST_STEP_S)
         self._stalled = False
         self._reports: dict[str, dict[str, Any]] = {}
-        self._done = threading.Event()
-        self._beat = threading.Thread(target=self._beating, daemon=True)
-        self._beat.start()
+        self._watched_s, self._closed = time.monotonic(), threading.Event()
+        self._heart = threading.Thread(target=self._beat, daemon=True)
+        self._heart.start()
 
     def stop(self) -> None:
         """Ask the loop to ramp down and end."""
@@ -115,46 +128,69 @@ class Supervisor:
         return rows[:copied]
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
-        """Start, watch and end everything. Raises RtloopError for what prevented the run."""
+        """Start, watch and end everything. Raises RtloopError for what prevented the run.
+
+        `on_progress` is called now and then in a thread of its own: a terminal that stands still holds up nothing.
+        """
+        ended = threading.Event()
+        showing = threading.Thread(target=self._show, args=(on_progress, ended), daemon=True)
         try:
             self.start()
+            showing.start()
             while (result := self.poll()) is None:
-                if on_progress is not None:
-                    on_progress(self)
                 time.sleep(POLL_S)
             return result
         finally:
+            ended.set()
+            if showing.is_alive():
+                showing.join(PROGRESS_PERIOD_S)
             self.close()
+
+    def _show(self, on_progress: Callable[[Supervisor], None] | None, ended: threading.Event) -> None:
+        while on_progress is not None and not ended.wait(PROGRESS_PERIOD_S):
+            on_progress(self)
 
     def start(self) -> None:
         """Give both processes their orders and let the loop go. Raises RtloopError for what prevents it."""
+        self.newest(0)  # compiled, or loaded, before it is needed in time
         self._loop.send(pickle.dumps(self.prepared.plan))
         self._await_ready()
         self.recorder.start(recording_header(self.prepared, self.realtime))
+        while not self.recorder.recording:
+            self._watched_s = time.monotonic()
+            if self.recorder.failure is not None:
+                raise self.recorder.failure
+            time.sleep(START_POLL_S)
         self.block.words[Word.GO] = 1
         self.startup_s = seconds_since_start()
 
     def poll(self) -> RunResult | None:
-        """Watch loop and recorder; the result once the run has ended."""
+        """Watch the loop, park what it leaves; the result once the recording has come to its end as well."""
+        self._watched_s = time.monotonic()
         self._collect()
-        if self._loop.exit_code is None and not self._loop_stalled():
-            self.recorder.poll()
+        if not self.ended and (self._loop.exit_code is not None or self._loop_stalled()):
+            self._end()
+        if not self.ended or self.recorder.totals is None:
             return None
-        return self._finish()
+        return self._result(self.recorder.totals)
 
     def close(self) -> None:
         """End what still runs."""
         self.stop()
-        if self._loop.wait(END_TIMEOUT_S) is None:
-            self._loop.end()
-        self._done.set()
-        self._beat.join()
+        deadline = time.monotonic() + END_TIMEOUT_S
+        while self._loop.exit_code is None and time.monotonic() < deadline:
+            self._watched_s = time.monotonic()
+            time.sleep(START_POLL_S)
+        self._closed.set()
+        self._heart.join()
+        self._loop.end()
         self.recorder.close()
 
-    def _beating(self) -> None:
-        while not self._done.is_set():
-            self.block.words[Word.HEARTBEAT_NS] = time.monotonic_ns()
-            self._done.wait(HEARTBEAT_PERIOD_S)
+    def _beat(self) -> None:
+        while not self._closed.is_set():
+            if time.monotonic() - self._watched_s < WATCHED_S:
+                self.block.words[Word.HEARTBEAT_NS] = time.monotonic_ns()
+            self._closed.wait(HEARTBEAT_PERIOD_S)
 
     def _collect(self) -> None:
         for report in self._loop.reports():
@@ -177,6 +213,7 @@ class Supervisor:
         """Wait until both processes are ready. Raises what the loop's process reports instead."""
         deadline = time.monotonic() + START_TIMEOUT_S
         while True:
+            self._watched_s = time.monotonic()
             self._collect()
             if "ready" in self._reports and self.recorder.state >= ProcessState.READY:
                 self.realtime = self._reports["ready"]["realtime"]
@@ -189,7 +226,7 @@ class Supervisor:
                 raise LoopFault(f"the recorder's process ended with {self.recorder.exit_code} before the run began")
             if time.monotonic() > deadline:
                 raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
-            time.sleep(0.002)
+            time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
         failed = self._reports.get("failed")
@@ -199,23 +236,25 @@ class Supervisor:
         error.exit_code = failed["exit_code"]
         raise error
 
-    def _finish(self) -> RunResult:
-        """Park if the loop died, let the recorder finish, and say how it went."""
+    def _end(self) -> None:
+        """Park first, if the loop died; then let the recorder finish."""
         words = self.block.words
-        code, error = self._loop.exit_code or 0, None
         if words[Word.LOOP_STATE] not in (ProcessState.FINISHED, ProcessState.FAILED):
-            died = "stood still and was killed" if self._stalled else f"died ({_ending(code)})"
-            error = f"the loop's process {died}; {self._park()}"
+            died = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
+            self.error = f"the loop's process {died}; {self._park()}"
             words[Word.LOOP_STATE] = ProcessState.FAILED
-        totals = self.recorder.finish()
+        self.ended = True
+        self.recorder.finish()
+
+    def _result(self, totals: dict[str, Any]) -> RunResult:
+        """How it went."""
         self._loop.wait(1.0)
         self._collect()
         finished, failed = self._reports.get("finished", {}), self._reports.get("failed", {})
         outcome = finished.get("outcome", "failed" if failed else "killed")
-        error = error or finished.get("driver_error") or failed.get("message")
-        if error is None and outcome == "heartbeat_lost":
-            error = "the loop lost its heartbeat and parked by itself"
+        error = self.error or finished.get("driver_error") or failed.get("message") or FAULTS.get(outcome)
         error = error or totals.get("error")
+        code = self._loop.exit_code or 0
         if code <= 0 and (outcome not in ("done", "stopped") or not totals.get("complete")):
             code = LoopFault.exit_code
         paths = [Path(path) for path in totals["paths"]]
@@ -224,9 +263,8 @@ class Supervisor:
     def _park(self) -> str:
         """Ramp the outputs down in the loop's place; what came of it in words."""
         plan = self.prepared.plan
-        slew = float(np.min(plan.coefficients["trip_slew_v_per_tick"])) * plan.pacing.rate_hz
         try:
-            park(plan.driver(), plan.wiring, plan.axes, self.block["last_drive_v"].tolist(), slew)
+            park(plan.driver(), plan.trip_slew_v_per_s, self.block["last_drive_v"])
         except DriverError as error:
             return f"its outputs could not be parked: {error}"
         return "its outputs were parked in its place"
