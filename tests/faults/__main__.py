@@ -26,8 +26,7 @@ def cells(row: Row) -> tuple[str, ...]:
     )  # fmt: skip
     drive = f"{row.largest_v:.2f} V, {row.step_v:.3f} V ({row.bound_v:.3f})"
     verdict = f"not possible here: {row.skipped}" if row.skipped else ("holds" if not row.problems else "FAILS")
-    exempt = f"any step allowed: {measured.step_exempt}" if measured.step_exempt else ""
-    notes = filter(None, (measured.note, exempt))
+    notes = filter(None, (measured.note,))
     return (row.fault.name, row.fault.must, safe, f"{ticks.lost} / {ticks.executed}", drive,
             "; ".join([verdict, *notes, *(problem[:LONGEST] for problem in row.problems)]))  # fmt: skip
 

@@ -20,14 +20,15 @@ POLL_S = 0.002
 
 
 class Seen(NamedTuple):
-    """What the board says of its output; `late_s` is how late its own clock ever was."""
+    """What the board says of its output. `largest_step_v` is the largest from one write to the next."""
 
     last_v: float
     lowest_v: float
     highest_v: float
     largest_step_v: float
     moved_ns: int
-    late_s: float
+    unseen: int
+    """Writes that it came too late to see."""
 
     @property
     def largest_v(self) -> float:
@@ -65,12 +66,12 @@ class Evidence:
         """What the output did, read from the board."""
         if self.card:
             record = np.memmap(self.folder / "card", plain_card.MEMORY, "r", shape=(1,))[0]
-            late_s = 0.0
+            step, unseen = "largest_step_v", 0
         else:
             memory = self.memory
-            record, late_s = memory.seen[0], float(memory.words[board.LONGEST_LATE_NS]) / 1e9
-        values = [record[name] for name in ("last_v", "lowest_v", "highest_v", "largest_step_v")]
-        return Seen(*map(float, values), int(record["moved_ns"]), late_s)
+            record, step, unseen = memory.seen[0], "largest_write_step_v", int(memory.words[board.UNSEEN])
+        values = [record[name] for name in ("last_v", "lowest_v", "highest_v", step)]
+        return Seen(*map(float, values), int(record["moved_ns"]), unseen)
 
     def ask_for(self, fault: int) -> None:
         """A fault of the board or of the card."""
@@ -96,6 +97,7 @@ class Evidence:
         """Keep what the board says now: a board that is started again forgets."""
         self.witnessed.append(self.seen())
 
-    def step_bound_v(self, rate_hz: float, seen: Seen) -> float:
-        """What the slew allows between two looks: a period where every write is seen, else two and the lateness."""
-        return SLEW_V_PER_S * (1 / rate_hz if self.card else 2 / rate_hz + seen.late_s) + LSB_V
+
+def step_bound_v(rate_hz: float) -> float:
+    """What slew and ramps allow from one write to the next, whatever the time between them."""
+    return 1.05 * SLEW_V_PER_S / rate_hz + LSB_V

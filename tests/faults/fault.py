@@ -12,6 +12,7 @@ from rtloop.errors import RtloopError
 from tests.faults.account import Account, account
 from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ, CARD_RATE_HZ
+from tests.faults.evidence import step_bound_v
 
 FULL_SCALE_V = 10.0
 
@@ -22,11 +23,10 @@ class NotPossible(Exception):
 
 @dataclass
 class Measured:
-    """What a fault is judged by. A step may be exempt where the board itself, and no command, made it."""
+    """What a fault is judged by."""
 
     safe_ms: float | None = None
     lost_allowed: bool = False
-    step_exempt: str = ""
     exit_code: int = 0
     note: str = ""
     extra: list[str] = field(default_factory=list)
@@ -100,14 +100,14 @@ def _judge(row: Row, bench: Bench) -> None:
         row.problems.append(f"exit code {code}, not {measured.exit_code}; {bench.log()[-600:]}")
     bench.witness()
     row.largest_v = max(seen.largest_v for seen in bench.witnessed)
-    row.step_v, row.bound_v = max(zip((s.largest_step_v for s in bench.witnessed),
-                                      (bench.step_bound_v(row.rate_hz, s) for s in bench.witnessed), strict=True),
-                                  key=lambda pair: pair[0] - pair[1])  # fmt: skip
+    row.step_v, row.bound_v = max(seen.largest_step_v for seen in bench.witnessed), step_bound_v(row.rate_hz)
+    if unseen := sum(seen.unseen for seen in bench.witnessed):
+        row.problems.append(f"{unseen} writes that the board came too late to see")
     if bench.seen().last_v != 0.0:
         row.problems.append(f"the output is at {bench.seen().last_v:.3f} V in the end")
     if row.largest_v > FULL_SCALE_V:
         row.problems.append(f"a drive of {row.largest_v:.3f} V")
-    if row.step_v > row.bound_v and not measured.step_exempt:
+    if row.step_v > row.bound_v:
         row.problems.append(f"a step of {row.step_v:.3f} V, allowed {row.bound_v:.3f} V")
     row.account = account(bench.folder / "recordings", bench.blocks)
     row.problems += row.account.problems
