@@ -25,7 +25,7 @@ def serve(config: Path) -> int:
 @CONFIG
 @fails_clearly
 def park(config: Path) -> int:
-    """Bring every output of CONFIG to its safe value, ramping from the last known drive."""
+    """Bring every output of CONFIG to its safe value, ramping from where it is."""
     from rtloop.service.parking import park_configuration
 
     click.echo(park_configuration(config), err=True)

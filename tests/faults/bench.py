@@ -47,6 +47,8 @@ class Bench(Evidence):
         self.board: subprocess.Popen[str] | None = None
         self.service: subprocess.Popen[str] | None = None
         self.blocks: list[SharedBlock] = []
+        self.stderr: int | None = None
+        """Where processes that are started from now on complain, if not to the log."""
         self._started: list[subprocess.Popen[str]] = []
         if card:
             plain_card.install(folder)
@@ -77,7 +79,8 @@ class Bench(Evidence):
         """Start a command; what it says goes to a log that `log` shows."""
         command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
         with open(self.folder / "log", "a") as log:
-            process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log, text=True)
+            stderr = log if self.stderr is None else self.stderr
+            process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=stderr, text=True)
         self._started.append(process)
         return process
 

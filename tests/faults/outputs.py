@@ -1,0 +1,188 @@
+"""Faults that would move an output: parking again and again, a log that nobody reads, changes under way."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import random
+import signal
+import time
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from drivers.base import Driver
+from drivers.errors import DriverError
+from hil.board import LSB_V
+from rtloop.config import load
+from rtloop.engine.ramp import ramp
+from rtloop.prepare import prepare
+from rtloop.service.parking import park
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.faults.fault import Fault, Measured
+from tests.faults.processes import KILLED_SAFE_MS
+from tests.faults.requests import is_refused
+
+DEATHS, SEED = 200, 14
+FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
+WITHOUT_RESTART = (("[recording]", "[service]\nrestarts = 0\n[recording]"),)
+PATIENT = (("[recording]", "[service]\nstall_ms = 60000.0\n[recording]"),)
+TAPS = (128, 3, 64, 1, 17, 5)
+
+
+def parked_again(bench: Bench) -> Measured:
+    """The service and its loop die at once; three times whoever comes parks."""
+    service, loop = bench.pid("service"), bench.pid("rt")
+    bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
+    assert bench.service is not None
+    bench.service.wait()
+    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    took_ms = bench.await_safe(60_000.0)
+    moved_ns = bench.seen().moved_ns
+    for _ in range(2):
+        assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.seen().moved_ns == moved_ns, "the output moved again"
+    bench.start_service()
+    bench.await_drive()
+    return Measured(took_ms)
+
+
+def parked_by_the_service_and_after_it(bench: Bench) -> Measured:
+    """No other loop is allowed: the service parks and ends, and the unit parks after it."""
+    bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
+    took_ms = bench.await_safe(KILLED_SAFE_MS)
+    assert bench.service is not None
+    bench.service.wait(60.0)
+    moved_ns = bench.seen().moved_ns
+    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.seen().moved_ns == moved_ns, "the output moved again"
+    return Measured(took_ms, exit_code=1)
+
+
+def ended_while_it_parks(bench: Bench) -> Measured:
+    """SIGTERM just after the loop's death."""
+    bench.strike(
+        lambda: os.kill(bench.pid("rt"), signal.SIGKILL), lambda: os.kill(bench.pid("service"), signal.SIGTERM)
+    )
+    took_ms = bench.await_safe(KILLED_SAFE_MS)
+    assert bench.service is not None
+    bench.service.wait(60.0)
+    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    return Measured(took_ms, exit_code=1)
+
+
+def full_pipe(bench: Bench) -> Measured:
+    """Whoever reads the log has stopped; then the loop is killed."""
+    bench.stop()
+    reading, writing = os.pipe()
+    bench.stderr = writing
+    bench.start_service()
+    bench.await_drive()
+    os.set_blocking(writing, False)
+    filled = 0
+    while True:
+        try:
+            filled += os.write(writing, b"x" * 4096)
+        except BlockingIOError:
+            break
+    os.set_blocking(writing, True)  # of the pipe, and so for the service as well
+    bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
+    took_ms = bench.await_safe(KILLED_SAFE_MS)
+    bench.await_restart()
+    assert bench.await_state("tripped")["faults"]
+    bench.recover()
+    assert len(os.read(reading, filled)) > 0
+    os.close(reading)
+    os.close(writing)
+    bench.stderr = None
+    return Measured(took_ms, note=f"{filled} bytes in the pipe")
+
+
+def other_filters(bench: Bench) -> Measured:
+    """Pre-filters of other lengths, one after the other, while the loop drives."""
+    bench.strike()
+    for taps in TAPS:
+        ticks = bench.ticks
+        bench.client.post("/tune", {"axis": "x", "section": "prefilter", "values": {"taps": [1 / taps] * taps}})
+        wait_for(lambda ticks=ticks: bench.ticks > ticks + 500, "some more ticks")
+    report = bench.status()
+    assert (report["state"], report["restarts"]) == ("running", 0), report
+    return Measured(note=f"{len(TAPS)} lengths")
+
+
+def refused_setpoint(bench: Bench) -> Measured:
+    """A setpoint for a loop that stands still: what was refused is not applied when it goes on."""
+    loop, before_um = bench.pid("rt"), bench.status()["axes"]["x"]["reference_um"]
+    bench.strike(lambda: os.kill(loop, signal.SIGSTOP))
+    assert is_refused(bench, "/setpoint", {"axis": "x", "value": -before_um})
+    os.kill(loop, signal.SIGCONT)
+    ticks = bench.ticks
+    wait_for(lambda: bench.ticks > ticks + 1000, "some more ticks")
+    reference_um = bench.status()["axes"]["x"]["reference_um"]
+    assert reference_um * before_um > 0, f"reference {before_um} µm, now {reference_um} µm"
+    return Measured()
+
+
+def parking_that_dies(bench: Bench) -> Measured:
+    """So many times: a process drives the output and dies, another is killed while it parks, a third parks."""
+    service, loop = bench.pid("service"), bench.pid("rt")
+    plan = prepare(load(bench.config)).plan
+    slew_v_per_s, noted_v, chance = plan.trip_slew_v_per_s, bench.blocks[-1]["last_drive_v"], random.Random(SEED)
+    bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
+    assert bench.service is not None
+    bench.service.wait()
+    park(plan.driver(), slew_v_per_s, noted_v)
+    halfway = 0
+    for _ in range(DEATHS):
+        drive_v = chance.uniform(-9.0, 9.0)
+        os.waitpid(fork(lambda drive_v=drive_v: drive_and_die(plan.driver(), drive_v, slew_v_per_s)), 0)
+        wait_for(lambda drive_v=drive_v: abs(bench.seen().last_v - drive_v) < LSB_V, "a drive")
+        pid = fork(lambda: park(plan.driver(), slew_v_per_s, noted_v))
+        time.sleep(chance.uniform(0.0, 2.0 * abs(drive_v) / slew_v_per_s))
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        halfway += 0.0 < abs(park(plan.driver(), slew_v_per_s, noted_v)[0]) < abs(drive_v) - LSB_V
+        wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    assert halfway > DEATHS // 10, f"{halfway} of {DEATHS} died halfway"
+    bench.start_service()
+    bench.await_drive()
+    return Measured(note=f"{DEATHS} deaths, seed {SEED}, {halfway} of them halfway down")
+
+
+def drive_and_die(driver: Driver, drive_v: float, slew_v_per_s: float) -> None:
+    """Ramp the output up, and leave it there."""
+    pointers = driver.open()
+    write = FUNCTION(pointers.write)
+    for row in ramp(np.zeros(1), np.array([drive_v]), slew_v_per_s / driver.rate_hz):
+        write(pointers.context, row.ctypes.data)
+        time.sleep(1e-4)
+    os._exit(0)
+
+
+def fork(work: Callable[[], object]) -> int:
+    """Process number of a child that does `work` and ends."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pid = os.fork()
+    if pid == 0:
+        try:
+            work()
+        except DriverError:
+            pass
+        finally:
+            os._exit(0)
+    return pid
+
+
+FAULTS = (
+    Fault("parked three times", "the first ramps, the others move nothing", parked_again),
+    Fault("loop SIGKILL, no restart", "service parks and ends; parking again moves nothing",
+          parked_by_the_service_and_after_it, changes=WITHOUT_RESTART),
+    Fault("loop SIGKILL, then SIGTERM", "parked; parking again moves nothing", ended_while_it_parks),
+    Fault("log that nobody reads", "parked in time; lines lost, not seconds", full_pipe),
+    Fault("pre-filters of other lengths", "the loop goes on", other_filters),
+    Fault("setpoint while it stands still", "refused and not applied later", refused_setpoint, changes=PATIENT),
+    Fault("parking SIGKILL, again and again", "gone on with where it was", parking_that_dies),
+)  # fmt: skip
