@@ -18,6 +18,7 @@ from rtloop.errors import OutputError
 from rtloop.recording.format import chunk_rows
 from rtloop.recording.load import load
 from rtloop.recording.reader import Reader
+from rtloop.recording.recover import recover
 from rtloop.recording.replay import replay
 from rtloop.recording.session import Options, Session
 from rtloop.recording.summary import summarise
@@ -218,9 +219,21 @@ def test_a_recorder_in_place_of_one_that_died_waits_for_room(disk: Disk, tmp_pat
     assert of_kind(load(second).events, "gap") == [{"first_tick": written, "count": 3 * SECOND - written}]
 
 
+def test_a_disk_that_fails_for_good_takes_nothing_back(disk: Disk, tmp_path: Path):
+    run = Recorded(tmp_path / "run.mcap")
+    run.run_to(16_000)
+    disk.error = errno.EIO
+    run.run_to(32_000)
+    totals = run.end()
+    part = tmp_path / "run.mcap.part"
+    disk.error = None
+    assert recover(part)["ticks"] == totals["ticks_logged"] >= 10_000
+    assert totals["ticks_lost"] == 32_000 - totals["ticks_logged"]
+
+
 def test_a_run_that_cannot_begin_leaves_nothing(disk: Disk, tmp_path: Path):
-    disk.error = errno.ENOSPC
     loop = HandMadeLoop()
+    disk.error = errno.ENOSPC
     with pytest.raises(OutputError, match="No space left"):
         Session(loop.block, tmp_path / "run.mcap", make_header(), Options(min_free_bytes=0))
     assert os.listdir(tmp_path) == []
@@ -251,15 +264,15 @@ def test_a_small_disk_that_is_made_larger(tmp_path: Path):
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", small], capture_output=True).returncode:
         pytest.skip("mounting a small disk is not permitted here")
     loop = HandMadeLoop()
-    recorder, rows, words = RecorderProcess(loop), make_rows(120_000), loop.block.words
+    recorder, rows, words = RecorderProcess(loop), make_rows(45_000), loop.block.words
     try:
         recorder.start(small / "run.mcap")
-        loop.run(rows[:60_000], slack=20_000)
+        loop.run(rows[:25_000], slack=20_000, snapshot_every=5_000)
         recorder.wait_until(lambda: words[Word.RECORDER_STATE] == ProcessState.FAILED)
         subprocess.run(["mount", "-o", "remount,size=64m", small], check=True)
-        loop.run(rows[60_000:80_000], slack=20_000)
+        loop.run(rows[25_000:35_000], slack=20_000, snapshot_every=5_000)
         recorder.wait_until(lambda: words[Word.RECORDER_STATE] == ProcessState.RUNNING)
-        loop.run(rows[80_000:], slack=20_000)
+        loop.run(rows[35_000:], slack=20_000, snapshot_every=5_000)
         loop.end()
         code, totals = recorder.result()
         assert code == 1
