@@ -61,8 +61,7 @@ class Recorder:
             drained = session.drain()
             self.set_word(Word.RECORDER_CURSOR, session.cursor)
             session.write_due()
-            if session.error:
-                self.set_word(Word.RECORDER_STATE, ProcessState.FAILED)
+            self.set_word(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
             if drained:
                 last_tick_s = time.monotonic()
             elif state in (ProcessState.FINISHED, ProcessState.FAILED):
