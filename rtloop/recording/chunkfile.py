@@ -62,7 +62,6 @@ class ChunkFile:
         self._distinct_counts: dict[tuple[tuple[int, int], ...], dict[int, int]] = {}
         self._crc = 0
         self._fd = self._open()
-        self._identity = os.fstat(self._fd)
         try:
             self._append(MAGIC + pack_records([header]))
         except OutputError:
@@ -80,9 +79,12 @@ class ChunkFile:
     def is_there(self) -> bool:
         """Whether the unfinished file still lies under its name: a removed one can be written, and is lost."""
         try:
-            return os.path.samestat(os.stat(self.part), self._identity)
-        except OSError:
+            os.stat(self.part)
+        except (FileNotFoundError, NotADirectoryError):
             return False
+        except OSError:
+            return True  # nobody knows; writing will tell
+        return True
 
     def append(self, content: Content) -> None:
         """Compress and write one chunk and its index records, if it has any."""
