@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,13 @@ from rtloop.recording.rings import RingReader
 from rtloop.signals import DEADLINE, TICK
 
 NS_PER_S = 1e9
+
+
+class Place(NamedTuple):
+    """A tick, and when it is due, in ns since the start."""
+
+    tick: int
+    time_ns: int
 
 
 class TickBuffer:
@@ -58,6 +65,10 @@ class TickBuffer:
         if row >= 0:
             base_tick, base_ns = self._rows[row, TICK], self._rows[row, DEADLINE]
         return round(base_ns + (tick - base_tick) * NS_PER_S / self._rate_hz)
+
+    def place(self, tick: int) -> Place:
+        """A tick and its time."""
+        return Place(tick, self.time_ns(tick))
 
     def gaps(self, count: int, expected: int) -> list[tuple[int, int]]:
         """(first tick, ticks) of all that is missing in the first `count` rows, which are to begin at `expected`."""

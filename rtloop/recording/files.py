@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.errors import OutputError
+from rtloop.recording.buffer import Place
 from rtloop.recording.contents import Message
 from rtloop.recording.writer import Writer
 
@@ -22,13 +23,6 @@ class Options(NamedTuple):
     message_index: bool = False
     sequence: int = 1
     """Number of the first file: above 1 where another recorder of the same run died."""
-
-
-class Place(NamedTuple):
-    """A tick, and when it is due, in ns since the start."""
-
-    tick: int
-    time_ns: int
 
 
 class Files:

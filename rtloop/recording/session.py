@@ -8,30 +8,26 @@ before it were drained: a file can be cut there, however far the loop is ahead.
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
-from rtloop.recording import format
 from rtloop.recording.buffer import TickBuffer
 from rtloop.recording.contents import Message
 from rtloop.recording.events import (
     FINISHED,
     GAP,
-    RECORDER,
     RECORDING_FAILED,
     RECORDING_RESUMED,
     ROTATED,
-    Event,
     event_of,
     recorder_event,
 )
-from rtloop.recording.files import Files, Options, Place
+from rtloop.recording.files import Files, Options
+from rtloop.recording.pending import Entry, Pending, tick_of
 from rtloop.recording.rings import RingReader
 from rtloop.signals import TICK
 
@@ -39,17 +35,6 @@ FLUSH_S = 0.5
 FLUSHED = {"ticks": Word.FLUSHED_TICKS, "snapshots": Word.FLUSHED_SNAPSHOTS, "events": Word.FLUSHED_EVENTS}
 ROOM_BYTES = 1 << 20
 """Must be free, and a quarter more than is to stay free, before a file is begun after a failure: it is to last."""
-KEPT_EVENTS = 4096
-"""From a time in which nothing can be written, for the file that follows."""
-
-
-class Pending(NamedTuple):
-    """A message to be written in front of the next ticks."""
-
-    tick: int
-    message: Message
-    of_loop: bool
-    """Whether it is an event that the loop published."""
 
 
 class Session:
@@ -67,13 +52,12 @@ class Session:
             RingReader(block, name, int(block.words[word])) for name, word in FLUSHED.items()
         )
         self._ahead: deque[bytes] = deque()
-        self._pending: list[Pending] = []
-        self._events_dropped = 0
+        self._pending = Pending(self._buffer, self._start_unix_ns)
         self.error: str | None = None
         self.failure: OutputError | None = None
         self._cut_tick = self.cursor
         logged = self.cursor - int(block.words[Word.LOST_TICKS])
-        self._files = Files(path, header, options, self._place(self.cursor), logged)
+        self._files = Files(path, header, options, self._buffer.place(self.cursor), logged)
         try:
             self._files.begin(self._files.opened(header["created_unix_ns"] if header["paced"] else 0))
         except OutputError as error:
@@ -96,12 +80,12 @@ class Session:
         ticks = self._buffer.take_from(self._ticks)
         snapshots, events = self._snapshots.take(), self._events.take()
         for message in events:
-            place = self._place(int(message["tick"]))
-            self._pending.append(self._entry(event_of(message, self._header["axes"], place.time_ns)))
+            time_ns = self._buffer.time_ns(int(message["tick"]))
+            self._pending.add_event(event_of(message, self._header["axes"], time_ns))
         self._ahead.extend(map(bytes, snapshots))
-        while self._ahead and (tick := _tick_of(self._ahead[0])) <= self.cursor:
+        while self._ahead and (tick := tick_of(self._ahead[0])) <= self.cursor:
             self._cut_if_due(tick)
-            self._add_snapshot()
+            self._pending.add_snapshot(self._ahead.popleft())
         return ticks + len(snapshots) + len(events)
 
     def write_due(self) -> None:
@@ -112,9 +96,9 @@ class Session:
     def finish(self, result: str) -> dict[str, Any]:
         """Write the rest and the end; returns the totals that the recorder prints."""
         while self._ahead:
-            self._add_snapshot()
+            self._pending.add_snapshot(self._ahead.popleft())
         self._write_all()
-        self._events_dropped += sum(entry.of_loop for entry in self._pending)
+        self._pending.drop(self._pending.take())
         self._finish_file(FINISHED, result, self.cursor, self.cursor)
         paths = [str(path) for path in self._files.paths]
         lost = self.cursor - self._files.logged
@@ -131,7 +115,7 @@ class Session:
 
     @property
     def _events_lost(self) -> int:
-        return self._events.lost + self._events_dropped
+        return self._events.lost + self._pending.dropped
 
     def _complete(self, lost: int, result: str) -> bool:
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
@@ -149,15 +133,13 @@ class Session:
             self._rotate(tick)
 
     def _rotate(self, tick: int) -> None:
-        early = [entry for entry in self._pending if entry.tick < tick]
-        self._pending = [entry for entry in self._pending if entry.tick >= tick]
-        self._write(self._buffer.before(tick), early)
+        self._write(self._buffer.before(tick), self._pending.take(before=tick))
         if self.failure:
             return
         self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
         self._cut_tick = tick
         try:
-            self._files.begin(self._files.opened(self._log_time(self._place(tick))))
+            self._files.begin(self._files.opened(self._pending.log_time(tick)))
         except OutputError as error:
             self._fail(error)
 
@@ -169,7 +151,7 @@ class Session:
             totals = {"ticks_executed": end_tick, "ticks_logged": logged, "ticks_lost": lost}
             totals |= {"events_lost": self._events_lost, "snapshots_lost": self._snapshots.lost, "result": result}
             what = {**totals, "complete": self._complete(lost, result), "error": self.error}
-            return self._own(kind, self._place(said_tick), what).message
+            return self._pending.own(kind, self._buffer.place(said_tick), what)
 
         if problem := self._files.finish(final):
             self.error = self.error or str(problem)
@@ -177,7 +159,7 @@ class Session:
     def _fail(self, error: OutputError) -> None:
         """Nothing is recorded from here on, until a file could be begun."""
         self.error = self.error or str(error)
-        self._pending.insert(0, self._own(RECORDING_FAILED, self._files.next, {"error": str(error)}))
+        self._pending.add_event(recorder_event(RECORDING_FAILED, *self._files.next, {"error": str(error)}))
         self._say(error)
 
     def _say(self, failure: OutputError) -> None:
@@ -189,31 +171,30 @@ class Session:
 
     def _resume(self, tick: int) -> None:
         """Try to go on in another file from the snapshot of `tick` on; the rows before it are lost."""
-        place, room_bytes = self._place(tick), ROOM_BYTES + self._options.min_free_bytes // 4
         self._files.leave_what_is_useless()
+        room_bytes = ROOM_BYTES + self._options.min_free_bytes // 4
         try:
-            writer = self._files.opened(self._log_time(place), room_bytes)
+            writer = self._files.opened(self._pending.log_time(tick), room_bytes)
         except OutputError as error:
             self._say(error)
             return
         self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
         self._files.begin(writer)
         gap = {"first_tick": self._files.next.tick, "count": tick - self._files.next.tick}
-        self._pending.append(self._own(RECORDING_RESUMED, place, gap))
+        self._pending.add_event(recorder_event(RECORDING_RESUMED, *self._buffer.place(tick), gap))
         self._buffer.drop(self._buffer.before(tick))
         self._cut_tick, self.failure = tick, None
         self._account(tick)
         self._block.words[Word.RECORDER_FAILURE] = 0
 
     def _write_all(self) -> None:
-        entries, self._pending = self._pending, []
-        self._write(len(self._buffer), entries)
+        self._write(len(self._buffer), self._pending.take())
         if self.failure is None:  # else a recorder that comes after this one may still find it in the rings
             self._account(self._files.next.tick)
             self._block.words[Word.FLUSHED_SNAPSHOTS] = self._snapshots.position - len(self._ahead)
             self._block.words[Word.FLUSHED_EVENTS] = self._events.position
 
-    def _write(self, count: int, entries: list[Pending]) -> None:
+    def _write(self, count: int, entries: list[Entry]) -> None:
         """Entries, then the first `count` rows. Where nothing can be written, rows are lost and events are kept."""
         self._written_s = time.monotonic()
         if self.failure is None:
@@ -222,21 +203,18 @@ class Session:
             except OutputError as error:
                 self._fail(error)
         if self.failure:
-            events = [entry for entry in entries + self._pending if entry.message.channel == format.EVENTS]
-            events.sort(key=lambda entry: entry.message.log_time)
-            self._events_dropped += sum(entry.of_loop for entry in events[KEPT_EVENTS:])
-            self._pending = events[:KEPT_EVENTS]
+            self._pending.keep_events(entries)
         self._buffer.drop(count)
 
     def _write_to_file(self, count: int, messages: list[Message]) -> None:
         rows, end = self._buffer.first(count), self._files.next
         if gaps := self._buffer.gaps(count, end.tick):
             for first, missing in gaps:
-                place = end if first == end.tick else self._place(first)
-                messages.append(self._own(GAP, place, {"first_tick": first, "count": missing}).message)
+                place = end if first == end.tick else self._buffer.place(first)
+                messages.append(self._pending.own(GAP, place, {"first_tick": first, "count": missing}))
             messages.sort(key=lambda message: message.log_time)
         if count:
-            end = self._place(int(rows[-1, TICK]) + 1)
+            end = self._buffer.place(int(rows[-1, TICK]) + 1)
         self._files.write(messages, rows, self._start_unix_ns(), end)
 
     def _account(self, tick: int) -> None:
@@ -249,27 +227,3 @@ class Session:
         if not self._header["paced"]:
             return 0
         return int(self._block.words[Word.START_UNIX_NS]) or self._header["created_unix_ns"]
-
-    def _place(self, tick: int) -> Place:
-        return Place(tick, self._buffer.time_ns(tick))
-
-    def _log_time(self, place: Place) -> int:
-        return self._start_unix_ns() + place.time_ns
-
-    def _own(self, kind: str, place: Place, what: dict[str, Any]) -> Pending:
-        return self._entry(recorder_event(kind, *place, what))
-
-    def _entry(self, event: Event) -> Pending:
-        log_time = self._log_time(Place(event["tick"], event["time_ns"]))
-        message = Message(format.EVENTS, log_time, json.dumps(event).encode())
-        return Pending(event["tick"], message, of_loop=event["who"] != RECORDER)
-
-    def _add_snapshot(self) -> None:
-        data = self._ahead.popleft()
-        place = self._place(_tick_of(data))
-        message = Message(format.LAW, self._log_time(place), hashlib.sha256(data).digest() + data)
-        self._pending.append(Pending(place.tick, message, of_loop=False))
-
-
-def _tick_of(snapshot: bytes) -> int:
-    return int.from_bytes(snapshot[:8], "little")
