@@ -16,6 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+LOW_SPACE = 1 << 16
+"""Beyond every errno: less space is free than is to stay free."""
+
 
 class RtloopError(Exception):
     """Base: the message names the thing, the value and what is allowed."""
@@ -41,9 +44,13 @@ class UnavailableError(RtloopError):
 
 
 class OutputError(RtloopError):
-    """A file or folder cannot be written."""
+    """A file or folder cannot be written; `number` says why: an errno, LOW_SPACE, or 0 for anything else."""
 
     exit_code = 73
+
+    def __init__(self, message: str, number: int = 0) -> None:
+        super().__init__(message)
+        self.number = number
 
 
 class MissingExtra(RtloopError):

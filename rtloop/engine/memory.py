@@ -52,6 +52,10 @@ class Word(IntEnum):
     """Positions up to which the recorder has written the rings: where the next one goes on if it dies."""
     FLUSHED_EVENTS = 13
     FLUSHED_SNAPSHOTS = 14
+    LOST_TICKS = 15
+    """Ticks before FLUSHED_TICKS that are in no file."""
+    RECORDER_FAILURE = 16
+    """Why ticks from FLUSHED_TICKS on are not recorded: `OutputError.number`; 0 while they are."""
 
 
 class ProcessState(IntEnum):

@@ -7,6 +7,7 @@ everything up to its last chunk; a full disk leaves room for the index by giving
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import zlib
@@ -61,10 +62,29 @@ class ChunkFile:
         self._distinct_counts: dict[tuple[tuple[int, int], ...], dict[int, int]] = {}
         self._crc = 0
         self._fd = self._open()
-        self._append(MAGIC + pack_records([header]))
+        try:
+            self._append(MAGIC + pack_records([header]))
+        except OutputError:
+            self.discard()
+            raise
 
     def __len__(self) -> int:
         return len(self._chunks)
+
+    @property
+    def end_bytes(self) -> int:
+        """About what the index will take."""
+        return sum(len(chunk.record) for chunk in self._chunks)
+
+    def is_there(self) -> bool:
+        """Whether the unfinished file still lies under its name: a removed one can be written, and is lost."""
+        try:
+            os.stat(self.part)
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError:
+            return True  # nobody knows; writing will tell
+        return True
 
     def append(self, content: Content) -> None:
         """Compress and write one chunk and its index records, if it has any."""
@@ -111,7 +131,8 @@ class ChunkFile:
         try:
             os.fsync(self._fd)
             if self.path.exists():
-                raise OutputError(f"{self.path} appeared while it was written; the recording stays in {self.part}")
+                message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
+                raise OutputError(message, errno.EEXIST)
             os.rename(self.part, self.path)
             folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             os.fsync(folder)
@@ -127,15 +148,23 @@ class ChunkFile:
             os.close(self._fd)
             self._fd = -1
 
+    def discard(self) -> None:
+        """Give up the file and remove it."""
+        if self.is_there():
+            with contextlib.suppress(OSError):
+                os.unlink(self.part)
+        self.close()
+
     def _open(self) -> int:
         if self.path.exists():
-            raise OutputError(f"{self.path} exists already; a recording is never overwritten")
+            raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
         try:
             fd = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
             return fd
         except FileExistsError:
-            raise OutputError(f"{self.part} is left from an unfinished run; `rtloop recover` completes it") from None
+            message = f"{self.part} is left from an unfinished run; `rtloop recover` completes it"
+            raise OutputError(message, errno.EEXIST) from None
         except OSError as error:
             raise self._refused(error) from None
 
@@ -171,4 +200,4 @@ class ChunkFile:
         )
 
     def _refused(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.part}: {error.strerror}")
+        return OutputError(f"{self.part}: {error.strerror}", error.errno or 0)

@@ -17,7 +17,9 @@ from rtloop.signals import Mode, trip_causes
 
 Event = dict[str, Any]
 GAP, FINISHED, ROTATED, RECOVERED = "gap", "finished", "rotated", "recovered"
-"""Kinds that the recorder itself writes; `who` is "recorder"."""
+RECORDING_FAILED, RECORDING_RESUMED = "recording_failed", "recording_resumed"
+"""Kinds that the recorder itself writes; `who` is RECORDER."""
+RECORDER = "recorder"
 FINAL = (FINISHED, ROTATED, RECOVERED)
 """One of these ends a file; its `what` holds the totals."""
 
@@ -43,7 +45,7 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
 
 def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
     """The record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder's own."""
-    if event["kind"] in (GAP, *FINAL):
+    if event["who"] == RECORDER:
         return None
     record = np.zeros(1, MESSAGE)
     record["tick"], record["identity"] = event["tick"], event["what"]["identity"]
@@ -55,7 +57,7 @@ def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None
 
 def recorder_event(kind: str, tick: int, time_ns: int, what: dict[str, Any]) -> Event:
     """An event of the recorder's own."""
-    return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": "recorder", "axis": None, "what": what}
+    return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": what}
 
 
 def _name(kinds: Any, value: float) -> str:

@@ -6,6 +6,8 @@ N is the shared block. One JSON line on stdin starts it: {"path": ".../NAME.mcap
 "options": the fields of `session.Options`. It ends when the loop has and the rings are empty, and prints one JSON
 line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. SIGINT and SIGTERM are
 ignored, for the loop's last ticks are to be recorded too.
+
+RECORDER_STATE is FAILED while nothing can be written, and RUNNING again once that is over.
 """
 
 from __future__ import annotations
@@ -61,8 +63,7 @@ class Recorder:
             drained = session.drain()
             self.set_word(Word.RECORDER_CURSOR, session.cursor)
             session.write_due()
-            if session.error:
-                self.set_word(Word.RECORDER_STATE, ProcessState.FAILED)
+            self.set_word(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
             if drained:
                 last_tick_s = time.monotonic()
             elif state in (ProcessState.FINISHED, ProcessState.FAILED):

@@ -1,62 +1,69 @@
 """One run's recording: what was drained from the rings and is not yet in the file, and the file or files.
 
 Order: ticks are drained before snapshots, these before events, and ticks are written last. A tick in the file
-therefore always finds the snapshot and the commands that precede it in front of it, and a snapshot at which the file
-is rotated finds all events before it drained.
+therefore always finds the snapshot and the commands that precede it in front of it. A snapshot waits until all ticks
+before it were drained: a file can be cut there, however far the loop is ahead.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
+import errno
 import time
+from collections import deque
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
-from rtloop.recording import format
+from rtloop.recording.buffer import TickBuffer
 from rtloop.recording.contents import Message
-from rtloop.recording.events import FINISHED, GAP, ROTATED, event_of, recorder_event
+from rtloop.recording.events import (
+    FINISHED,
+    GAP,
+    RECORDING_FAILED,
+    RECORDING_RESUMED,
+    ROTATED,
+    event_of,
+    recorder_event,
+)
+from rtloop.recording.files import Files, Options
+from rtloop.recording.pending import Entry, Pending, tick_of
 from rtloop.recording.rings import RingReader
-from rtloop.recording.writer import Writer
-from rtloop.signals import DEADLINE, TICK
+from rtloop.signals import TICK
 
 FLUSH_S = 0.5
 FLUSHED = {"ticks": Word.FLUSHED_TICKS, "snapshots": Word.FLUSHED_SNAPSHOTS, "events": Word.FLUSHED_EVENTS}
-NS_PER_S = 1e9
-
-
-class Options(NamedTuple):
-    """Choices of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …, each cut at a state snapshot."""
-
-    rotate_bytes: int | None = None
-    rotate_s: float | None = None
-    min_free_bytes: int = 64 << 20
-    message_index: bool = False
-    sequence: int = 1
-    """Number of the first file: above 1 where another recorder of the same run died."""
+ROOM_BYTES = 1 << 20
+"""Must be free, and a quarter more than is to stay free, before a file is begun after a failure: it is to last."""
 
 
 class Session:
-    """Drains the rings of `block` and writes `path`. After an error it goes on draining and counts the loss."""
+    """Drains the rings of `block` and writes `path`.
+
+    Where that fails it goes on draining, counts the loss, and tries a new file at every snapshot: `failure` says why
+    nothing is recorded now, `error` what came first. An unpaced run waits for its recorder: it is not tried again.
+    """
 
     def __init__(self, block: SharedBlock, path: Path, header: dict[str, Any], options: Options) -> None:
         self._block, self._path, self._header, self._options = block, path, header, options
-        self._rows = np.empty((format.chunk_rows(header["columns"]), len(header["columns"])))
-        self._fill, self._written_s = 0, time.monotonic()
-        self._anchor = (0.0, 0.0)
+        self._buffer = TickBuffer(header["columns"], header["rate_hz"])
+        self._written_s = time.monotonic()
         self._ticks, self._snapshots, self._events = (
             RingReader(block, name, int(block.words[word])) for name, word in FLUSHED.items()
         )
-        self._pending: list[tuple[int, Message]] = []
-        self._paths: list[Path] = []
-        self._first_tick, self._logged, self._bytes = self._ticks.position, 0, 0
-        self._begin_tick = self._first_tick
+        self._ahead: deque[bytes] = deque()
+        self._pending = Pending(self._buffer, self._start_unix_ns)
         self.error: str | None = None
-        self._writer = self._open(header["created_unix_ns"] if header["paced"] else 0)
+        self.failure: OutputError | None = None
+        self._cut_tick = self.cursor
+        logged = self.cursor - int(block.words[Word.LOST_TICKS])
+        self._files = Files(path, header, options, self._buffer.place(self.cursor), logged)
+        try:
+            self._files.begin(self._files.opened(header["created_unix_ns"] if header["paced"] else 0))
+        except OutputError as error:
+            if options.sequence == 1:
+                raise
+            self._fail(error)
 
     @property
     def cursor(self) -> int:
@@ -66,143 +73,157 @@ class Session:
     @property
     def room(self) -> int:
         """Ticks that the next drain can take."""
-        return len(self._rows) - self._fill
+        return self._buffer.room
 
     def drain(self) -> int:
         """Copy what the rings hold; returns the number of ticks and messages taken or found lost."""
-        start = self._ticks.position
-        copied, lost = self._ticks.take_into(self._rows[self._fill :])
-        self._fill += copied
-        if lost:
-            gap = recorder_event(GAP, start, self._time_ns(start), {"first_tick": start, "count": lost})
-            self._add(format.EVENTS, start, json.dumps(gap))
+        ticks = self._buffer.take_from(self._ticks)
         snapshots, events = self._snapshots.take(), self._events.take()
         for message in events:
-            tick = int(message["tick"])
-            self._add(format.EVENTS, tick, json.dumps(event_of(message, self._header["axes"], self._time_ns(tick))))
-        for data in map(bytes, snapshots):
-            tick = int.from_bytes(data[:8], "little")
-            self._rotate_if_due(tick)
-            self._add(format.LAW, tick, hashlib.sha256(data).digest() + data)
-        return copied + lost + len(snapshots) + len(events)
+            time_ns = self._buffer.time_ns(int(message["tick"]))
+            self._pending.add_event(event_of(message, self._header["axes"], time_ns))
+        self._ahead.extend(map(bytes, snapshots))
+        while self._ahead and (tick := tick_of(self._ahead[0])) <= self.cursor:
+            self._cut_if_due(tick)
+            self._pending.add_snapshot(self._ahead.popleft())
+        return ticks + len(snapshots) + len(events)
 
     def write_due(self) -> None:
         """Write when a chunk is full or the last write is FLUSH_S ago."""
         if self.room == 0 or time.monotonic() - self._written_s >= FLUSH_S:
-            self._write(self._fill, self._pending)
-            self._pending = []
+            self._write_all()
 
     def finish(self, result: str) -> dict[str, Any]:
         """Write the rest and the end; returns the totals that the recorder prints."""
-        self._write(self._fill, self._pending)
-        self._close(FINISHED, result, self.cursor)
-        lost = self.cursor - self._begin_tick - self._logged
+        while self._ahead:
+            self._pending.add_snapshot(self._ahead.popleft())
+        self._write_all()
+        self._pending.drop(self._pending.take())
+        self._finish_file(FINISHED, result, self.cursor, self.cursor)
+        paths = [str(path) for path in self._files.paths]
+        lost = self.cursor - self._files.logged
         return {
-            "path": str(self._paths[-1]),
-            "paths": [str(path) for path in self._paths],
-            "ticks_logged": self._logged,
+            "path": paths[-1] if paths else str(self._path),
+            "paths": paths,
+            "ticks_logged": self._files.logged,
             "ticks_lost": lost,
-            "events_lost": self._events.lost,
-            "bytes": self._bytes,
+            "events_lost": self._events_lost,
+            "bytes": self._files.closed_bytes,
             "complete": self._complete(lost, result),
             "error": self.error,
         }
 
+    @property
+    def _events_lost(self) -> int:
+        return self._events.lost + self._pending.dropped
+
     def _complete(self, lost: int, result: str) -> bool:
-        return lost == 0 and self._events.lost == 0 and self.error is None and result in (FINISHED, ROTATED)
+        return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
-    def _open(self, log_time: int) -> Writer:
-        path, header = self._path, self._header
-        if self._options.rotate_bytes or self._options.rotate_s or self._options.sequence > 1:
-            sequence = len(self._paths) + self._options.sequence
-            path = path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
-            header = {**header, "sequence": sequence, "first_tick": self._first_tick}
-        self._paths.append(path)
-        return Writer(
-            path,
-            header,
-            log_time,
-            message_index=self._options.message_index,
-            min_free_bytes=self._options.min_free_bytes,
-        )
+    def _cut_if_due(self, tick: int) -> None:
+        """Go on in another file from the snapshot of `tick` on: after a failure, or where this one is large enough."""
+        if self.failure:
+            if self._header["paced"]:
+                self._resume(tick)
+            return
+        options, age_s = self._options, (tick - self._cut_tick) / self._header["rate_hz"]
+        large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
+        long = options.rotate_s is not None and age_s >= options.rotate_s
+        if (large or long) and tick > self._cut_tick:
+            self._rotate(tick)
 
-    def _close(self, kind: str, result: str, end_tick: int) -> None:
-        """Finish the file, which covers the ticks from `_first_tick` to before `end_tick`."""
+    def _rotate(self, tick: int) -> None:
+        self._write(self._buffer.before(tick), self._pending.take(before=tick))
+        if self.failure:
+            return
+        self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
+        self._cut_tick = tick
+        try:
+            self._files.begin(self._files.opened(self._pending.log_time(tick)))
+        except OutputError as error:
+            self._fail(error)
+
+    def _finish_file(self, kind: str, result: str, end_tick: int, said_tick: int) -> None:
+        """Finish the file, which accounts for the ticks before `end_tick`; the event that ends it is of `said_tick`."""
 
         def final(logged: int) -> Message:
-            lost = end_tick - self._first_tick - logged
+            lost = end_tick - self._files.first.tick - logged
             totals = {"ticks_executed": end_tick, "ticks_logged": logged, "ticks_lost": lost}
-            totals |= {"events_lost": self._events.lost, "snapshots_lost": self._snapshots.lost, "result": result}
+            totals |= {"events_lost": self._events_lost, "snapshots_lost": self._snapshots.lost, "result": result}
             what = {**totals, "complete": self._complete(lost, result), "error": self.error}
-            return self._message(
-                format.EVENTS, end_tick, json.dumps(recorder_event(kind, end_tick, self._time_ns(end_tick), what))
-            )
+            return self._pending.own(kind, self._buffer.place(said_tick), what)
 
+        if problem := self._files.finish(final):
+            self.error = self.error or str(problem)
+
+    def _fail(self, error: OutputError) -> None:
+        """Nothing is recorded from here on, until a file could be begun."""
+        self.error = self.error or str(error)
+        self._pending.add_event(recorder_event(RECORDING_FAILED, *self._files.next, {"error": str(error)}))
+        self._say(error)
+
+    def _say(self, failure: OutputError) -> None:
+        """Why nothing is recorded, and which tick is the first that is in no file."""
+        self.failure = failure
+        self._files.leave_what_is_useless()
+        self._account(self._files.next.tick)
+        self._block.words[Word.RECORDER_FAILURE] = failure.number or errno.EIO
+
+    def _resume(self, tick: int) -> None:
+        """Try to go on in another file from the snapshot of `tick` on; the rows before it are lost."""
+        self._files.leave_what_is_useless()
+        room_bytes = ROOM_BYTES + self._options.min_free_bytes // 4
         try:
-            self._writer.finish(final)
+            writer = self._files.opened(self._pending.log_time(tick), room_bytes)
         except OutputError as error:
-            self.error = self.error or str(error)
-            self._writer.close()
-        self._logged += self._writer.ticks
-        self._bytes += self._writer.size_bytes
-
-    def _rotate_if_due(self, tick: int) -> None:
-        """Go on in the next file, from `tick` on, if this one is large or long enough."""
-        options, age = self._options, (tick - self._first_tick) / self._header["rate_hz"]
-        large = options.rotate_bytes is not None and self._writer.size_bytes >= options.rotate_bytes
-        long = options.rotate_s is not None and age >= options.rotate_s
-        if not (large or long) or tick == self._first_tick or self.error:
+            self._say(error)
             return
-        early = [entry for entry in self._pending if entry[0] < tick]
-        self._pending = [entry for entry in self._pending if entry[0] >= tick]
-        self._write(int(np.searchsorted(self._rows[: self._fill, TICK], tick)), early)
-        self._close(ROTATED, "rotated", tick)
-        self._first_tick = tick
-        try:
-            self._writer = self._open(self._start_unix_ns() + self._time_ns(tick))
-        except OutputError as error:
-            self.error = self.error or str(error)
+        self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
+        self._files.begin(writer)
+        gap = {"first_tick": self._files.next.tick, "count": tick - self._files.next.tick}
+        self._pending.add_event(recorder_event(RECORDING_RESUMED, *self._buffer.place(tick), gap))
+        self._buffer.drop(self._buffer.before(tick))
+        self._cut_tick, self.failure = tick, None
+        self._account(tick)
+        self._block.words[Word.RECORDER_FAILURE] = 0
 
-    def _write(self, count: int, messages: list[tuple[int, Message]]) -> None:
-        """Messages, then the first `count` rows; the rows behind them move to the front."""
+    def _write_all(self) -> None:
+        self._write(len(self._buffer), self._pending.take())
+        if self.failure is None:  # else a recorder that comes after this one may still find it in the rings
+            self._account(self._files.next.tick)
+            self._block.words[Word.FLUSHED_SNAPSHOTS] = self._snapshots.position - len(self._ahead)
+            self._block.words[Word.FLUSHED_EVENTS] = self._events.position
+
+    def _write(self, count: int, entries: list[Entry]) -> None:
+        """Entries, then the first `count` rows. Where nothing can be written, rows are lost and events are kept."""
         self._written_s = time.monotonic()
-        if self.error is None:
+        if self.failure is None:
             try:
-                self._writer.start_unix_ns = self._start_unix_ns()
-                self._writer.write_messages([message for _, message in messages])
-                self._writer.write_ticks(self._rows[:count])
+                self._write_to_file(count, [entry.message for entry in entries])
             except OutputError as error:
-                self.error = str(error)
-        if count:
-            self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
-        self._say_flushed(count)
-        rest = self._fill - count
-        self._rows[:rest] = self._rows[count : self._fill].copy()
-        self._fill = rest
+                self._fail(error)
+        if self.failure:
+            self._pending.keep_events(entries)
+        self._buffer.drop(count)
 
-    def _say_flushed(self, count: int) -> None:
-        """Positions up to which everything is in the file, or lost."""
-        if count == self._fill:
-            for reader, word in zip((self._ticks, self._snapshots, self._events), FLUSHED.values(), strict=True):
-                self._block.words[word] = reader.position
+    def _write_to_file(self, count: int, messages: list[Message]) -> None:
+        rows, end = self._buffer.first(count), self._files.next
+        if gaps := self._buffer.gaps(count, end.tick):
+            for first, missing in gaps:
+                place = end if first == end.tick else self._buffer.place(first)
+                messages.append(self._pending.own(GAP, place, {"first_tick": first, "count": missing}))
+            messages.sort(key=lambda message: message.log_time)
+        if count:
+            end = self._buffer.place(int(rows[-1, TICK]) + 1)
+        self._files.write(messages, rows, self._start_unix_ns(), end)
+
+    def _account(self, tick: int) -> None:
+        """Ticks before `tick` are in a file, or lost."""
+        self._block.words[Word.FLUSHED_TICKS] = tick
+        self._block.words[Word.LOST_TICKS] = tick - self._files.logged
 
     def _start_unix_ns(self) -> int:
         """Virtual time starts at 0, so that two unpaced runs are logged alike."""
         if not self._header["paced"]:
             return 0
         return int(self._block.words[Word.START_UNIX_NS]) or self._header["created_unix_ns"]
-
-    def _time_ns(self, tick: int) -> int:
-        """When `tick` was due, since the start: from its row or the last one before it, else by the period."""
-        base_tick, base_ns = self._anchor
-        row = int(np.searchsorted(self._rows[: self._fill, TICK], tick, side="right")) - 1
-        if row >= 0:
-            base_tick, base_ns = self._rows[row, TICK], self._rows[row, DEADLINE]
-        return round(base_ns + (tick - base_tick) * NS_PER_S / self._header["rate_hz"])
-
-    def _message(self, channel: int, tick: int, payload: bytes | str) -> Message:
-        data = payload.encode() if isinstance(payload, str) else payload
-        return Message(channel, self._start_unix_ns() + self._time_ns(tick), data)
-
-    def _add(self, channel: int, tick: int, payload: bytes | str) -> None:
-        self._pending.append((tick, self._message(channel, tick, payload)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -13,19 +15,22 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
-from rtloop.errors import OutputError
+from rtloop.errors import LOW_SPACE, OutputError
 from rtloop.recording import format
 from rtloop.recording.chunkfile import ChunkFile, Content
 from rtloop.recording.container import PREFIX, pack_message, pack_records
 from rtloop.recording.contents import Message
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Writer:
     """`path` is the finished file's name; `header` is kept as the `/configuration` message at `log_time` (UNIX ns).
 
     Ticks are logged at `start_unix_ns`, by default `log_time`, plus their deadline. `message_index` adds 16 bytes of
-    index to every tick: some viewers need it. Below `min_free_bytes` of free space nothing more is written. Raises
-    OutputError, here and from the methods; what was written stays good. `suffix` marks the unfinished file.
+    index to every tick: some viewers need it. Below `min_free_bytes` of free space nothing more is written, and nothing
+    is begun where not `room_bytes` more are free. Raises OutputError, here and from the methods; what was written stays
+    good, and of a file that could not be begun nothing is left. `suffix` marks the unfinished file.
     """
 
     def __init__(
@@ -36,6 +41,7 @@ class Writer:
         *,
         message_index: bool = False,
         min_free_bytes: int = 0,
+        room_bytes: int = 0,
         suffix: str = ".part",
     ) -> None:
         self.path = path
@@ -44,10 +50,14 @@ class Writer:
         self._columns: list[str] = header["columns"]
         self._message_index, self._min_free_bytes = message_index, min_free_bytes
         self._blank = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
-        self._check_space()
+        self._check_space(room_bytes)
         repeated = [*format.schemas(self._columns), *format.channels()]
         self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
-        self._write_header(header, log_time, repeated)
+        try:
+            self._write_header(header, log_time, repeated)
+        except OutputError:
+            self._file.discard()
+            raise
 
     @property
     def part(self) -> Path:
@@ -59,12 +69,32 @@ class Writer:
         """Size of the file so far."""
         return self._file.size
 
+    @property
+    def end_bytes(self) -> int:
+        """About what the end of the file will take."""
+        return self._file.end_bytes
+
+    def is_there(self) -> bool:
+        """Whether the unfinished file still lies under its name."""
+        return self._file.is_there()
+
+    def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any]) -> None:
+        """Messages of the slow topics and ticks: both, or neither."""
+        self.write_messages(messages)
+        try:
+            self.write_ticks(rows)
+        except OutputError:
+            if messages:
+                with contextlib.suppress(OutputError):
+                    self._file.drop_last()
+            raise
+
     def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
         """Rows (n, columns) float64 of consecutive ticks, n at most `format.chunk_rows`, as one chunk."""
         count = len(rows)
         if count == 0:
             return
-        self._check_space()
+        self._check()
         records = self._blank[:count]
         format.fill_ticks(records, self._columns, rows, self.start_unix_ns)
         times, index = records["_log_time"], {}
@@ -78,7 +108,7 @@ class Writer:
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Messages of the slow topics as one chunk, with an index by topic."""
         if messages:
-            self._check_space()
+            self._check()
             self._file.append(_content(messages))
 
     def finish(self, final: Callable[[int], Message]) -> None:
@@ -97,12 +127,16 @@ class Writer:
         """Give up the file as it is; idempotent."""
         self._file.close()
 
+    def discard(self) -> None:
+        """Give up the file and remove it."""
+        self._file.discard()
+
     def _end_fits(self, final: Callable[[int], Message]) -> bool:
         try:
             self._file.append(_content([final(self.ticks)]))
             self._file.write_end()
-        except OutputError:
-            if len(self._file) <= 1:
+        except OutputError as error:
+            if error.number not in FULL or len(self._file) <= 1:
                 raise
             return False
         return True
@@ -113,18 +147,26 @@ class Writer:
         message = Message(format.CONFIGURATION, log_time, payload)
         self._file.append(_content([message], pack_records(repeated)))
 
-    def _check_space(self) -> None:
-        if self._min_free_bytes == 0:
+    def _check(self) -> None:
+        if not self.is_there():
+            raise OutputError(f"{self.part}: was removed, or its folder was, while it was written", errno.ENOENT)
+        self._check_space()
+
+    def _check_space(self, room_bytes: int = 0) -> None:
+        least = self._min_free_bytes + room_bytes
+        if least == 0:
             return
         try:
             status = os.statvfs(self.path.parent)
         except OSError as error:
-            raise OutputError(f"{self.path}: {error.strerror}") from None
+            raise OutputError(f"{self.path}: {error.strerror}", error.errno or 0) from None
         free = status.f_bavail * status.f_frsize
-        if free < self._min_free_bytes:
-            raise OutputError(
-                f"{self.path}: {free >> 20} MiB are free, at least {self._min_free_bytes >> 20} MiB are to stay free"
-            )
+        if free >= least:
+            return
+        if self._min_free_bytes == 0:
+            raise OutputError(f"{self.path}: {os.strerror(errno.ENOSPC)}", errno.ENOSPC)
+        stay = f"at least {self._min_free_bytes >> 20} MiB are to stay free"
+        raise OutputError(f"{self.path}: {free >> 20} MiB are free, {stay}", LOW_SPACE)
 
 
 def _content(messages: Sequence[Message], before: bytes = b"") -> Content:

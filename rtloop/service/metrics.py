@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from prometheus_client import CollectorRegistry, Gauge, generate_latest
 
+from rtloop.service.recording_state import recording_state
 from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, timing
 
@@ -18,6 +19,12 @@ def metrics_text(service: Service) -> str:
     Gauge("rtloop_ticks", "Ticks executed by the present loop", registry=registry).set(
         0 if supervisor is None else supervisor.ticks
     )
+    if supervisor is not None:
+        said = recording_state(supervisor.block)
+        Gauge("rtloop_recording", "1 while ticks are recorded, else 0", registry=registry).set(said["reason"] is None)
+        Gauge("rtloop_ticks_not_recorded", "Ticks of the present loop that are in no recording", registry=registry).set(
+            said["ticks_lost"]
+        )
     Gauge("rtloop_restarts", "Loops that ended before the present one", registry=registry).set(len(service.results))
     if measured:
         Gauge("rtloop_rate_hz", "Rate over the last ticks", registry=registry).set(measured["rate_hz"])

@@ -35,6 +35,7 @@ from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
 from rtloop.service.paths import block_path
 from rtloop.service.preparation import prepare_actuator
+from rtloop.service.recording_state import recording_fault, recording_state
 from rtloop.service.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 from rtloop.signals import Flag, Mode
 
@@ -78,6 +79,7 @@ class Service:
         self._reloading = threading.Lock()
         self._deaths_s: list[float] = []
         self._stopping = False
+        self._unrecorded: str | None = None
         self._offsets_v: dict[int, float] = {}
         self._ready = False
 
@@ -213,6 +215,7 @@ class Service:
                 self._reload.clear()
                 self._aside(self._apply_reload)
             self._tell(supervisor)
+            self._say_whether_recorded(supervisor)
             state = self.state
             if state is not said:
                 row = supervisor.latest()
@@ -228,6 +231,15 @@ class Service:
         if result.error:
             log.error("%s", result.error)
         return result
+
+    def _say_whether_recorded(self, supervisor: Supervisor) -> None:
+        """A line when ticks are not recorded any more, and one when they are again."""
+        fault = recording_fault(supervisor.block)
+        if fault is not None and fault != self._unrecorded:
+            log.error("%s", fault)
+        if fault is None and self._unrecorded is not None:
+            log.warning("recorded again; %d ticks are lost", recording_state(supervisor.block)["ticks_lost"])
+        self._unrecorded = fault
 
     def _tell(self, supervisor: Supervisor) -> None:
         """READY after ticks really ran; WATCHDOG only while they advance, or have ended; STATUS now and then."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rtloop import signals
+from rtloop.service.recording_state import recording_state
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
 
@@ -15,7 +16,7 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """State, timing over the last ticks, faults, and the newest signals."""
+    """State, timing over the last ticks, faults, whether ticks are recorded, and the newest signals."""
     supervisor = service.supervisor
     report: dict[str, Any] = {
         "name": service.configuration.name,
@@ -24,6 +25,7 @@ def status(service: Service) -> dict[str, Any]:
         "faults": list(service.faults),
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
+        "recording": {} if supervisor is None else recording_state(supervisor.block),
         "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
         "restarts": len(service.results),
     }

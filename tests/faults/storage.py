@@ -1,22 +1,30 @@
-"""Faults of the recording: a disk that is full, a ring that is overrun."""
+"""Faults of the recording: a disk that is full, a folder that vanishes, a ring that is overrun."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
-from rtloop.engine.memory import ProcessState, Word
+from prometheus_client.parser import text_string_to_metric_families
+
+import rtloop
+from rtloop.engine.memory import Word
+from rtloop.recording.replay import replay
 from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ
 from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 
-SMALL = "size=900k"
+SMALL, LARGE = "size=900k", "size=64m"
+SAID_S = 5.0
+"""A failure is found when a chunk is written, and a new file tried at every snapshot: both about once a second."""
 ROUNDS = 1.4
 
 
@@ -34,17 +42,63 @@ def small_disk(folder: Path) -> Iterator[None]:
         subprocess.run(["umount", "--lazy", str(recordings)], check=True)
 
 
-def disk_full(bench: Bench) -> Measured:
-    bench.strike()
-    wait_for(
-        lambda: int(bench.blocks[-1].words[Word.RECORDER_STATE]) == ProcessState.FAILED,
-        "a recorder that cannot write",
-        60.0,
-    )
+def await_recording(bench: Bench, state: str, timeout_s: float = SAID_S) -> dict[str, Any]:
+    """What status says of the recording, once it is in `state`, for a second more; the metrics say the same."""
+    wait_for(lambda: bench.status()["recording"]["state"] == state, state, timeout_s)
     ticks = bench.ticks
     wait_for(lambda: bench.ticks > ticks + 4000, "another second")
-    assert bench.status()["state"] == "running"
-    return Measured(lost_allowed=True, exit_code=1, note="the loop goes on; said at the end")
+    families = {family.name: family for family in text_string_to_metric_families(bench.client.get("/metrics"))}
+    assert families["rtloop_recording"].samples[0].value == (state == "recording")
+    status = bench.status()
+    assert status["state"] == "running"
+    said = status["recording"]
+    assert said["state"] == state
+    assert families["rtloop_ticks_not_recorded"].samples[0].value > 0
+    assert said["ticks_lost"] > 0
+    return said
+
+
+def disk_full(bench: Bench) -> Measured:
+    bench.strike()
+    said = await_recording(bench, "not recording", 60.0)
+    assert said["reason"] == "No space left on device"
+    return Measured(lost_allowed=True, exit_code=1, note="the loop goes on; said at once and at the end")
+
+
+def disk_full_then_room(bench: Bench) -> Measured:
+    measured = disk_full(bench)
+    command = ["mount", "-o", f"remount,{LARGE}", str(bench.folder / "recordings")]
+    subprocess.run(command, check=True, capture_output=True)
+    await_recording(bench, "recording")
+    return resumed(bench, measured)
+
+
+def folder_removed(bench: Bench) -> Measured:
+    folder = bench.folder / "recordings"
+    bench.strike(lambda: shutil.rmtree(folder))
+    said = await_recording(bench, "not recording")
+    assert said["reason"] == "No such file or directory"
+    assert said["since_tick"] == 0  # what had been written is gone too
+    folder.mkdir()
+    await_recording(bench, "recording")
+    return resumed(bench, Measured(lost_allowed=True, exit_code=1))
+
+
+def resumed(bench: Bench, measured: Measured) -> Measured:
+    """The newest file says what is missing in front of it, as status does, and replays by itself."""
+    lost = bench.status()["recording"]["ticks_lost"]
+    ticks = bench.ticks
+    wait_for(lambda: bench.ticks > ticks + 8000, "some more ticks")
+    (part,) = (bench.folder / "recordings").glob("*.mcap.part")
+    recording = rtloop.load(part)
+    gaps = [event["what"]["count"] for event in recording.events if event["kind"] == "gap"]
+    assert gaps == [lost]
+    assert {event["kind"] for event in recording.events} >= {"recording_failed", "recording_resumed"}
+    verdict = replay(recording)
+    assert verdict.identical
+    assert verdict.unverified == 0
+    measured.note = f"the loop goes on; {lost} ticks said to be lost; recorded again"
+    return measured
 
 
 def ring_overrun(bench: Bench) -> Measured:
@@ -68,6 +122,8 @@ def ring_overrun(bench: Bench) -> Measured:
 
 
 FAULTS = (
-    Fault("disk full", "the loop goes on; lost ticks said", disk_full, around=small_disk),
+    Fault("disk full", "the loop goes on; lost ticks said at once", disk_full, around=small_disk),
+    Fault("disk full, then room", "recorded again; the gap said", disk_full_then_room, around=small_disk),
+    Fault("folder of recordings removed, then made", "recorded again; the gap said", folder_removed),
     Fault("ring overrun", "the loop goes on; the gap said", ring_overrun),
 )

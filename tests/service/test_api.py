@@ -33,6 +33,7 @@ def recorded(bench: Bench, kind: str, tick: int) -> dict[str, Any]:
 def test_states_and_refusals(bench: Bench):
     status = bench.client.get("/status")
     assert (status["state"], status["armed"], status["mode"], status["trip"]) == ("stopped", False, "off", [])
+    assert status["recording"] == {"state": "recording", "reason": None, "since_tick": None, "ticks_lost": 0}
     for path, body in (("/start", {}), ("/mode", {"mode": "raw"})):
         code, said = answer(bench, "POST", path, body)
         assert code == 409
@@ -144,6 +145,8 @@ def test_metrics_and_description(bench: Bench):
     assert sum(states.values()) == 1.0
     assert states["stopped"] == 1.0
     assert families["rtloop_ticks"].samples[0].value > 0
+    assert families["rtloop_recording"].samples[0].value == 1.0
+    assert families["rtloop_ticks_not_recorded"].samples[0].value == 0.0
     assert families["rtloop_rate_hz"].samples[0].value == pytest.approx(4000.0, rel=0.05)
     description = bench.client.get("/openapi.json")
     assert description["openapi"].startswith("3.1")

@@ -1,0 +1,79 @@
+"""Ticks that were drained and are not written yet, and when each tick was due."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.recording import format
+from rtloop.recording.rings import RingReader
+from rtloop.signals import DEADLINE, TICK
+
+NS_PER_S = 1e9
+
+
+class Place(NamedTuple):
+    """A tick, and when it is due, in ns since the start."""
+
+    tick: int
+    time_ns: int
+
+
+class TickBuffer:
+    """Rows (n, columns) float64 in the order of their ticks, one chunk at most."""
+
+    def __init__(self, columns: list[str], rate_hz: float) -> None:
+        self._rows = np.empty((format.chunk_rows(columns), len(columns)))
+        self._fill, self._rate_hz = 0, rate_hz
+        self._anchor = (0.0, 0.0)
+
+    def __len__(self) -> int:
+        return self._fill
+
+    @property
+    def room(self) -> int:
+        """Ticks that can still be taken."""
+        return len(self._rows) - self._fill
+
+    def take_from(self, reader: RingReader) -> int:
+        """Take what there is room for; returns the ticks taken or found lost."""
+        copied, lost = reader.take_into(self._rows[self._fill :])
+        self._fill += copied
+        return copied + lost
+
+    def first(self, count: int) -> np.ndarray[Any, Any]:
+        """The first `count` rows, valid until they are dropped."""
+        return self._rows[:count]
+
+    def before(self, tick: int) -> int:
+        """How many rows come before `tick`."""
+        return int(np.searchsorted(self._rows[: self._fill, TICK], tick))
+
+    def drop(self, count: int) -> None:
+        """Forget the first `count` rows; those behind them move to the front."""
+        if count:
+            self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
+        rest = self._fill - count
+        self._rows[:rest] = self._rows[count : self._fill].copy()
+        self._fill = rest
+
+    def time_ns(self, tick: int) -> int:
+        """When `tick` was due, since the start: from its row or the last one before it, else by the period."""
+        base_tick, base_ns = self._anchor
+        row = int(np.searchsorted(self._rows[: self._fill, TICK], tick, side="right")) - 1
+        if row >= 0:
+            base_tick, base_ns = self._rows[row, TICK], self._rows[row, DEADLINE]
+        return round(base_ns + (tick - base_tick) * NS_PER_S / self._rate_hz)
+
+    def place(self, tick: int) -> Place:
+        """A tick and its time."""
+        return Place(tick, self.time_ns(tick))
+
+    def gaps(self, count: int, expected: int) -> list[tuple[int, int]]:
+        """(first tick, ticks) of all that is missing in the first `count` rows, which are to begin at `expected`."""
+        ticks = self._rows[:count, TICK]
+        if count == 0 or (ticks[0] == expected and ticks[-1] == expected + count - 1):  # the usual case
+            return []
+        known = np.concatenate([[expected - 1], ticks]).astype(np.int64)
+        return [(int(known[i]) + 1, int(known[i + 1] - known[i]) - 1) for i in np.flatnonzero(np.diff(known) != 1)]

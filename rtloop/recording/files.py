@@ -1,0 +1,113 @@
+"""The files of one run, written one after the other, and the account of the ticks in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.errors import OutputError
+from rtloop.recording.buffer import Place
+from rtloop.recording.contents import Message
+from rtloop.recording.writer import Writer
+
+
+class Options(NamedTuple):
+    """Choices of a run. A rotated recording is NAME-0001.mcap, NAME-0002.mcap, …, each cut at a state snapshot."""
+
+    rotate_bytes: int | None = None
+    rotate_s: float | None = None
+    min_free_bytes: int = 64 << 20
+    message_index: bool = False
+    sequence: int = 1
+    """Number of the first file: above 1 where another recorder of the same run died."""
+
+
+class Files:
+    """`begin` is where the first file begins, `logged` the ticks that earlier recorders left in files.
+
+    `next` is the tick behind the last one in a file, `first` the first one that the present file accounts for.
+    """
+
+    def __init__(self, path: Path, header: dict[str, Any], options: Options, begin: Place, logged: int) -> None:
+        self._path, self._header, self._options = path, header, options
+        self._opened: list[Path] = []
+        self._closed_ticks, self.closed_bytes = logged, 0
+        self.next = self.first = begin
+        self.writer: Writer | None = None
+
+    @property
+    def paths(self) -> list[Path]:
+        """The finished files that are there."""
+        return [path for path in self._opened if path.exists()]
+
+    @property
+    def logged(self) -> int:
+        """Ticks in files."""
+        return self._closed_ticks + (self.writer.ticks if self.writer else 0)
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the present file."""
+        return self.writer.size_bytes if self.writer else 0
+
+    def opened(self, log_time: int, room_bytes: int = 0) -> Writer:
+        """The next file, for `begin`; it accounts for the ticks from `next` on. Raises OutputError.
+
+        `room_bytes`: to be free beside what is to stay free, and what the end of the present file takes.
+        """
+        path, header, options = self._path, self._header, self._options
+        sequence = len(self._opened) + options.sequence
+        if options.rotate_bytes or options.rotate_s or sequence > 1:
+            path = path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
+            header = {**header, "sequence": sequence, "first_tick": self.next.tick}
+        index, least = options.message_index, options.min_free_bytes
+        room_bytes += self.writer.end_bytes if room_bytes and self.writer else 0
+        writer = Writer(path, header, log_time, message_index=index, min_free_bytes=least, room_bytes=room_bytes)
+        self._opened.append(path)
+        return writer
+
+    def begin(self, writer: Writer) -> None:
+        """Go on in another file."""
+        self.writer, self.first = writer, self.next
+
+    def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any], start_unix_ns: int, end: Place) -> None:
+        """Messages and ticks, both or neither; the next file or tick is to go on at `end`. Raises OutputError."""
+        assert self.writer is not None
+        self.writer.start_unix_ns = start_unix_ns
+        self.writer.write(messages, rows)
+        self.next = end
+
+    def finish(self, final: Callable[[int], Message]) -> OutputError | None:
+        """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again."""
+        writer, self.writer = self.writer, None
+        if writer is None:
+            return None
+        written, problem = writer.ticks, None
+        try:
+            writer.finish(final)
+        except OutputError as error:
+            problem = error
+            if not writer.is_there():
+                self._lose(writer)
+                return problem
+            writer.close()
+        self.next = Place(self.next.tick - written + writer.ticks, self.next.time_ns)
+        self._closed_ticks += writer.ticks
+        self.closed_bytes += writer.size_bytes
+        return problem
+
+    def leave_what_is_useless(self) -> None:
+        """Give up a file that was removed, and with it its ticks; remove one without ticks."""
+        if self.writer and not self.writer.is_there():
+            self._lose(self.writer)
+        elif self.writer and not self.writer.ticks:
+            self.writer.discard()
+            self.writer = None
+            self._opened.pop()
+
+    def _lose(self, writer: Writer) -> None:
+        writer.close()
+        self.writer, self.next = None, self.first
