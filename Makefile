@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # Tests that compute, two at a time; the others start processes and wait for clocks, and come one after the other.
 COMPUTING := tests/law tests/hil tests/design tests/benchmarks
 
-.PHONY: run test bench faults soak-daemon soak-flood soak-swaps soak-recordings soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-swaps soak-recordings soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -23,6 +23,14 @@ test: $(READY)
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)
 	$(BIN)/python -m tests.faults
+
+# Two of them at once, a hundred times at random: a quarter of an hour.
+faults-pairs: $(READY)
+	$(BIN)/python -m tests.faults.pairs
+
+# A law changed at random for 10^8 ticks, with canaries around its records: about ten minutes, 1 GB in the temporary folder.
+soak-live-changes: $(READY)
+	$(BIN)/python -m tests.soak.live_changes
 
 # The control API under eight clients beside a paced run; swaps through it; the daemon on a board for an hour.
 soak-flood: $(READY)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+REVISION = 2
+"""Of what the law does with its memory. 1 kept the pre-filter's through changes of mode, and of sections alone."""
 LANES = 4
 """Play operators and pairs of controller states are computed four at a time. What is in use is padded to a multiple
 of this with zero weights, so that no kernel needs a remainder; counts have 8 bits, so that no index can be negative."""
@@ -195,4 +197,4 @@ def layout_description() -> dict[str, Any]:
     """What a recording says of the snapshot's layout: the fields with their offsets, and a digest of them."""
     tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
     described = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
-    return {**described, "sha256": hashlib.sha256(repr(described).encode()).hexdigest()}
+    return {**described, "sha256": hashlib.sha256(repr(described).encode()).hexdigest(), "revision": REVISION}

@@ -1,0 +1,44 @@
+"""The loop's process with a canary before and behind every record of the law: `python -m tests.soak.guarded_process`.
+
+When the loop has ended it reports how many bytes of the canaries are no longer what they were.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from rtloop.engine import process
+from rtloop.law import layout
+
+CANARY_BYTES, CANARY = 1 << 16, 0xA5
+_guarded: list[tuple[np.ndarray[Any, Any], int, int]] = []
+
+
+def guarded_records(dtype: np.dtype[Any], count: int) -> layout.Records:
+    """As `layout.records`, between two canaries."""
+    room = np.full(2 * CANARY_BYTES + count * dtype.itemsize + layout.LINE_BYTES, CANARY, np.uint8)
+    begin = CANARY_BYTES + -(room.ctypes.data + CANARY_BYTES) % layout.LINE_BYTES
+    end = begin + count * dtype.itemsize
+    room[begin:end] = 0
+    _guarded.append((room, begin, end))
+    return room[begin:end].view(dtype).view(np.recarray)
+
+
+def broken() -> int:
+    """Bytes of all canaries that something wrote to."""
+    return sum(int(np.count_nonzero(np.delete(room, np.s_[begin:end]) != CANARY)) for room, begin, end in _guarded)
+
+
+def main() -> int:
+    """The loop's process, and then the canaries."""
+    layout.records = guarded_records
+    code = process.main()
+    process.report("canaries", records=len(_guarded), broken=broken())
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""A law that is changed all the time, at random, in everything that may change under way. `make soak-live-changes`.
+
+Two axes in virtual time, as fast as the loop goes, changed by the very code that a service uses. Nothing may be written
+outside a record (canaries lie around each, and every index is checked), no drive may leave its limits or its slew, and
+the recording must replay identical.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import threading
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+import rtloop
+from rtloop.config import parse
+from rtloop.engine.memory import SharedBlock
+from rtloop.engine.messages import Kind
+from rtloop.errors import RtloopError
+from rtloop.prepare import prepare
+from rtloop.recording.replay import replay
+from rtloop.service.child import Child
+from rtloop.service.desk import Desk
+from rtloop.service.live import LiveLaw
+from rtloop.service.supervisor import Processes, Supervisor
+from rtloop.signals import Mode
+from tests.recording.real_loop import ROOT
+
+DRIVE_V, SLEW_V_PER_S, TRIP_SLEW_V_PER_S, RATE_HZ = 9.0, 3000.0, 700.0, 10_000.0
+ROTATE_MIB, BLOCK_TICKS, SPARE_SAMPLES = 256.0, 1_000_000, 1 << 14
+TEXT = (ROOT / "deploy" / "two-axis.toml").read_text(encoding="utf-8")
+LIMITS = ("drive_v = 10.0\n", f"drive_v = {DRIVE_V}\nslew_v_per_s = {SLEW_V_PER_S}\n")
+TRIP = ("trip_slew_v_per_s = 1000.0", f"trip_slew_v_per_s = {TRIP_SLEW_V_PER_S}")
+
+
+class GuardedProcesses(Processes):
+    """With canaries around the loop's records."""
+
+    def __init__(self) -> None:
+        self.fd = SharedBlock.reserve()
+        self.loop = Child("tests.soak.guarded_process", self.fd)
+        self.recorder = Child("rtloop.recording.recorder", self.fd)
+
+
+class Changes:
+    """Random changes to a running law; `done` counts them by kind, `refused` those that were not taken."""
+
+    def __init__(self, live: LiveLaw, desk: Desk, chance: Random) -> None:
+        self._live, self._desk, self._chance = live, desk, chance
+        self.done: Counter[str] = Counter()
+        self.refused = 0
+
+    def one(self) -> None:
+        """The next one."""
+        kinds = self._prefilter, self._controller, self._limits, self._interlocks, self._mode, self._reference
+        kind = self._chance.choice((*kinds, self._waveform, self._tare, self._reset))
+        try:
+            kind()
+            self.done[kind.__name__.strip("_")] += 1
+        except RtloopError:
+            self.refused += 1
+
+    @property
+    def _axis(self) -> str:
+        return self._chance.choice("xy")
+
+    def _prefilter(self) -> None:
+        count, sections = self._chance.choice((0, 1, 2, 7, 48, 127, 128)), self._chance.choice((0, 0, 1, 3, 12))
+        taps = [self._chance.uniform(0, 1) for _ in range(count)]
+        poles = [self._chance.uniform(0.05, 0.9) for _ in range(sections)]
+        values = {
+            "taps": [tap / sum(taps) for tap in taps],
+            "sections": [[(1 - p) ** 2, 0.0, 0.0, -2 * p, p * p] for p in poles],
+        }
+        self._live.tune(self._axis, "prefilter", values)
+
+    def _controller(self) -> None:
+        """An integrator with up to 23 more poles and zeros, all beyond the crossover; any number is stable."""
+        order = self._chance.randrange(0, 24)
+        poles = [-self._chance.uniform(3e3, 2e4) for _ in range(order)]
+        zeros = [pole * self._chance.uniform(0.9, 1.1) for pole in poles]
+        controller = {
+            "form": "zpk",
+            "gain": self._chance.uniform(20.0, 80.0),
+            "zeros": [[zero, 0.0] for zero in zeros],
+            "poles": [[-0.5, 0.0], *([pole, 0.0] for pole in poles)],
+            "method": self._chance.choice(("tustin", "matched", "zoh")),
+        }
+        self._live.load_controller(self._axis, controller)
+
+    def _limits(self) -> None:
+        values = {"command_um": self._chance.uniform(10.0, 42.0), "bump_s": self._chance.uniform(0.001, 0.1)}
+        self._live.tune(self._axis, "limits", values)
+
+    def _interlocks(self) -> None:
+        values = {
+            "position_um": self._chance.choice((20.0, 60.0, 60.0, 60.0)),
+            "oscillation_swings": self._chance.choice((0, 8)),
+            "tracking_ticks": self._chance.choice((0, 500)),
+            "frozen_ticks": self._chance.choice((0, 1000)),
+        }
+        self._live.tune(self._axis, "interlocks", values)
+
+    def _mode(self) -> None:
+        self._desk.submit(Kind.SET_MODE, values=[float(self._chance.choice(list(Mode)))])
+
+    def _reference(self) -> None:
+        amplitude, offset = self._chance.uniform(0.0, 9.0), self._chance.uniform(-9.0, 9.0)
+        reference: dict[str, Any] = {"kind": self._chance.choice(("sine", "triangle")), "frequency_hz": 40.0}
+        reference |= {"amplitude": amplitude, "offset": offset}
+        if self._chance.random() < 0.4:
+            levels = [self._chance.uniform(-9.0, 9.0) for _ in range(self._chance.randrange(1, 50))]
+            reference = {"kind": "steps", "levels": levels, "dwell_s": 0.01}
+        self._live.set_reference(self._axis, reference)
+
+    def _waveform(self) -> None:
+        count = self._chance.choice((1, 2, 1000, SPARE_SAMPLES // 4))
+        samples = [self._chance.uniform(-9.0, 9.0)] * count
+        self._live.set_waveform(self._axis, samples, self._chance.randrange(1, 5), self._chance.random() < 0.5)
+
+    def _tare(self) -> None:
+        self._live.tare(self._chance.randrange(2), self._chance.uniform(-0.05, 0.05))
+
+    def _reset(self) -> None:
+        self._desk.submit(Kind.RESET_TRIP)
+        self._desk.submit(Kind.SET_MODE, values=[float(Mode.CLOSED_LOOP)])
+
+
+def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], Changes, dict[str, Any]]:
+    """Run so many ticks under changes; the recording's files, the changes, what the canaries say."""
+    text = TEXT.replace(*LIMITS).replace(*TRIP)
+    text = text[: text.index("[recording]")]
+    text += f'[recording]\nfolder = "{folder}"\nrotate_mib = {ROTATE_MIB}\nmin_free_mib = 0.0\n'
+    with GuardedProcesses() as processes:
+        prepared = prepare(parse(text, "changes", folder, "changes"), duration_s=ticks / RATE_HZ, paced=False)
+        prepared = replace(prepared, plan=replace(prepared.plan, spare_samples=SPARE_SAMPLES))
+        supervisor = Supervisor(processes, prepared, folder / "changes.mcap")
+        desk = Desk(supervisor.block)
+        changes = Changes(LiveLaw(prepared, supervisor.block, desk, {}), desk, Random(seed))
+        ended = threading.Event()
+
+        def change() -> None:
+            while not ended.is_set() and not supervisor.ended:
+                if supervisor.ticks:
+                    changes.one()
+
+        changing = threading.Thread(target=change)
+        changing.start()
+        try:
+            result = supervisor.run()
+        finally:
+            ended.set()
+            changing.join()
+        assert result.outcome == "done", result
+        return result.recordings, changes, supervisor._reports["canaries"]
+
+
+def judge(paths: list[Path]) -> dict[str, float]:
+    """Largest drive and largest change of it in a tick, as the recording shows them."""
+    found = {"drive_v": 0.0, "step_v": 0.0}
+    recording = rtloop.load(paths)
+    for axis in "xy":
+        drive_v = recording[f"{axis}_drive_v"]
+        found["drive_v"] = max(found["drive_v"], float(np.abs(drive_v).max()))
+        found["step_v"] = max(found["step_v"], float(np.abs(np.diff(drive_v, prepend=0.0)).max()))
+    return found
+
+
+def main() -> None:
+    """Run, judge, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--ticks", type=int, default=100_000_000)
+    parser.add_argument("--seed", type=int, default=14)
+    given = parser.parse_args()
+    ticks = changed = refused = 0
+    for number in range(-(-given.ticks // BLOCK_TICKS // 10)):
+        with tempfile.TemporaryDirectory(prefix="rtloop-changes-") as name:
+            paths, changes, canaries = record(Path(name), 10 * BLOCK_TICKS, given.seed + number)
+            found, verdict = judge(paths), replay(rtloop.load(paths))
+        ticks, changed, refused = ticks + verdict.ticks, changed + changes.done.total(), refused + changes.refused
+        print(
+            f"seed {given.seed + number}: {verdict.ticks} ticks, {changes.done.total()} changes {dict(changes.done)}, "
+            f"{changes.refused} refused; {canaries['broken']} bytes written beside {canaries['records']} records; "
+            f"largest |drive| {found['drive_v']:.6f} of {DRIVE_V} V, largest step {found['step_v']:.6f} of "
+            f"{SLEW_V_PER_S / RATE_HZ} V; replay {'identical' if verdict.identical else verdict.first_difference}",
+            flush=True,
+        )
+        assert canaries["broken"] == 0
+        assert found["drive_v"] <= DRIVE_V
+        assert found["step_v"] <= SLEW_V_PER_S / RATE_HZ * (1 + 1e-9)
+        assert verdict.identical
+        assert not verdict.problems
+    print(f"{ticks} ticks, {changed} changes, {refused} refused: nothing outside a record, all replay identical")
+
+
+if __name__ == "__main__":
+    main()
