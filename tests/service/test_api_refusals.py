@@ -52,6 +52,33 @@ def test_malformed_json(bench: Bench, data: bytes):
     assert json.loads(said)["error"]
 
 
+@pytest.mark.parametrize("make", ["fifo", "zero", "shadow", "link", "above"])
+def test_a_table_is_a_file_below_the_configuration(bench: Bench, make: str):
+    """Whoever may use the API may not read what the service may read."""
+    folder = bench.config.parent
+    name = {"zero": "/dev/zero", "shadow": "/etc/passwd", "above": f"../{folder.name}/wave.csv"}.get(make, make)
+    (folder / "wave.csv").write_text("1.0\n")
+    if make == "fifo":
+        os.mkfifo(folder / "fifo")
+    if make == "link":
+        (folder / "link").symlink_to("/etc/passwd")
+    code, said = answer(bench, "POST", "/reference", {"axis": "x", "reference": {"kind": "table", "file": name}})
+    assert code == 422
+    assert "root" not in said["error"].replace(str(folder), "")
+
+
+def test_a_table_below_the_configuration_plays(bench: Bench):
+    folder = bench.config.parent / "waves"
+    folder.mkdir()
+    (folder / "wave.csv").write_text("1.0\n2.0\n")
+    body = {"axis": "x", "reference": {"kind": "table", "file": "waves/wave.csv", "hold_ticks": 3}}
+    assert answer(bench, "POST", "/reference", body)[0] == 200
+    (folder / "wave.csv").write_text("root of all\n")
+    code, said = answer(bench, "POST", "/reference", body)
+    assert (code, "root" in said["error"]) == (422, False)
+    assert answer(bench, "POST", "/setpoint", {"axis": "x", "value": 0.0})[0] == 200
+
+
 def test_unknown_too_large_and_wrong_method(bench: Bench):
     assert answer(bench, "GET", "/nowhere")[0] == 404
     assert answer(bench, "GET", "/mode")[0] == 405
