@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -19,6 +18,7 @@ from drivers.errors import DriverError
 from drivers.registry import driver_class
 from hil.options import Options
 from rtloop.errors import ConfigError, RtloopError
+from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.service.options import ServiceOptions
 
@@ -131,7 +131,7 @@ def load(path: str | Path) -> Configuration:
     """Read and check a file. Raises InputFileError, or ConfigError with all faults."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:
         raise InputFileError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError as error:
@@ -142,9 +142,9 @@ def load(path: str | Path) -> Configuration:
 def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
     """Check a configuration's text; relative paths in it start at `folder`. Raises ConfigError with all faults."""
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+        raw = parse_toml(text)
+    except ValueError as error:
+        raise ConfigError(source, [str(error)]) from None
     driver = raw.pop("driver", None)
     faults: list[str] = []
     sections = _validated(TypeAdapter(_Sections), raw, "", faults)

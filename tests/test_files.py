@@ -13,7 +13,6 @@ import pytest
 from rtloop.config import InputFileError, load
 from rtloop.errors import ConfigError
 from rtloop.law.options import TableOptions
-
 from rtloop.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
 from rtloop.specifications import load_specification
 from tests.paper_configuration import REFERENCE, built
@@ -47,7 +46,7 @@ def table(folder: Path, file: str | Path) -> np.ndarray:
 def strange(tmp_path: Path) -> list[Path]:
     """What may be opened, but is no file with a content of its own."""
     os.mkfifo(tmp_path / "fifo.toml")
-    return [tmp_path / "fifo.toml", Path("/dev/zero"), Path("/dev/tty"), tmp_path]
+    return [tmp_path / "fifo.toml", Path("/dev/zero"), tmp_path]
 
 
 def test_a_table_is_a_regular_file(tmp_path, strange):

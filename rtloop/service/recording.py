@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import time
 from pathlib import Path
@@ -92,6 +93,7 @@ class RecorderKeeper:
     def _files(self, suffix: str) -> list[Path]:
         """This run's files, in their order."""
         folder, stem = self._path.parent, self._path.stem
+        stem = glob.escape(stem)
         return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 
     def close(self) -> None:
