@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import socket
+import stat
 import sys
 import threading
 from collections.abc import Iterator
@@ -16,13 +17,15 @@ from typing import Any
 
 import uvicorn
 
+from hil.trusted import Untrusted, open_folder
 from rtloop.errors import UnavailableError
 from rtloop.service.api import application
 from rtloop.service.can_bus import supervised_by_can
-from rtloop.service.paths import socket_path
+from rtloop.service.paths import FOLDER_MODE, refusal, socket_path
 from rtloop.service.service import Service
 
 LIMIT_CONCURRENCY = 64
+BACKLOG = 64
 END_TIMEOUT_S = 5.0
 
 
@@ -58,28 +61,55 @@ def _listening(service: Service) -> Iterator[None]:
 
 
 def _bind(path: Path, mode: int) -> socket.socket:
-    """A listening socket with exactly these permissions. Raises UnavailableError where another service listens."""
+    """A listening socket with exactly these permissions, of the folder's group where we may give it that.
+
+    Raises UnavailableError where another service listens or something else than a socket stands, RefusedError for a
+    folder that others may write to.
+    """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
+        folder = open_folder(path.parent, FOLDER_MODE)
+        try:
+            group = os.fstat(folder).st_gid
+        finally:
+            os.close(folder)
+        _clear(path)
+        previous = os.umask(0o777)
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(previous)
+        with contextlib.suppress(PermissionError):
+            os.chown(path, -1, group)
+        os.chmod(path, mode)
+        listener.listen(BACKLOG)
+        return listener
+    except Untrusted as error:
+        listener.close()
+        raise refusal(error) from None
+    except OSError as error:
+        listener.close()
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None
+    except UnavailableError:
+        listener.close()
+        raise
+
+
+def _clear(path: Path) -> None:
+    """Remove a socket that nobody serves any more. Raises UnavailableError, OSError."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise UnavailableError(f"{path}: is there and no socket; it is not touched")
         with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as probe:
+            probe.setblocking(False)
             probe.connect(str(path))
         raise UnavailableError(f"{path}: another service listens there")
-    except (FileNotFoundError, ConnectionRefusedError):
+    except BlockingIOError:  # so many clients that they must wait
+        raise UnavailableError(f"{path}: another service listens there") from None
+    except ConnectionRefusedError:
+        path.unlink()
+    except FileNotFoundError:
         pass
-    except OSError as error:
-        raise UnavailableError(f"{path}: {error.strerror or error}") from None
-    previous = os.umask(0o777 & ~mode)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        listener.bind(str(path))
-        os.chmod(path, mode)
-    except OSError as error:
-        raise UnavailableError(f"{path}: {error.strerror or error}") from None
-    finally:
-        os.umask(previous)
-    listener.listen(128)
-    return listener
 
 
 class _JournalFormatter(logging.Formatter):

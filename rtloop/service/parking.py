@@ -19,7 +19,7 @@ from rtloop.config import load
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import UnavailableError
 from rtloop.prepare import prepare
-from rtloop.service.paths import block_path
+from rtloop.service.paths import block_path, open_block
 
 _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 SHORTEST_PERIOD_S = 0.0001
@@ -56,9 +56,8 @@ def park_configuration(config: Path) -> str:
 @contextmanager
 def _last_block(path: Path) -> Iterator[SharedBlock | None]:
     """A service's shared block; None where there is none."""
-    try:
-        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    except OSError:
+    fd = open_block(path)
+    if fd is None:
         yield None
         return
     try:
