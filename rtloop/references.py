@@ -23,6 +23,8 @@ from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 
 MAX_TABLE_BYTES = 64 << 20
+MAX_HOLD_TICKS = 10**9
+"""Of a sample: more than a day at 10 kHz, and no number of ticks overflows."""
 
 
 class _NotANumber(Exception):
@@ -56,12 +58,16 @@ def generator_values(
     if isinstance(options, HoldOptions):
         return Generator.HOLD, options.value
     if isinstance(options, StepsOptions):
+        if options.dwell_s * rate_hz > MAX_HOLD_TICKS:
+            raise ValueError(f"dwell_s: {options.dwell_s} is more than {MAX_HOLD_TICKS} periods of {1 / rate_hz:g} s")
         hold_ticks = round(options.dwell_s * rate_hz)
         if hold_ticks < 1:
             raise ValueError(f"dwell_s: {options.dwell_s} is less than a period of {1 / rate_hz:g} s")
         first = table.add(np.array(options.levels))
         return Generator.TABLE, first, len(options.levels), hold_ticks, float(options.repeat)
     if isinstance(options, TableOptions):
+        if options.hold_ticks > MAX_HOLD_TICKS:
+            raise ValueError(f"hold_ticks: {options.hold_ticks}; at most {MAX_HOLD_TICKS} are allowed")
         samples = read_samples(folder / options.file)
         return Generator.TABLE, table.add(samples), samples.size, options.hold_ticks, float(options.repeat)
     if isinstance(options, ChirpOptions):

@@ -14,8 +14,8 @@ from hil.trusted import Untrusted, owners
 from rtloop.errors import RefusedError, RtloopError, UnavailableError
 from rtloop.service.paths import refusal
 
-TIMEOUT_S = 10.0
-_CREDENTIALS = struct.Struct("3i")
+TIMEOUT_S = 20.0
+_TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 """Process, user and group of a peer (unix(7))."""
 
 
@@ -37,15 +37,17 @@ def _connected(path: Path) -> socket.socket:
         raise refusal(error) from None
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        connection.settimeout(TIMEOUT_S)
+        # a connection attempt waits for its turn only on a socket that blocks (unix(7))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(round(TIMEOUT_S), 0))
         connection.connect(str(path))
+        connection.settimeout(TIMEOUT_S)
         _, server, _ = _CREDENTIALS.unpack(
             connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         )
         owner = path.lstat().st_uid
         if server not in believed or owner != server:
             raise RefusedError(
-                f"{path}: served by user {server} on a socket of user {owner}, who are not believed here"
+                f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner"
             )
         return connection
     except BaseException:

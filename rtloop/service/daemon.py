@@ -20,12 +20,12 @@ import uvicorn
 from hil.trusted import Untrusted, open_folder
 from rtloop.errors import UnavailableError
 from rtloop.service.api import application
+from rtloop.service.building import builder_ready
 from rtloop.service.can_bus import supervised_by_can
+from rtloop.service.connections import BACKLOG, settings
 from rtloop.service.paths import FOLDER_MODE, refusal, socket_path
 from rtloop.service.service import Service
 
-LIMIT_CONCURRENCY = 64
-BACKLOG = 64
 END_TIMEOUT_S = 5.0
 
 
@@ -36,7 +36,7 @@ def serve(config: Path) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
-    with _listening(service), supervised_by_can(service):
+    with builder_ready(), _listening(service), supervised_by_can(service):
         return service.run()
 
 
@@ -45,10 +45,7 @@ def _listening(service: Service) -> Iterator[None]:
     """The API on its socket, in a thread of its own, for as long as the service runs."""
     path = socket_path(service.configuration)
     listener = _bind(path, int(service.configuration.service.socket_mode, 8))
-    settings = uvicorn.Config(
-        application(service), log_level="warning", lifespan="off", limit_concurrency=LIMIT_CONCURRENCY, log_config=None
-    )
-    server = uvicorn.Server(settings)
+    server = uvicorn.Server(settings(application(service)))
     thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listener])), daemon=True)
     thread.start()
     try:

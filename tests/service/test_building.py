@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 
-
 import numpy as np
 import pytest
 
@@ -44,4 +43,3 @@ def test_what_is_built_beside_is_what_is_built_here():
 def test_a_configuration_survives_the_way():
     here = configuration()
     assert pickle.loads(pickle.dumps(here)) == here
-
