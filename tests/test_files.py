@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rtloop.config import InputFileError, load
-from rtloop.errors import ConfigError
+from rtloop.design.identified import read_feedforward
+from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.options import TableOptions
 from rtloop.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
 from rtloop.specifications import load_specification
@@ -112,3 +113,16 @@ def test_the_owner_of_a_configuration_may_name_a_file_elsewhere(tmp_path):
     (tmp_path / "wave.csv").write_text("1.0\n-2.0  # the lowest\n\n3\n")
     reference = f'kind = "table"\nfile = "{tmp_path}/wave.csv"\n'
     assert built((REFERENCE, reference)).plan.table.tolist() == [1.0, -2.0, 3.0]
+
+
+def test_a_file_with_a_feedforward_is_read_like_a_configuration(tmp_path, strange):
+    binary, other = tmp_path / "binary.toml", tmp_path / "other.toml"
+    binary.write_bytes(b"\xff\xfe")
+    other.write_text(f"[{SECRET}]\n[{SECRET}]\n")
+    for path in (*strange, binary):
+        with pytest.raises(RtloopError, match=rf"^{path}: ") as caught:
+            read_feedforward(path)
+        assert caught.value.exit_code == 66
+    with pytest.raises(ConfigError, match="not valid TOML: ") as caught:
+        read_feedforward(other)
+    assert SECRET not in str(caught.value)

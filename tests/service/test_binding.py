@@ -8,7 +8,9 @@ import stat
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from rtloop.cli import main
 from rtloop.errors import RtloopError
 from rtloop.service.daemon import _bind
 
@@ -37,3 +39,13 @@ def test_a_socket_that_nobody_serves_any_more_is_replaced(tmp_path: Path):
             _bind(path, 0o660)
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(path))
+
+
+def test_the_name_of_a_service_is_no_pattern(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("lab[b]", "labb"):
+        _bind(tmp_path / f"{name}.sock", 0o660).close()
+    monkeypatch.setattr("rtloop.service.paths.client_folders", lambda: [tmp_path])
+    for name in ("lab[b]", "labb"):
+        said = CliRunner().invoke(main, ["ctl", "--name", name, "status"])
+        assert said.exit_code == 69
+        assert f"{tmp_path}/{name}.sock: no service answers there" in said.stderr
