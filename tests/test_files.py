@@ -71,6 +71,12 @@ def test_a_table_has_a_largest_size(tmp_path):
         table(tmp_path, path)
 
 
+def test_a_table_has_a_largest_number_of_samples(tmp_path):
+    np.save(tmp_path / "bytes.npy", np.zeros(MAX_TABLE_BYTES // 8 + 1, np.uint8))
+    with pytest.raises(ValueError, match="8388609 samples; at most 8388608 are allowed"):
+        table(tmp_path, "bytes.npy")
+
+
 @pytest.mark.parametrize("read", [load, load_specification])
 def test_a_configuration_has_a_largest_size(tmp_path, read):
     path = tmp_path / "large.toml"
