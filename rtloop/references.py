@@ -23,6 +23,7 @@ from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 
 MAX_TABLE_BYTES = 64 << 20
+MAX_SAMPLES = MAX_TABLE_BYTES // 8
 MAX_HOLD_TICKS = 10**9
 """Of a sample: more than a day at 10 kHz, and no number of ticks overflows."""
 
@@ -95,6 +96,8 @@ def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float6
         raise ValueError(f"file: {path}: not a column of numbers") from None
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
         raise ValueError(f"file: {path}: holds {getattr(loaded, 'dtype', 'an archive')}; real numbers are needed")
+    if loaded.size > MAX_SAMPLES:
+        raise ValueError(f"file: {path}: {loaded.size} samples; at most {MAX_SAMPLES} are allowed")
     samples = loaded.astype(float)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"file: {path}: shape {samples.shape}; one column of at least one number is needed")
