@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -95,16 +94,13 @@ def test_two_unpaced_runs_are_equal_in_bytes_and_another_seed_is_not(tmp_path: P
 def test_a_name_may_hold_what_patterns_and_markup_are_made_of(tmp_path: Path) -> None:
     config = tmp_path / "lab[b]*.toml"
     config.write_text(PAPER.read_text())
-    shutil.copy(PAPER.with_name("paper-spec.toml"), tmp_path)
     code, summary, _ = run(config, "--duration", "0.1", "--unpaced", "--out", tmp_path)
     assert code == 0
     assert Path(summary["recording"]).name.startswith("lab[b]*-")
     assert summary["ticks_logged"] == 1000
-    for arguments in (["run", config, "--duration", "0.1", "--unpaced", "--out", tmp_path],
-                      ["info", summary["recording"]], ["check", config]):  # fmt: skip
-        out, err = start(*arguments).communicate(timeout=TIMEOUT_S)
-        assert "lab[b]*" in out.replace("\n", "") + err
-        assert "Traceback" not in err
+    out, err = start("info", summary["recording"]).communicate(timeout=TIMEOUT_S)
+    assert "lab[b]*" in out.replace("\n", "")
+    assert err == ""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
