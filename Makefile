@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # Tests that compute, two at a time; the others start processes and wait for clocks, and come one after the other.
 COMPUTING := tests/law tests/hil tests/design tests/benchmarks
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-swaps soak-recordings soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -35,6 +35,10 @@ soak-live-changes: $(READY)
 # The control API under eight clients beside a paced run; swaps through it; the daemon on a board for an hour.
 soak-flood: $(READY)
 	$(BIN)/python -m tests.soak.api_flood
+
+# Two thousand silent and slow clients and every hostile request, while an operator stops and starts: a minute.
+soak-connections: $(READY)
+	$(BIN)/python -m tests.soak.connections
 
 soak-swaps: $(READY)
 	$(BIN)/python -m tests.soak.swaps

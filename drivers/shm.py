@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from hil.compiled import cfunc
 from hil.monotonic import monotonic_ns
 from hil.options import BoardOptions
 from hil.pointers import SIGNATURE, address_pointer, carray
+from hil.trusted import open_file
 
 CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "fifo", "adc_codes")]
@@ -109,7 +111,7 @@ class ShmDriver(Driver):
     def open(self) -> Pointers:
         """Attach to a running board. Raises DriverError where there is none, or another controller has it."""
         try:
-            self._fd = os.open(self._file, os.O_RDWR | os.O_CLOEXEC)
+            self._fd = open_file(Path(self._file), os.O_RDWR, group=True)
         except OSError as error:
             raise DriverError(
                 f"{self._file}: {error.strerror}; start the board with `rtloop hil serve CONFIG`"

@@ -24,6 +24,7 @@ from hil.monotonic import monotonic_ns, sleep_until
 from hil.noise import seed_word
 from hil.options import BoardOptions
 from hil.rig import advance, build_rig, sample
+from hil.trusted import open_file
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
 VERSION = 2
@@ -122,7 +123,7 @@ def serve(
     if len(axes) > MAX_CHANNELS:
         raise ValueError(f"{len(axes)} axes; a board has at most {MAX_CHANNELS} channels")
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
-    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o660)
+    fd = open_file(path, os.O_RDWR | os.O_CREAT, 0o660, group=True)
     try:
         if not take_role(fd, BOARD_BYTE):
             raise BoardBusy(f"{path}: another board serves this file")

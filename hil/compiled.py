@@ -14,7 +14,6 @@ import contextlib
 import hashlib
 import os
 import platform
-import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +24,8 @@ import llvmlite.binding
 import numba
 import numba.extending
 from numba import config as numba_config
+
+from hil.trusted import open_folder
 
 SOURCE_ROOT = Path(__file__).resolve().parent.parent
 KERNELS = ("hil", "drivers", "rtloop/law", "rtloop/engine", "rtloop/signals.py")
@@ -51,12 +52,10 @@ def cpu_identity() -> str:
 def _owned_folder(path: Path) -> bool:
     """Make `path` if needed; True when it is ours alone to write, so that nobody else's code is loaded from it."""
     try:
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = path.stat()
+        os.close(open_folder(path, 0o700))
     except OSError:
         return False
-    foreign = status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return not foreign and os.access(path, os.W_OK | os.X_OK)
+    return os.access(path, os.W_OK | os.X_OK)
 
 
 def _cache_folder() -> tuple[Path, bool]:

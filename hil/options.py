@@ -6,10 +6,11 @@ dynamics, names of axes.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hil.converters import MAX_LATENCY
 from hil.creep import MAX_LAGS
@@ -22,10 +23,36 @@ Factor = Annotated[tuple[float, ...], Field(strict=False, min_length=1, max_leng
 """Coefficients of 1, s or s², the highest power first."""
 
 
+LARGEST, SMALLEST = 1e100, 1e-100
+"""Magnitudes of numbers: their products and quotients are numbers still."""
+LARGEST_INTEGER = 2**63 - 1
+
+
+def _numbers(value: Any) -> Iterator[int | float]:
+    """All numbers in lists within lists."""
+    if isinstance(value, int | float):
+        yield value
+    elif isinstance(value, list | tuple):
+        for part in value:
+            yield from _numbers(part)
+
+
 class Options(BaseModel):
-    """Base of all models of the rig."""
+    """Base of all models: every number is one that can be computed with."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _computable(cls, value: Any) -> Any:
+        """`value`. Raises ValueError for a number that nothing can be computed with."""
+        for number in _numbers(value):
+            if isinstance(number, int):
+                if abs(number) > LARGEST_INTEGER:
+                    raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; smaller ones are allowed")
+            elif abs(number) > LARGEST or 0 < abs(number) < SMALLEST:
+                raise ValueError(f"{number:g}: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}, are allowed")
+        return value
 
     def _only_with(self, name: str, value: str, *fields: str) -> None:
         """Raise ValueError for a field that is set although it would be ignored."""

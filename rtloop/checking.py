@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from rtloop.config import load
@@ -42,8 +43,8 @@ def check_configuration(config: Path, as_json: bool) -> int:
     console = Console(highlight=False)
     plan, facts = prepared.plan, prepared.facts
     console.print(
-        f"[bold]{plan.name}[/]: {len(plan.axes)} axis at {plan.pacing.rate_hz:g} Hz, mode {plan.mode.name.lower()}, "
-        f"driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
+        f"[bold]{escape(plan.name)}[/]: {len(plan.axes)} axis at {plan.pacing.rate_hz:g} Hz, "
+        f"mode {plan.mode.name.lower()}, driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
     )
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
         limits, interlocks = axis.limits, axis.interlocks
@@ -56,7 +57,7 @@ def check_configuration(config: Path, as_json: bool) -> int:
         _print_axis(console, check, shifts[check.name])
         found = judged[axis.name]
         if found is not None:
-            console.print(f"{axis.specification}: {answer(found)}; `rtloop design verify` shows it all")
+            console.print(f"{escape(str(axis.specification))}: {answer(found)}; `rtloop design verify` shows it all")
     for warning in prepared.warnings:
         click.echo(f"warning: {warning}", err=True)
     return 0

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -17,13 +16,16 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from drivers.base import Wiring
 from drivers.errors import DriverError
 from drivers.registry import driver_class
-from hil.options import Options
+from hil.options import LARGEST_INTEGER, Options
 from rtloop.errors import ConfigError, RtloopError
+from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.service.options import ServiceOptions
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
+MAX_FAULTS, MAX_CHARACTERS = 40, 400
+"""That are said of one text, and of each."""
 
 
 class LoopOptions(Options):
@@ -131,7 +133,7 @@ def load(path: str | Path) -> Configuration:
     """Read and check a file. Raises InputFileError, or ConfigError with all faults."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:
         raise InputFileError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError as error:
@@ -142,9 +144,9 @@ def load(path: str | Path) -> Configuration:
 def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
     """Check a configuration's text; relative paths in it start at `folder`. Raises ConfigError with all faults."""
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+        raw = parse_toml(text)
+    except ValueError as error:
+        raise ConfigError(source, [str(error)]) from None
     driver = raw.pop("driver", None)
     faults: list[str] = []
     sections = _validated(TypeAdapter(_Sections), raw, "", faults)
@@ -202,7 +204,8 @@ def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str]
     """One line for each fault of `raw`, which stands at the key `prefix`."""
     details = error.errors(include_url=False)
     details = [detail for detail in details if not (detail["type"] == "too_short" and detail["input"])]
-    return [_fault(detail, prefix, raw, known_keys or set()) for detail in details]
+    more = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
+    return [_short(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + more
 
 
 def _keys(schema: Any) -> set[str]:
@@ -242,8 +245,18 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
         return f"{where}: one table; a list of tables, each headed [[{where}]], is needed"
     message = detail["msg"].removeprefix("Value error, ")
     value = detail["input"]
-    shown = f" {value!r}:" if isinstance(value, str | int | float | bool) else ""
+    shown = f" {_shown(value)}:" if isinstance(value, str | int | float | bool) else ""
     return f"{where}:{shown} {message[0].lower()}{message[1:]}" if not shown else f"{where}:{shown} {message}"
+
+
+def _shown(value: Any) -> str:
+    """As it was written; an integer too long to be written is only said to be one."""
+    return "a very long integer" if isinstance(value, int) and abs(value) > LARGEST_INTEGER else repr(value)
+
+
+def _short(fault: str) -> str:
+    """Of a fault, as much as a person reads."""
+    return fault if len(fault) <= MAX_CHARACTERS else f"{fault[:MAX_CHARACTERS]}…"
 
 
 def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -> list[str]:

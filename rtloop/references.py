@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.base import Channel, index_of
+from rtloop.files import read_below, read_regular
 from rtloop.law.options import (
     ChirpOptions,
     HoldOptions,
@@ -19,6 +21,15 @@ from rtloop.law.options import (
 )
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
+
+MAX_TABLE_BYTES = 64 << 20
+MAX_SAMPLES = MAX_TABLE_BYTES // 8
+MAX_HOLD_TICKS = 10**9
+"""Of a sample: more than a day at 10 kHz, and no number of ticks overflows."""
+
+
+class _NotANumber(Exception):
+    """A line of a table that is none."""
 
 
 class TableOfSamples:
@@ -48,13 +59,17 @@ def generator_values(
     if isinstance(options, HoldOptions):
         return Generator.HOLD, options.value
     if isinstance(options, StepsOptions):
+        if options.dwell_s * rate_hz > MAX_HOLD_TICKS:
+            raise ValueError(f"dwell_s: {options.dwell_s} is more than {MAX_HOLD_TICKS} periods of {1 / rate_hz:g} s")
         hold_ticks = round(options.dwell_s * rate_hz)
         if hold_ticks < 1:
             raise ValueError(f"dwell_s: {options.dwell_s} is less than a period of {1 / rate_hz:g} s")
         first = table.add(np.array(options.levels))
         return Generator.TABLE, first, len(options.levels), hold_ticks, float(options.repeat)
     if isinstance(options, TableOptions):
-        samples = _read_samples(folder / options.file)
+        if options.hold_ticks > MAX_HOLD_TICKS:
+            raise ValueError(f"hold_ticks: {options.hold_ticks}; at most {MAX_HOLD_TICKS} are allowed")
+        samples = read_samples(folder / options.file)
         return Generator.TABLE, table.add(samples), samples.size, options.hold_ticks, float(options.repeat)
     if isinstance(options, ChirpOptions):
         sweep = (options.amplitude, options.start_hz, options.end_hz, options.duration_s, options.offset)
@@ -65,16 +80,24 @@ def generator_values(
     return kind, options.amplitude, options.frequency_hz, options.offset, options.phase_deg / 360
 
 
-def _read_samples(path: Path) -> npt.NDArray[np.float64]:
-    """A column of numbers. Raises ValueError."""
+def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float64]:
+    """A column of numbers; of files in or below a folder only, where one is given. Raises ValueError.
+
+    What the file holds is not told: who names a file is not always who may read it.
+    """
     try:
-        loaded = np.load(path, allow_pickle=False) if path.suffix == ".npy" else _numbers(path.read_text("utf-8"))
+        data = read_regular(path, MAX_TABLE_BYTES) if below is None else read_below(below, path, MAX_TABLE_BYTES)
+        loaded = np.load(io.BytesIO(data), allow_pickle=False) if path.suffix == ".npy" else _numbers(data.decode())
     except OSError as error:
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"file: {path}: not a column of numbers ({error})") from None
-    if loaded.dtype.kind not in "fiu":
-        raise ValueError(f"file: {path}: holds {loaded.dtype}; real numbers are needed")
+    except _NotANumber as error:
+        raise ValueError(f"file: {path}: not a column of numbers (line {error})") from None
+    except Exception:  # what the header of an .npy may do wrong has no end
+        raise ValueError(f"file: {path}: not a column of numbers") from None
+    if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
+        raise ValueError(f"file: {path}: holds {getattr(loaded, 'dtype', 'an archive')}; real numbers are needed")
+    if loaded.size > MAX_SAMPLES:
+        raise ValueError(f"file: {path}: {loaded.size} samples; at most {MAX_SAMPLES} are allowed")
     samples = loaded.astype(float)
     if samples.ndim != 1 or samples.size == 0:
         raise ValueError(f"file: {path}: shape {samples.shape}; one column of at least one number is needed")
@@ -84,9 +107,15 @@ def _read_samples(path: Path) -> npt.NDArray[np.float64]:
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """A number a line; empty lines and what follows a # do not count."""
-    lines = (line.partition("#")[0].strip() for line in text.splitlines())
-    return np.array([float(line) for line in lines if line])
+    """A number a line; empty lines and what follows a # do not count. Raises _NotANumber with the line's number."""
+    numbers = []
+    for count, line in enumerate(text.splitlines(), start=1):
+        if content := line.partition("#")[0].strip():
+            try:
+                numbers.append(float(content))
+            except ValueError:
+                raise _NotANumber(count) from None
+    return np.array(numbers)
 
 
 def reach(values: Sequence[float], samples: npt.NDArray[np.float64]) -> float:

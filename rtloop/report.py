@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import IO, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from drivers.errors import DriverError
@@ -62,9 +63,9 @@ def print_summary(summary: dict[str, Any]) -> None:
     """What a recording holds, as tables."""
     console = Console(highlight=False)
     if "ticks_logged" not in summary:
-        console.print(f"nothing recorded in {summary.get('recording')}")
+        console.print(f"nothing recorded in {escape(str(summary.get('recording')))}")
         return
-    console.print(f"[bold]{summary['recording']}[/]  {_size(summary)}")
+    console.print(f"[bold]{escape(summary['recording'])}[/]  {_size(summary)}")
     table = _table("", "", "")
     expected = summary["ticks_expected"]
     table.add_row(
@@ -81,7 +82,7 @@ def print_summary(summary: dict[str, Any]) -> None:
     if len(summary["parts"]) > 1:
         table.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
     for problem in summary["problems"]:
-        table.add_row("[red]problem[/]", "", problem)
+        table.add_row("[red]problem[/]", "", escape(problem))
     for trip in summary["trips"]:
         table.add_row("[red]trip[/]", f"tick {trip['tick']}", ", ".join(trip["causes"]))
     console.print(table)
@@ -145,7 +146,7 @@ def print_drivers() -> None:
             driver = driver_class(kind)
             facts = driver(driver.options_model(), {"x": driver.example}, 1000.0).facts
         except (DriverError, ValueError) as error:
-            table.add_row(kind, f"[red]{error}[/]", "", "", where)
+            table.add_row(kind, f"[red]{escape(str(error))}[/]", "", "", where)
             continue
         rate = "any" if facts.max_rate_hz == float("inf") else f"{facts.max_rate_hz:g} Hz"
         table.add_row(kind, "yes" if facts.real else "no", "rtloop's", rate, where)

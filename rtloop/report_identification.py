@@ -97,7 +97,7 @@ def _print_response(console: Console, found: dict[str, Any] | None) -> None:
 def _print_files(console: Console, report: dict[str, Any]) -> None:
     for key in ("output", "plot"):
         if report.get(key):
-            console.print(report[key])
+            console.print(report[key], markup=False)
 
 
 def _number(value: float | None, form: str = "{:.2f}") -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from rtloop.recording.replay import ReplayReport
 from rtloop.terminal import console as _console
@@ -35,11 +36,11 @@ def print_replay(path: Path, report: ReplayReport) -> None:
         console.print(f"{report.unverified:,} ticks before the next snapshot of the law were passed over")
     checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
     if report.first_difference is None:
-        console.print(f"[green]identical[/]: {path}: {checked} compared in bytes")
+        console.print(f"[green]identical[/]: {_name(path)}: {checked} compared in bytes")
         return
     found = report.first_difference
     console.print(
-        f"[red]different[/]: {path}: tick {found['tick']}, {found['signal']}: recorded {found['recorded']!r}, "
+        f"[red]different[/]: {_name(path)}: tick {found['tick']}, {found['signal']}: recorded {found['recorded']!r}, "
         f"replayed {found['replayed']!r} ({checked} compared)"
     )
 
@@ -47,7 +48,8 @@ def print_replay(path: Path, report: ReplayReport) -> None:
 def print_differences(report: dict[str, Any]) -> None:
     """Largest and root mean square difference, signal by signal."""
     console = _console()
-    console.print(f"the law of {report['config']} on the inputs of {report['recording']}: {report['ticks']:,} ticks")
+    law, recording = _name(report["config"]), _name(report["recording"])
+    console.print(f"the law of {law} on the inputs of {recording}: {report['ticks']:,} ticks")
     table = _table("difference", "largest", "at tick", "rms")
     for name, difference in report["signals"].items():
         table.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")
@@ -60,7 +62,7 @@ def print_resimulation(report: dict[str, Any]) -> None:
     """Recorded and resimulated, side by side."""
     console = _console()
     law = report["config"] or "the recorded law and rig"
-    console.print(f"the reference of {report['recording']} through {law}: {report['ticks']:,} ticks")
+    console.print(f"the reference of {_name(report['recording'])} through {_name(law)}: {report['ticks']:,} ticks")
     for axis in report["axes"]:
         before, after = axis["recorded"], axis["resimulated"]
         table = _table(f"axis {axis['name']}", "recorded", "resimulated")
@@ -78,7 +80,7 @@ def print_resimulation(report: dict[str, Any]) -> None:
 def print_recovery(report: dict[str, Any]) -> None:
     """What is in the recovered file, and what is missing."""
     console = _console()
-    console.print(f"{report['output']}: {report['ticks']:,} ticks recovered from {report['recording']}")
+    console.print(f"{_name(report['output'])}: {report['ticks']:,} ticks recovered from {_name(report['recording'])}")
     for first, count in report["gaps"]:
         console.print(f"missing: {count:,} ticks from tick {first} on")
     _print_problems(console, report["problems"])
@@ -89,7 +91,7 @@ def print_recovery(report: dict[str, Any]) -> None:
 def print_export(report: dict[str, Any]) -> None:
     """What was written where."""
     console = _console()
-    console.print(f"{report['output']}: {report['ticks']:,} ticks, {report['bytes'] / 2**20:.1f} MiB")
+    console.print(f"{_name(report['output'])}: {report['ticks']:,} ticks, {report['bytes'] / 2**20:.1f} MiB")
     _print_problems(console, report["problems"])
 
 
@@ -100,7 +102,12 @@ def _print_trip(console: Console, what: str, trip: dict[str, Any] | None) -> Non
 
 def _print_problems(console: Console, problems: list[str]) -> None:
     for problem in problems:
-        console.print(f"[red]problem[/]: {problem}")
+        console.print(f"[red]problem[/]: {_name(problem)}")
+
+
+def _name(text: object) -> str:
+    """As it is: brackets in the name of a file are no markup."""
+    return escape(str(text))
 
 
 def _number(value: float | None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ from pydantic import ValidationError
 from rtloop.config import InputFileError, describe
 from rtloop.design.specification import DesignOptions
 from rtloop.errors import ConfigError
+from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 
 
 class SpecificationFile(NamedTuple):
@@ -24,15 +24,15 @@ class SpecificationFile(NamedTuple):
 def load_specification(path: Path) -> SpecificationFile:
     """Read and check. Raises InputFileError, or ConfigError with all faults."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:
         raise InputFileError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise InputFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(str(path), [f"not valid TOML: {error}"]) from None
+        raw = parse_toml(text)
+    except ValueError as error:
+        raise ConfigError(str(path), [str(error)]) from None
     try:
         return SpecificationFile(path, text, DesignOptions.model_validate(raw))
     except ValidationError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,8 @@ def _client(context: click.Context) -> Any:
     name, path = context.obj
     if path is None:
         folders = client_folders()
-        found = [item for folder in folders for item in sorted(folder.glob(f"{name or '*'}.sock"))]
+        pattern = "*" if name is None else glob.escape(name)
+        found = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
         if len(found) != 1:
             there = ", ".join(item.stem for item in found) or "none that may be reached"
             where = ", ".join(str(folder) for folder in folders)
@@ -211,11 +213,11 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
 
 def _inline_table(text: str) -> dict[str, Any]:
     """TOML's inline table without its braces. Raises a usage error."""
-    import tomllib
+    from rtloop.files import parse_toml
 
     try:
-        return tomllib.loads(f"table = {{ {text} }}")["table"]
-    except tomllib.TOMLDecodeError as error:
+        return parse_toml(f"table = {{ {text} }}")["table"]
+    except ValueError as error:
         raise click.UsageError(f"{text!r}: not `key = value, …`: {error}") from None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from rtloop.design.identify_hysteresis import HysteresisFit
 from rtloop.design.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
 from rtloop.errors import ConfigError, OutputError
+from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import FeedforwardOptions
 from rtloop.recording.errors import RecordingError
@@ -82,18 +82,20 @@ def read_feedforward(path: Path, axis: str | None = None) -> FeedforwardOptions:
     Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
     """
     try:
-        content = path.read_text("utf-8")
+        content = read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
     return feedforward_of(content, str(path), axis)
 
 
 def feedforward_of(content: str, source: str, axis: str | None = None) -> FeedforwardOptions:
     """The same, from TOML text. Raises ConfigError."""
     try:
-        found: Any = tomllib.loads(content).get("axis")
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+        found: Any = parse_toml(content).get("axis")
+    except ValueError as error:
+        raise ConfigError(source, [str(error)]) from None
     if isinstance(found, list):
         found = next((one for one in found if isinstance(one, dict) and axis in (None, one.get("name"))), None)
     if not isinstance(found, dict) or "feedforward" not in found:

@@ -19,6 +19,9 @@ from hil.linear import Complex, conjugate_pairs
 from rtloop.design.realisation import System
 from rtloop.design.zeros import zeros_and_gain
 
+MAX_ORDER = 200
+"""Far above what a loop can run, and its roots are found in milliseconds."""
+
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
@@ -32,6 +35,7 @@ class Transfer:
     gain: float
 
     def __post_init__(self) -> None:
+        require_order(max(np.size(self.zeros), np.size(self.poles)))
         object.__setattr__(self, "zeros", _paired("zeros", self.zeros))
         object.__setattr__(self, "poles", _paired("poles", self.poles))
         object.__setattr__(self, "gain", float(_finite("gain", self.gain)))
@@ -107,6 +111,12 @@ class Transfer:
         return self.zeros.size < self.poles.size
 
 
+def require_order(order: int) -> None:
+    """Raise ValueError for an order whose roots would take seconds."""
+    if order > MAX_ORDER:
+        raise ValueError(f"order {order}: at most {MAX_ORDER} is allowed")
+
+
 def factored_response(zeros: Complex, poles: Complex, gain: float, at: npt.ArrayLike) -> Complex:
     """gain·Π(x − z)/Π(x − p) at complex points of any shape, a ratio at a time so that nothing overflows."""
     points = np.asarray(at, dtype=complex)
@@ -146,7 +156,9 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
     """Roots and leading coefficient of a product of polynomials. Raises ValueError for a factor that is zero."""
     roots: list[Complex] = [np.empty(0, dtype=complex)]
     leading = 1.0
+    require_order(len(factors))
     for factor in factors:
+        require_order(np.size(factor) - 1)
         polynomial = np.trim_zeros(np.atleast_1d(_finite(name, factor)), "f")
         if polynomial.ndim != 1:
             raise ValueError(f"{name}: {factor!r} is not a list of coefficients, highest power of s first")
@@ -173,6 +185,7 @@ def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
 
 def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> System:
     """The four matrices as a System. Raises ValueError where their shapes do not fit together."""
+    require_order(np.shape(a)[0] if np.size(a) else 0)
     matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))
     column, row, direct = _finite("b", b).ravel(), _finite("c", c).ravel(), _finite("d", d).ravel()
     order = matrix.shape[0]

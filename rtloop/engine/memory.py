@@ -11,6 +11,8 @@ import fcntl
 import json
 import mmap
 import os
+import signal
+import struct
 import time
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -22,6 +24,8 @@ from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 
 DIRECTORY_BYTES = 8192
+_LOCK = "hhqqi4x"
+"""struct flock: kind, whence, start, length, process."""
 ATTACH_POLL_S = 0.001
 RING_SECONDS = 10.0
 # numbers of slots are powers of two: the rings rely on it
@@ -142,13 +146,27 @@ class SharedBlock:
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
 
     def driven_by(self) -> int | None:
-        """The process that claimed the block and still lives; not for that process itself."""
+        """The process that claimed the block and still lives, as the kernel knows it; not for that process itself."""
+        asked = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0)
+        kind, *_, pid = struct.unpack(_LOCK, fcntl.fcntl(self.fd, fcntl.F_GETLK, asked))
+        return None if kind == fcntl.F_UNLCK else pid
+
+    def kill_driver(self) -> None:
+        """End the process that claimed the block: that one, and none that has got its number meanwhile."""
+        pid = self.driven_by()
+        if pid is None:
+            return
         try:
-            fcntl.lockf(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1)
-        except OSError:
-            return int(self.words[Word.LOOP_PID])
-        fcntl.lockf(self.fd, fcntl.LOCK_UN, 1)
-        return None
+            process = os.pidfd_open(pid)
+        except ProcessLookupError:
+            return
+        try:
+            if self.driven_by() == pid:
+                signal.pidfd_send_signal(process, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        finally:
+            os.close(process)
 
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""

@@ -8,79 +8,43 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from drivers.errors import DriverError
-from rtloop.config import ModeName, describe
+from rtloop.config import describe
 from rtloop.engine.commands import QueueFull
-from rtloop.errors import ConfigError, RtloopError
+from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.law.options import TableOptions
+from rtloop.references import read_samples
+from rtloop.service.bodies import (
+    MAX_BODY_BYTES,
+    Body,
+    ControllerBody,
+    ModeBody,
+    ReferenceBody,
+    SetpointBody,
+    TuneBody,
+    WaveformBody,
+)
 from rtloop.service.desk import Refused
+from rtloop.service.lanes import Busy, Lane, Lanes
 from rtloop.service.metrics import metrics_text
 from rtloop.service.service import Service
 from rtloop.service.status import newest_signals, status
 
-MAX_BODY_BYTES = 4 << 20
 WATCH_HZ = 20.0
-
-
-class Body(BaseModel):
-    """Base of request bodies."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class ModeBody(Body):
-    """A mode for all axes."""
-
-    mode: ModeName
-
-
-class ReferenceBody(Body):
-    """A reference as in [axis.reference]."""
-
-    axis: str
-    reference: dict[str, Any]
-
-
-class SetpointBody(Body):
-    """A constant reference, µm (V in raw mode)."""
-
-    axis: str
-    value: float
-
-
-class WaveformBody(Body):
-    """Samples, `hold_ticks` ticks each."""
-
-    axis: str
-    samples: list[float] = Field(min_length=1)
-    hold_ticks: int = Field(default=1, ge=1)
-    repeat: bool = False
-
-
-class TuneBody(Body):
-    """Keys of [axis.SECTION] to change."""
-
-    axis: str
-    section: str
-    values: dict[str, Any] = Field(min_length=1)
-
-
-class ControllerBody(Body):
-    """A whole [axis.controller]."""
-
-    axis: str
-    controller: dict[str, Any]
-
+MAX_STREAMS = 16
+"""WebSockets at a time."""
 
 Action = Callable[[Service, Any], dict[str, Any]]
 
@@ -103,12 +67,12 @@ def _arm(service: Service, _: Any) -> dict[str, Any]:
 ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
     "/arm": (None, "Allow the outputs to be driven.", _arm),
     "/start": (None, "Set the configured mode.", lambda service, _: _tick(service.start())),
-    "/stop": (None, "Ramp the outputs to safe.", lambda service, _: _tick(service.stop())),
+    "/stop": (None, "Ramp the outputs to safe; waits for no other request.", lambda service, _: _tick(service.stop())),
     "/reset": (None, "Forget latched trips; the outputs stay off.", lambda service, _: _tick(service.reset())),
     "/reload": (None, "Read the configuration again.", lambda service, _: service.reload_now()),
     "/mode": (ModeBody, "Change the mode bumplessly.", lambda service, body: _tick(service.set_mode(body.mode))),
     "/reference": (ReferenceBody, "Change the reference of an axis.",
-                   lambda service, body: _tick(_live(service).set_reference(body.axis, body.reference))),
+                   lambda service, body: _tick(_reference(service, body))),
     "/setpoint": (SetpointBody, "Hold the reference of an axis at a value.",
                   lambda service, body: _tick(_setpoint(service, body))),
     "/waveform": (WaveformBody, "Play samples on an axis.",
@@ -120,6 +84,24 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
                     lambda service, body: _tick(_live(service).load_controller(body.axis, body.controller))),
 }  # fmt: skip
 """Path → body, what it does, how. All are POST; a command's answer is the tick at which it took effect."""
+LANES = {"/stop": Lane.SAFETY, "/reset": Lane.SAFETY,
+         "/tune": Lane.BUILD, "/controller": Lane.BUILD, "/reload": Lane.BUILD}  # fmt: skip
+"""The rest is ordinary."""
+
+
+def _reference(service: Service, body: ReferenceBody) -> int:
+    """Another generator; a table is read here, for whoever asks may not read what the service may."""
+    live = _live(service)
+    if body.reference.get("kind") != "table":
+        return live.set_reference(body.axis, body.reference)
+    try:
+        table = TableOptions.model_validate(body.reference)
+        samples = read_samples(Path(table.file), below=service.configuration.folder)
+    except ValidationError as error:
+        raise ConfigError("reference", describe(error, "reference", body.reference)) from None
+    except ValueError as error:
+        raise ConfigError("reference", [f"reference.{error}"]) from None
+    return live.set_waveform(body.axis, samples.tolist(), table.hold_ticks, table.repeat)
 
 
 def _setpoint(service: Service, body: SetpointBody) -> int:
@@ -128,6 +110,24 @@ def _setpoint(service: Service, body: SetpointBody) -> int:
 
 def application(service: Service) -> Starlette:
     """The API of a service."""
+    lanes, streams = Lanes(), 0
+
+    @asynccontextmanager
+    async def stream(socket: WebSocket) -> AsyncIterator[bool]:
+        """Accept one of MAX_STREAMS; False, and refused, where there are as many. Its end is no error."""
+        nonlocal streams
+        if streams >= MAX_STREAMS:
+            await socket.close(1013)
+            yield False
+            return
+        streams += 1
+        try:
+            await socket.accept()
+            yield True
+        except (WebSocketDisconnect, RuntimeError, OSError, KeyError):  # the last for bytes instead of text
+            return
+        finally:
+            streams -= 1
 
     async def get_status(_: Request) -> Response:
         return JSONResponse(status(service))
@@ -139,33 +139,26 @@ def application(service: Service) -> Starlette:
         return JSONResponse(openapi())
 
     async def watch(socket: WebSocket) -> None:
-        await socket.accept()
-        try:
-            while True:
+        async with stream(socket) as accepted:
+            while accepted:
                 await socket.send_text(json.dumps({"state": service.state} | newest_signals(service)))
                 await asyncio.sleep(1 / WATCH_HZ)
-        except (WebSocketDisconnect, RuntimeError, OSError):
-            return
 
     async def setpoints(socket: WebSocket) -> None:
         """A stream of setpoints, each answered by its tick or an error."""
-        await socket.accept()
-        try:
-            while True:
-                answer = await _answer(service, SetpointBody, ACTIONS["/setpoint"][2], await socket.receive_text())
+        async with stream(socket) as accepted:
+            while accepted:
+                answer = await _answer(service, lanes, "/setpoint", await socket.receive_text())
                 await socket.send_text(bytes(answer.body).decode())
-        except (WebSocketDisconnect, RuntimeError, OSError, KeyError):  # the last for bytes instead of text
-            return
 
-    def post(body: type[Body] | None, action: Action) -> Callable[[Request], Any]:
-        async def handler(request: Request) -> Response:
-            try:
-                data = await _read(request)
-            except ValueError as error:
-                return _error(413, str(error))
-            return await _answer(service, body, action, data)
-
-        return handler
+    async def post(request: Request) -> Response:
+        try:
+            data = await _read(request)
+        except ClientDisconnect:
+            return Response()
+        except ValueError as error:
+            return _error(413, str(error))
+        return await _answer(service, lanes, request.url.path, data)
 
     routes: list[Any] = [
         Route("/status", get_status),
@@ -174,7 +167,7 @@ def application(service: Service) -> Starlette:
         WebSocketRoute("/watch", watch),
         WebSocketRoute("/setpoints", setpoints),
     ]
-    routes += [Route(path, post(body, action), methods=["POST"]) for path, (body, _, action) in ACTIONS.items()]
+    routes += [Route(path, post, methods=["POST"]) for path in ACTIONS]
     return Starlette(routes=routes)
 
 
@@ -188,18 +181,19 @@ async def _read(request: Request) -> bytes:
     return data
 
 
-async def _answer(service: Service, body: type[Body] | None, action: Action, data: bytes | str) -> Response:
-    """Validate, act in a thread, and answer; errors become 4xx that say why."""
+async def _answer(service: Service, lanes: Lanes, path: str, data: bytes | str) -> Response:
+    """Validate, act in a thread, and answer; errors become 4xx that say why, 503 where too many wait."""
+    body, _, action = ACTIONS[path]
     try:
         wanted = None if body is None else body.model_validate_json(data)
-        return JSONResponse(await run_in_threadpool(action, service, wanted))
+        return JSONResponse(await lanes.run(LANES.get(path, Lane.ORDINARY), action, service, wanted))
     except ValidationError as error:
         return _error(422, "; ".join(describe(error, "", {})))
     except ConfigError as error:
         return _error(422, "; ".join(error.faults))
-    except (Refused, QueueFull) as error:
-        return _error(409, str(error))
-    except (RtloopError, DriverError) as error:
+    except (Busy, UnavailableError) as error:
+        return _error(503, str(error))
+    except (QueueFull, RtloopError, DriverError) as error:
         return _error(409, str(error))
 
 
@@ -215,7 +209,8 @@ def openapi() -> dict[str, Any]:
     }
     answers = {"200": {"description": "done; a command's `tick` is when it took effect"},
                "409": {"description": "refused in this state"}, "413": {"description": "too large"},
-               "422": {"description": "malformed, or outside the envelope"}}  # fmt: skip
+               "422": {"description": "malformed, or outside the envelope"},
+               "503": {"description": "too many wait, or it takes too long"}}  # fmt: skip
     for path, (body, summary, _) in ACTIONS.items():
         operation: dict[str, Any] = {"summary": summary, "responses": answers}
         if body is not None:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import http.client
 import json
 import socket
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import RtloopError, UnavailableError
+from hil.trusted import Untrusted, owners
+from rtloop.errors import RefusedError, RtloopError, UnavailableError
+from rtloop.service.paths import refusal
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 20.0
+_TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
+"""Process, user and group of a peer (unix(7))."""
 
 
 class _UnixConnection(http.client.HTTPConnection):
@@ -21,9 +26,33 @@ class _UnixConnection(http.client.HTTPConnection):
 
     def connect(self) -> None:
         """To the socket's path."""
-        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(TIMEOUT_S)
-        self.sock.connect(str(self._path))
+        self.sock = _connected(self._path)
+
+
+def _connected(path: Path) -> socket.socket:
+    """A connection to who serves there: we, root, or whom root gave the folder to. Raises OSError, RefusedError."""
+    try:
+        believed = owners(path.parent)
+    except Untrusted as error:
+        raise refusal(error) from None
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        # a connection attempt waits for its turn only on a socket that blocks (unix(7))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(round(TIMEOUT_S), 0))
+        connection.connect(str(path))
+        connection.settimeout(TIMEOUT_S)
+        _, server, _ = _CREDENTIALS.unpack(
+            connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        )
+        owner = path.lstat().st_uid
+        if server not in believed or owner != server:
+            raise RefusedError(
+                f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner"
+            )
+        return connection
+    except BaseException:
+        connection.close()
+        raise
 
 
 class Client:
@@ -43,10 +72,10 @@ class Client:
     def watch(self) -> Iterator[dict[str, Any]]:
         """Newest signals, about 20 times a second. Raises UnavailableError."""
         from websockets.exceptions import WebSocketException
-        from websockets.sync.client import unix_connect
+        from websockets.sync.client import connect
 
         try:
-            with unix_connect(str(self.path), "ws://localhost/watch") as connection:
+            with connect("ws://localhost/watch", sock=_connected(self.path)) as connection:
                 for message in connection:
                     yield json.loads(message)
         except (OSError, WebSocketException) as error:

@@ -8,20 +8,23 @@ import logging
 import os
 import signal
 import socket
+import stat
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import uvicorn
 
+from hil.trusted import Untrusted, open_folder
 from rtloop.errors import UnavailableError
 from rtloop.service.api import application
+from rtloop.service.building import builder_ready
 from rtloop.service.can_bus import supervised_by_can
+from rtloop.service.connections import BACKLOG, settings
 from rtloop.service.journal import Journal
-from rtloop.service.paths import socket_path
+from rtloop.service.paths import FOLDER_MODE, refusal, socket_path
 from rtloop.service.service import Service
 
-LIMIT_CONCURRENCY = 64
 END_TIMEOUT_S = 5.0
 
 
@@ -33,7 +36,7 @@ def serve(config: Path) -> int:
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
     try:
-        with _listening(service), supervised_by_can(service):
+        with builder_ready(), _listening(service), supervised_by_can(service):
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()
@@ -44,10 +47,7 @@ def _listening(service: Service) -> Iterator[None]:
     """The API on its socket, in a thread of its own, for as long as the service runs."""
     path = socket_path(service.configuration)
     listener = _bind(path, int(service.configuration.service.socket_mode, 8))
-    settings = uvicorn.Config(
-        application(service), log_level="warning", lifespan="off", limit_concurrency=LIMIT_CONCURRENCY, log_config=None
-    )
-    server = uvicorn.Server(settings)
+    server = uvicorn.Server(settings(application(service)))
     thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listener])), daemon=True)
     thread.start()
     try:
@@ -60,28 +60,55 @@ def _listening(service: Service) -> Iterator[None]:
 
 
 def _bind(path: Path, mode: int) -> socket.socket:
-    """A listening socket with exactly these permissions. Raises UnavailableError where another service listens."""
+    """A listening socket with exactly these permissions, of the folder's group where we may give it that.
+
+    Raises UnavailableError where another service listens or something else than a socket stands, RefusedError for a
+    folder that others may write to.
+    """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
+        folder = open_folder(path.parent, FOLDER_MODE)
+        try:
+            group = os.fstat(folder).st_gid
+        finally:
+            os.close(folder)
+        _clear(path)
+        previous = os.umask(0o777)
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(previous)
+        with contextlib.suppress(PermissionError):
+            os.chown(path, -1, group)
+        os.chmod(path, mode)
+        listener.listen(BACKLOG)
+        return listener
+    except Untrusted as error:
+        listener.close()
+        raise refusal(error) from None
+    except OSError as error:
+        listener.close()
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None
+    except UnavailableError:
+        listener.close()
+        raise
+
+
+def _clear(path: Path) -> None:
+    """Remove a socket that nobody serves any more. Raises UnavailableError, OSError."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise UnavailableError(f"{path}: is there and no socket; it is not touched")
         with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as probe:
+            probe.setblocking(False)
             probe.connect(str(path))
         raise UnavailableError(f"{path}: another service listens there")
-    except (FileNotFoundError, ConnectionRefusedError):
+    except BlockingIOError:  # so many clients that they must wait
+        raise UnavailableError(f"{path}: another service listens there") from None
+    except ConnectionRefusedError:
+        path.unlink()
+    except FileNotFoundError:
         pass
-    except OSError as error:
-        raise UnavailableError(f"{path}: {error.strerror or error}") from None
-    previous = os.umask(0o777 & ~mode)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        listener.bind(str(path))
-        os.chmod(path, mode)
-    except OSError as error:
-        raise UnavailableError(f"{path}: {error.strerror or error}") from None
-    finally:
-        os.umask(previous)
-    listener.listen(128)
-    return listener
 
 
 class _JournalFormatter(logging.Formatter):

@@ -18,8 +18,9 @@ from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
-from rtloop.prepare import Prepared, prepare
+from rtloop.prepare import Prepared
 from rtloop.references import TableOfSamples, generator_values, reach
+from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused, Taken
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels")
@@ -131,7 +132,7 @@ class LiveLaw:
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
-        prepared = prepare(_with_axis(configuration, number, axis))
+        prepared = prepare_limited(_with_axis(configuration, number, axis))
         try:
             tick = self._stage(number, prepared)
         except Taken:

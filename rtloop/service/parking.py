@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +18,7 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
 from rtloop.errors import UnavailableError
 from rtloop.prepare import prepare
-from rtloop.service.paths import block_path
+from rtloop.service.paths import block_path, open_block
 
 POLL_S = 0.005
 KILL_S = 5.0
@@ -47,9 +46,8 @@ def park_configuration(config: Path) -> str:
 @contextmanager
 def _last_block(path: Path) -> Iterator[SharedBlock | None]:
     """A service's shared block; None where there is none."""
-    try:
-        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    except OSError:
+    fd = open_block(path)
+    if fd is None:
         yield None
         return
     try:
@@ -72,8 +70,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
         if time.monotonic() > kill_s + KILL_S:
             raise DriverError(f"process {pid} drives the outputs and cannot be killed")
         if time.monotonic() > kill_s:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+            block.kill_driver()
         time.sleep(POLL_S)
 
 

@@ -1,12 +1,20 @@
-"""Where a service keeps its socket and its shared block, which holds the last drive, so that others find them."""
+"""Where a service keeps its socket and its shared block, which holds the last drive, so that others find them.
+
+What lies there is believed, and killed and driven by: nobody else may have put it there (`hil.trusted`).
+"""
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
+from hil.trusted import Untrusted, open_file, open_folder
 from rtloop.config import Configuration
+from rtloop.errors import OutputError, RefusedError, UnavailableError
 
+FOLDER_MODE = 0o750
+"""Members of the group get to the socket."""
 SYSTEM_FOLDER = Path("/run/rtloop")
 """Of services that run for the whole machine, as the units have it."""
 
@@ -35,3 +43,39 @@ def socket_path(configuration: Configuration) -> Path:
 def block_path(configuration: Configuration) -> Path:
     """Where the shared block of a service lies, for `rtloop park`."""
     return runtime_folder() / f"{configuration.name}.block"
+
+
+def new_block(path: Path) -> int:
+    """An empty file in place of an old one, which a process that still has it mapped keeps.
+
+    Raises OutputError, RefusedError for a folder that is not ours alone to write.
+    """
+    try:
+        folder = open_folder(path.parent, FOLDER_MODE)
+        try:
+            with suppress(FileNotFoundError):
+                os.unlink(path.name, dir_fd=folder)
+            return os.open(path.name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600, dir_fd=folder)
+        finally:
+            os.close(folder)
+    except Untrusted as error:
+        raise refusal(error) from None
+    except OSError as error:
+        raise OutputError(f"{path}: cannot make the shared block: {error.strerror}") from None
+
+
+def open_block(path: Path) -> int | None:
+    """A service's shared block; None where there is none. Raises RefusedError, UnavailableError."""
+    try:
+        return open_file(path, os.O_RDWR)
+    except FileNotFoundError:
+        return None
+    except Untrusted as error:
+        raise refusal(error) from None
+    except OSError as error:
+        raise UnavailableError(f"{path}: {error.strerror}") from None
+
+
+def refusal(error: Untrusted) -> RefusedError:
+    """For a user: what is not believed, and why."""
+    return RefusedError(f"{error.filename}: {error.strerror}")

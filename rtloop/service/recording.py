@@ -6,6 +6,7 @@ waits for a file.
 
 from __future__ import annotations
 
+import glob
 import json
 import threading
 import time
@@ -134,6 +135,7 @@ class RecorderKeeper:
     def _files(self, suffix: str) -> list[Path]:
         """This run's files, in their order."""
         folder, stem = self._path.parent, self._path.stem
+        stem = glob.escape(stem)
         return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 
     def _repair(self, part: Path) -> None:

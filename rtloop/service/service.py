@@ -30,6 +30,7 @@ from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.prepare import Prepared, prepare
 from rtloop.recording.recover import leftovers, recover
 from rtloop.running import recording_path
+from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
@@ -318,7 +319,7 @@ class Service:
         """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""
         with self._reloading:  # one after the other: the file that was read last is the one that stays
             configuration = load(self.config)
-            prepared: Prepared = prepare(configuration)
+            prepared: Prepared = prepare_limited(configuration)
             live = self.live
             changed = [] if live is None else live.replace_all(prepared)
             self.configuration = configuration

@@ -20,11 +20,12 @@ import numpy as np
 from drivers.errors import DriverError
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.ring import drain
-from rtloop.errors import LoopFault, OutputError, RtloopError, UnavailableError
+from rtloop.errors import LoopFault, RtloopError, UnavailableError
 from rtloop.prepare import Prepared
 from rtloop.service.child import Child
 from rtloop.service.header import recording_header
 from rtloop.service.parking import park
+from rtloop.service.paths import new_block
 from rtloop.service.recording import RecorderKeeper
 from rtloop.service.stall import StallWatch, stall_limit_s
 
@@ -64,7 +65,7 @@ class Processes:
 
     def __init__(self, block: Path | None = None) -> None:
         """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
-        self.fd = SharedBlock.reserve() if block is None else _new_file(block)
+        self.fd = SharedBlock.reserve() if block is None else new_block(block)
         self.loop = Child("rtloop.engine.process", self.fd)
         self.recorder = Child("rtloop.recording.recorder", self.fd)
 
@@ -268,16 +269,6 @@ class Supervisor:
         except DriverError as error:
             return f"its outputs could not be parked: {error}"
         return "its outputs were parked in its place"
-
-
-def _new_file(path: Path) -> int:
-    """An empty file in place of an old one, which a process that still has it mapped keeps. Raises OutputError."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot make the shared block: {error.strerror}") from None
 
 
 def seconds_since_start() -> float:

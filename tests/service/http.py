@@ -22,8 +22,8 @@ GOOD_CONTROLLER = {
 def exchange(path: Path, method: str, resource: str, body: bytes = b"") -> tuple[int, bytes]:
     """Status and body; a server may answer before it has read everything, and hang up."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(TIMEOUT_S)
         connection.connect(str(path))
+        connection.settimeout(TIMEOUT_S)
         head = f"{method} {resource} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {len(body)}"
         with suppress(BrokenPipeError, ConnectionResetError):
             connection.sendall(head.encode() + b"\r\n\r\n" + body)

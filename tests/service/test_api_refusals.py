@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -11,7 +12,9 @@ from typing import Any
 import pytest
 
 from rtloop.engine.memory import Word
+from rtloop.service.connections import BACKLOG, MAX_CONNECTIONS
 from tests.faults.bench import Bench
+from tests.service.hostile import EXPENSIVE, HUGE, hostile
 from tests.service.http import GOOD_CONTROLLER, answer, exchange
 
 
@@ -52,6 +55,33 @@ def test_malformed_json(bench: Bench, data: bytes):
     assert json.loads(said)["error"]
 
 
+@pytest.mark.parametrize("make", ["fifo", "zero", "shadow", "link", "above"])
+def test_a_table_is_a_file_below_the_configuration(bench: Bench, make: str):
+    """Whoever may use the API may not read what the service may read."""
+    folder = bench.config.parent
+    name = {"zero": "/dev/zero", "shadow": "/etc/passwd", "above": f"../{folder.name}/wave.csv"}.get(make, make)
+    (folder / "wave.csv").write_text("1.0\n")
+    if make == "fifo":
+        os.mkfifo(folder / "fifo")
+    if make == "link":
+        (folder / "link").symlink_to("/etc/passwd")
+    code, said = answer(bench, "POST", "/reference", {"axis": "x", "reference": {"kind": "table", "file": name}})
+    assert code == 422
+    assert "root" not in said["error"].replace(str(folder), "")
+
+
+def test_a_table_below_the_configuration_plays(bench: Bench):
+    folder = bench.config.parent / "waves"
+    folder.mkdir()
+    (folder / "wave.csv").write_text("1.0\n2.0\n")
+    body = {"axis": "x", "reference": {"kind": "table", "file": "waves/wave.csv", "hold_ticks": 3}}
+    assert answer(bench, "POST", "/reference", body)[0] == 200
+    (folder / "wave.csv").write_text("root of all\n")
+    code, said = answer(bench, "POST", "/reference", body)
+    assert (code, "root" in said["error"]) == (422, False)
+    assert answer(bench, "POST", "/setpoint", {"axis": "x", "value": 0.0})[0] == 200
+
+
 def test_unknown_too_large_and_wrong_method(bench: Bench):
     assert answer(bench, "GET", "/nowhere")[0] == 404
     assert answer(bench, "GET", "/mode")[0] == 405
@@ -63,6 +93,52 @@ def test_unknown_too_large_and_wrong_method(bench: Bench):
     code, said = answer(bench, "POST", "/waveform", {"axis": "x", "samples": samples})
     assert code == 422
     assert "at most" in said["error"]
+
+
+@pytest.mark.parametrize(("path", "body"), [
+    ("/reference", {"axis": "x", "reference": {"kind": "steps", "levels": [1.0], "dwell_s": 1e308}}),
+    ("/tune", {"axis": "x", "section": "controller", "values": {"prewarp_hz": 5e-324}}),
+    ("/tune", {"axis": "x", "section": "interlocks", "values": {"swing_ticks": HUGE}}),
+    ("/setpoint", {"axis": "x", "value": HUGE}),
+    ("/waveform", {"axis": "x", "samples": [0.0], "hold_ticks": HUGE}),
+    ("/controller", {"axis": "x", "controller": GOOD_CONTROLLER | {"gain": 10**4000}}),
+    ("/controller", EXPENSIVE["/controller"]),
+])  # fmt: skip
+def test_numbers_that_nothing_can_be_made_of(bench: Bench, path: str, body: dict[str, Any]):
+    code, said = answer(bench, "POST", path, body)
+    assert code == 422, said
+    assert 0 < len(said["error"]) < 2000
+
+
+def test_hostile_requests_are_refused_and_change_nothing(bench: Bench):
+    refused = 0
+    for path, body in hostile(seed=1, count=120):
+        commands = int(bench.blocks[-1].words[Word.COMMANDS_HEAD])
+        code, said = exchange(bench.client.path, "POST", path, body)
+        assert code in (200, 413, 422), (path, body[:300], said)
+        if code != 200:
+            refused += 1
+            assert len(json.loads(said)["error"]) < 2000
+            assert int(bench.blocks[-1].words[Word.COMMANDS_HEAD]) == commands
+    assert refused > 80
+    assert "Traceback" not in bench.log()
+    bench.client.post("/reload")  # back to the file, whatever was taken
+
+
+def test_more_silent_clients_than_there_are_connections(bench: Bench):
+    """None of them says anything, or all of what it has to say: whoever does speak is heard."""
+    with contextlib.ExitStack() as stack:
+        for number in range(3 * MAX_CONNECTIONS):
+            client = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            client.connect(str(bench.client.path))
+            if number % 2:
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    client.send(b"POST /mode HTTP/1.1\r\nContent-Length: 100\r\n\r\n{")
+        open_files = len(os.listdir(f"/proc/{bench.pid('service')}/fd"))
+        assert open_files < MAX_CONNECTIONS + 3 * BACKLOG  # one lot is just taken, another just closed
+        assert bench.client.get("/status")["state"] == "stopped"
+        bench.client.post("/stop")
+        bench.client.post("/reset")
 
 
 def test_the_socket_is_for_owner_and_group(bench: Bench):

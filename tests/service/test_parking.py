@@ -70,6 +70,20 @@ def test_a_loop_that_stands_still_is_killed(block, monkeypatch):
     assert loop.returncode == -signal.SIGKILL
 
 
+def test_a_number_in_the_block_is_not_believed(block, monkeypatch):
+    """Whoever wrote a process's number there: only the one that holds the claim is killed."""
+    monkeypatch.setattr(parking, "MARGIN_S", 0.05)
+    with subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE) as other:
+        with a_loop(block) as loop:
+            block.words[Word.LOOP_PID] = other.pid
+            loop.send_signal(signal.SIGSTOP)
+            parking._await_end(block, 0.05, 1000.0)
+        assert loop.returncode == -signal.SIGKILL
+        parking._await_end(block, 0.05, 1000.0)
+        assert other.poll() is None
+        other.stdin.close()
+
+
 def test_a_service_that_is_alive_is_left_alone(block):
     ended = threading.Event()
 

@@ -91,6 +91,18 @@ def test_two_unpaced_runs_are_equal_in_bytes_and_another_seed_is_not(tmp_path: P
     assert records[0] != records[2]
 
 
+def test_a_name_may_hold_what_patterns_and_markup_are_made_of(tmp_path: Path) -> None:
+    config = tmp_path / "lab[b]*.toml"
+    config.write_text(PAPER.read_text())
+    code, summary, _ = run(config, "--duration", "0.1", "--unpaced", "--out", tmp_path)
+    assert code == 0
+    assert Path(summary["recording"]).name.startswith("lab[b]*-")
+    assert summary["ticks_logged"] == 1000
+    out, err = start("info", summary["recording"]).communicate(timeout=TIMEOUT_S)
+    assert "lab[b]*" in out.replace("\n", "")
+    assert err == ""
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ramps_down_and_completes_the_recording(tmp_path: Path, number: signal.Signals) -> None:
     process = start("run", PAPER, "--out", tmp_path, "--json")

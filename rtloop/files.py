@@ -1,0 +1,61 @@
+"""Reading what a user names: regular files of a bounded size, and a message that tells nothing of what they hold."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+MAX_TEXT_BYTES = 1 << 20
+"""Of a configuration or a specification."""
+_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
+
+
+def read_regular(path: Path, limit_bytes: int) -> bytes:
+    """All of a regular file. Raises OSError for another kind of file and for one that is larger."""
+    return _contents(os.open(path, _READ), limit_bytes)
+
+
+def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
+    """All of a regular file in or below `folder`, reached through no link. Raises OSError."""
+    if relative.is_absolute() or ".." in relative.parts or not relative.parts:
+        raise OSError(errno.EACCES, "not below the configuration's folder, where alone files may be named")
+    fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        for part in relative.parts[:-1]:
+            above, fd = fd, os.open(part, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=fd)
+            os.close(above)
+        return _contents(os.open(relative.name, _READ | os.O_NOFOLLOW, dir_fd=fd), limit_bytes)
+    finally:
+        os.close(fd)
+
+
+def _contents(fd: int, limit_bytes: int) -> bytes:
+    """What `fd` holds, which is closed."""
+    with open(fd, "rb") as file:
+        status = os.fstat(fd)
+        if stat.S_ISDIR(status.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file")
+        data = file.read(limit_bytes + 1)
+        if len(data) > limit_bytes:
+            raise OSError(errno.EFBIG, f"{max(status.st_size, len(data))} bytes; at most {limit_bytes} are allowed")
+        return data
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text. Raises ValueError, which says where it is none and quotes no more than a character."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"not valid TOML: {_QUOTED.sub('…', str(error))}") from None
+    except ValueError:  # the interpreter's own limit, whose message is about the interpreter
+        raise ValueError("not valid TOML: an integer of more digits than any number here has") from None
+    except RecursionError:
+        raise ValueError("not valid TOML: nested too deeply") from None

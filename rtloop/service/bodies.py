@@ -1,0 +1,94 @@
+"""Bodies of requests: what may be in one, how large, how many, how deep. Whatever enters is bounded here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field
+
+from hil.options import LARGEST_INTEGER
+from rtloop.config import ModeName
+from rtloop.references import MAX_HOLD_TICKS
+
+MAX_BODY_BYTES = 4 << 20
+MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
+"""Of settings: values in all, tables and lists within each other, and of a text."""
+
+
+def _bounded(settings: dict[str, Any]) -> dict[str, Any]:
+    """`settings`. Raises ValueError for what is too much for a section of a configuration."""
+    for count, (depth, value) in enumerate(_values(settings, 1), start=1):
+        if count > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES} values; fewer are allowed")
+        if depth > MAX_DEPTH:
+            raise ValueError(f"more than {MAX_DEPTH} tables and lists within each other; fewer are allowed")
+        if isinstance(value, str) and len(value) > MAX_CHARACTERS:
+            raise ValueError(f"a text of {len(value)} characters; at most {MAX_CHARACTERS} are allowed")
+        if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+            raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; smaller ones are allowed")
+    return settings
+
+
+def _values(node: Any, depth: int) -> Iterator[tuple[int, Any]]:
+    """Everything in `node` with its depth; nothing from below MAX_DEPTH."""
+    yield depth, node
+    if depth <= MAX_DEPTH and isinstance(node, dict | list):
+        for key in node if isinstance(node, dict) else ():
+            yield depth, key
+        for value in node.values() if isinstance(node, dict) else node:
+            yield from _values(value, depth + 1)
+
+
+Settings = Annotated[dict[str, Any], AfterValidator(_bounded)]
+Name = Annotated[str, Field(max_length=100)]
+
+
+class Body(BaseModel):
+    """Base of request bodies."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class ModeBody(Body):
+    """A mode for all axes."""
+
+    mode: ModeName
+
+
+class ReferenceBody(Body):
+    """A reference as in [axis.reference]; the file of a table lies in or below the configuration's folder."""
+
+    axis: Name
+    reference: Settings
+
+
+class SetpointBody(Body):
+    """A constant reference, µm (V in raw mode)."""
+
+    axis: Name
+    value: float
+
+
+class WaveformBody(Body):
+    """Samples, `hold_ticks` ticks each."""
+
+    axis: Name
+    samples: Annotated[list[float], FailFast(), Field(min_length=1)]
+    hold_ticks: int = Field(default=1, ge=1, le=MAX_HOLD_TICKS)
+    repeat: bool = False
+
+
+class TuneBody(Body):
+    """Keys of [axis.SECTION] to change."""
+
+    axis: Name
+    section: Name
+    values: Annotated[Settings, Field(min_length=1)]
+
+
+class ControllerBody(Body):
+    """A whole [axis.controller]."""
+
+    axis: Name
+    controller: Settings

@@ -1,0 +1,160 @@
+"""Another law, built in a process of its own: one that takes too long is killed, and whoever asked is told.
+
+The process is started once and waits, so that nobody waits for its imports; a killed one is replaced by the next that
+is needed. It reads pickled configurations on its stdin and writes pickled answers to its stdout, and ends with its
+stdin: with the service.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import select
+import struct
+import subprocess
+import sys
+import threading
+import time
+from typing import IO, Any
+
+from drivers.errors import DriverError
+from rtloop.config import Configuration
+from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.prepare import Prepared, prepare
+
+BUILD_S = 10.0
+"""A law that is not built and verified within this is refused."""
+START_S = 120.0
+_LENGTH = struct.Struct("<Q")
+
+
+class Builder:
+    """Builds one configuration at a time; thread-safe."""
+
+    def __init__(self, build_s: float = BUILD_S) -> None:
+        self.build_s = build_s
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._ready = False
+
+    @property
+    def pid(self) -> int | None:
+        """Of its process; None where none runs."""
+        return None if self._process is None else self._process.pid
+
+    def start(self) -> None:
+        """Start the process where none runs, without waiting for it."""
+        if self._process is not None and self._process.poll() is None:
+            return
+        self.end()
+        self._ready = False
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "rtloop.service.building"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            process_group=0,
+            bufsize=0,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        )
+
+    def prepare(self, configuration: Configuration) -> Prepared:
+        """As `rtloop.prepare.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
+        with self._lock:
+            self.start()
+            if not self._ready:
+                self._answer(START_S)
+                self._ready = True
+            self._send(pickle.dumps(configuration))
+            kind, value = self._answer(self.build_s)
+        if kind == "prepared":
+            return value
+        if kind == "faults":
+            raise ConfigError(configuration.name, value)
+        raise DriverError(value) if kind == "driver" else RtloopError(value)
+
+    def end(self) -> None:
+        """Kill the process, if there is one."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(BrokenPipeError):
+                        pipe.close()
+            self._process = None
+
+    def _send(self, data: bytes) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it died: its answer does not come
+            _write(self._process.stdin, data)
+
+    def _answer(self, limit_s: float) -> tuple[str, Any]:
+        """What the process says within `limit_s`; it is killed where it says nothing. Raises UnavailableError."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        fd, deadline_s = self._process.stdout.fileno(), time.monotonic() + limit_s
+        data = bytearray()
+        while len(data) < _LENGTH.size or len(data) < _LENGTH.size + _LENGTH.unpack_from(data)[0]:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0 or not select.select([fd], [], [], left_s)[0]:
+                self.end()
+                raise UnavailableError(f"building the law took longer than {limit_s:g} s and was given up")
+            part = os.read(fd, 1 << 20)
+            if not part:
+                self.end()
+                raise UnavailableError("building the law: its process died")
+            data += part
+        return pickle.loads(data[_LENGTH.size :])
+
+
+def _write(pipe: IO[bytes], data: bytes) -> None:
+    """All of `data` behind its length, whatever a single write takes."""
+    left = memoryview(_LENGTH.pack(len(data)) + data)
+    while left:
+        left = left[pipe.write(left) :]
+
+
+_builder = Builder()
+
+
+def prepare_limited(configuration: Configuration) -> Prepared:
+    """Prepare a change of a service in the process beside it. Raises as `Builder.prepare`."""
+    return _builder.prepare(configuration)
+
+
+@contextlib.contextmanager
+def builder_ready() -> Any:
+    """The process beside the service, warm before it is needed."""
+    _builder.start()
+    try:
+        yield
+    finally:
+        _builder.end()
+
+
+def _build(configuration: Configuration) -> tuple[str, Any]:
+    """Kind and value of an answer."""
+    try:
+        return "prepared", prepare(configuration)
+    except ConfigError as error:
+        return "faults", error.faults
+    except DriverError as error:
+        return "driver", str(error)
+    except ArithmeticError as error:
+        return "faults", [f"its numbers cannot be computed with ({error})"]
+
+
+def main() -> None:
+    """Answer until stdin ends."""
+    answers = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)  # what a library prints goes where messages go
+    _write(answers, pickle.dumps(("ready", None)))
+    while len(length := sys.stdin.buffer.read(_LENGTH.size)) == _LENGTH.size:
+        data = sys.stdin.buffer.read(_LENGTH.unpack(length)[0])
+        _write(answers, pickle.dumps(_build(pickle.loads(data))))
+
+
+if __name__ == "__main__":
+    main()

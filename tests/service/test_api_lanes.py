@@ -1,0 +1,69 @@
+"""Who waits for whom: requests that bring the outputs to rest wait for nobody. The service is a stand-in."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import Any
+
+import pytest
+
+from rtloop.service.api import application
+
+PATIENCE_S = 20.0
+MANY = 60
+
+
+class Stuck:
+    """A service whose ordinary work does not come back until it is let go."""
+
+    def __init__(self) -> None:
+        self.let_go = threading.Event()
+        self.stopped = 0
+
+    def reload_now(self) -> dict[str, Any]:
+        self.let_go.wait()
+        return {}
+
+    start = reload_now
+
+    def stop(self) -> int:
+        self.stopped += 1
+        return self.stopped
+
+    reset = stop
+
+
+async def post(app: Any, path: str) -> int:
+    """The status of an answer, asked for without a socket."""
+    sent: list[Any] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {"type": "http", "method": "POST", "path": path, "raw_path": path.encode(), "root_path": "",
+             "query_string": b"", "headers": [], "http_version": "1.1", "scheme": "http"}  # fmt: skip
+    await app(scope, receive, send)
+    return sent[0]["status"]
+
+
+@pytest.mark.parametrize("path", ["/reload", "/start"])
+def test_stop_and_reset_wait_for_nobody(path):
+    async def crowd() -> list[int]:
+        stuck = Stuck()
+        app = application(stuck)  # type: ignore[arg-type]
+        waiting = [asyncio.create_task(post(app, path)) for _ in range(MANY)]
+        await asyncio.sleep(0)
+        try:
+            said = [await asyncio.wait_for(post(app, path), PATIENCE_S) for path in ("/stop", "/reset")]
+        finally:
+            stuck.let_go.set()
+        answers = await asyncio.gather(*waiting)
+        assert stuck.stopped == 2
+        assert set(answers) == {200, 503}  # more than may wait are told so at once
+        return said
+
+    assert asyncio.run(crowd()) == [200, 200]
