@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import IO, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from drivers.errors import DriverError
@@ -64,7 +65,7 @@ def print_summary(summary: dict[str, Any]) -> None:
     if "ticks_logged" not in summary:
         console.print(f"nothing recorded in {summary.get('recording')}")
         return
-    console.print(f"[bold]{summary['recording']}[/]  {_size(summary)}")
+    console.print(f"[bold]{escape(summary['recording'])}[/]  {_size(summary)}")
     table = _table("", "", "")
     expected = summary["ticks_expected"]
     table.add_row(
@@ -81,7 +82,7 @@ def print_summary(summary: dict[str, Any]) -> None:
     if len(summary["parts"]) > 1:
         table.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
     for problem in summary["problems"]:
-        table.add_row("[red]problem[/]", "", problem)
+        table.add_row("[red]problem[/]", "", escape(problem))
     for trip in summary["trips"]:
         table.add_row("[red]trip[/]", f"tick {trip['tick']}", ", ".join(trip["causes"]))
     console.print(table)
@@ -153,7 +154,8 @@ def print_drivers() -> None:
 
 
 def _size(summary: dict[str, Any]) -> str:
-    return f"{summary['size_bytes'] / 2**20:.1f} MiB, {summary['bytes_per_tick']:.1f} bytes a tick"
+    each = summary["bytes_per_tick"]
+    return f"{summary['size_bytes'] / 2**20:.1f} MiB" + ("" if each is None else f", {each:.1f} bytes a tick")
 
 
 def _scheduling(realtime: dict[str, Any]) -> str:

@@ -24,7 +24,7 @@ from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK
 from tests.recording.forging import TICKS, Base, Forgery, bases, forged, packed
 
 SECONDS = 30
-CODES = (0, 1, 66, 73)
+CODES = (0, 1, 66, 73, 78)
 SHORT_TAGS = 15
 COMMANDS = ("set_mode", "reset_trip", "stop", "load_law")
 USES: dict[str, list[str]] = {

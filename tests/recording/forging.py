@@ -16,13 +16,13 @@ from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
 from rtloop.recording import format
 from rtloop.recording import session as session_module
 from rtloop.recording.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
 from rtloop.recording.contents import Message, split_messages
 from rtloop.recording.reader import Reader
 from rtloop.recording.session import Options, Session
+from tests.recording.law_fields import COUNTS, fields_of
 from tests.recording.real_loop import TWO_AXES, RealLoop, changed
 
 Random = np.random.Generator
@@ -38,7 +38,6 @@ NASTY: tuple[Any, ...] = (
     *([], {}, [1, 2], ["x", "x"], [None], {"x": {}}, [[0, 1, 2]]),
 )
 NUMBERS = (0.0, -0.0, 1.0, -1.0, 3.0, 1e-310, 1e9, 1e19, -1e19, 1e308, np.nan, np.inf, -np.inf, 0.5, 4294967296.0)
-COUNTS = (-(2**63), -(2**31), -129, -2, -1, 0, 1, 2, 3, 4, 5, 25, 65, 129, 255, 4_000, 2**31, 2**62, 2**63 - 1)
 JUNK = (b"", b"{", b"null", b"[]", b"\xff\xfe", b'{"tick":1}', b"[" * DEEP, b'{"a":' * DEEP, b"1" * 5_000, b"\0" * 64)
 
 
@@ -88,18 +87,6 @@ class Base(NamedTuple):
             (i, j) for i, chunk in enumerate(self.chunks) for j, one in enumerate(chunk.messages)
             if one.channel == channel
         ]  # fmt: skip
-
-    @property
-    def places(self) -> list[tuple[str, np.dtype[Any], int]]:
-        """Name, type and offset in a snapshot of every field of every record of the law."""
-        offset, places = 8, [("tick", np.dtype("<u8"), 0)]
-        tables = [(axis, COEFFICIENTS) for axis in self.header["axes"]]
-        tables += [(axis, STATE) for axis in self.header["axes"]] + [("loop", LOOP_STATE)]
-        for owner, table in tables:
-            for name, (dtype, start, *_) in (table.fields or {}).items():
-                places.append((f"{owner}.{name}", dtype, offset + start))
-            offset += table.itemsize
-        return places
 
 
 def bases(folder: Path) -> list[Base]:
@@ -225,7 +212,7 @@ def forge_snapshot(base: Base, random: Random) -> Forgery:
     """A number in a snapshot (or the same in all of them), its length, or its tick."""
     places = base.messages(format.LAW)
     chosen = places if random.random() < 0.2 else [_any(places, random)]
-    name, dtype, offset = _any(base.places, random)
+    name, dtype, offset = _any(fields_of(base.header["axes"]), random)
     start = offset + int(random.integers(max(int(np.prod(dtype.shape)), 1))) * dtype.base.itemsize
     value = np.array(_any(NUMBERS if dtype.base.kind == "f" else COUNTS, random))
     shorter = random.random() < 0.03

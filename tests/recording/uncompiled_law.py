@@ -1,14 +1,13 @@
 """The law without its compiler, on forged snapshots: numpy raises where the compiled kernels would write anywhere.
 
-Run as a module with NUMBA_DISABLE_JIT=1; prints how many snapshots were accepted and refused, and how many of each,
-with the check taken out, reach beyond an array.
+Run as a module with NUMBA_DISABLE_JIT=1 and a good snapshot of one axis on stdin; prints how many snapshots were
+accepted and refused, and how many of each, with the check taken out, reach beyond an array.
 """
 
 from __future__ import annotations
 
 import json
-import tempfile
-from pathlib import Path
+import sys
 from unittest.mock import patch
 
 import numpy as np
@@ -17,8 +16,7 @@ from rtloop.law import layout
 from rtloop.law.law import evaluate, update
 from rtloop.law.layout import CONDITIONS, records
 from rtloop.signals import Mode
-from tests.recording.forging import COUNTS, bases
-from tests.recording.forging import format as recording_format
+from tests.recording.law_fields import COUNTS, fields_of
 
 TICKS, SEED, TRIES = 2, 3, 400
 
@@ -52,11 +50,8 @@ def main() -> None:
     """Forge whole numbers of a good snapshot."""
     random, counts = np.random.default_rng(SEED), {"accepted": 0, "refused": 0}
     beyond = {"accepted": 0, "refused": 0}
-    with tempfile.TemporaryDirectory() as folder:
-        base = bases(Path(folder))[0]
-    i, j = base.messages(recording_format.LAW)[1]
-    whole = base.chunks[i].messages[j].payload[32:]
-    fields = [place for place in base.places if place[1].base.kind in "iu"]
+    whole = sys.stdin.buffer.read()
+    fields = [field for field in fields_of(["x"]) if field.dtype.base.kind in "iu"]
     for number in range(TRIES):
         data = bytearray(whole)
         _, dtype, start = fields[number % len(fields)]
