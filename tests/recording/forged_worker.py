@@ -26,7 +26,8 @@ from tests.recording.forging import TICKS, Base, Forgery, bases, forged, packed
 SECONDS = 30
 CODES = (0, 1, 66, 73, 78)
 SHORT_TAGS = 15
-COMMANDS = ("set_mode", "reset_trip", "stop", "load_law")
+COMMANDS = {"set_mode": ("value",), "reset_trip": (), "stop": (), "load_law": ("axis", "value")}
+"""Kinds that a replay executes, and what the loop looks at in each."""
 USES: dict[str, list[str]] = {
     "info": ["info", "run.mcap", "--json"],
     "info, words": ["info", "run.mcap"],
@@ -65,7 +66,10 @@ def executed(path: Path, axes: int) -> Executed:
             elif channel.topic == "/events":
                 event = json.loads(message.data)
                 if event["kind"] in COMMANDS:
-                    found.commands.append((event["tick"], event["kind"], event["axis"], event["what"]["values"][0]))
+                    obeyed = {"axis": event["axis"], "value": event["what"]["values"][0]}
+                    found.commands.append(
+                        (event["tick"], event["kind"], *(obeyed[key] for key in COMMANDS[event["kind"]]))
+                    )
     return found
 
 
