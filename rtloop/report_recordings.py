@@ -34,8 +34,7 @@ def print_replay(path: Path, report: ReplayReport) -> None:
     _print_problems(console, report.problems)
     for entry in report.not_verified:
         console.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
-    for what in report.not_judged:
-        console.print(f"not judged: {what}")
+    console.print(f"not judged: {'; '.join(report.not_judged)}")
     checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
     name, found = escape(str(path)), report.first_difference
     if report.identical:

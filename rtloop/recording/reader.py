@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from rtloop.recording import format
+from rtloop.recording.account import Account
 from rtloop.recording.checked import Malformed, event_from
 from rtloop.recording.chunks import Entry, Source, indexed_chunks, scanned_chunks
 from rtloop.recording.container import DamagedChunk, unpack_chunk
@@ -123,7 +124,7 @@ class Reader:
         `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
         """
         wanted = self._known(self.columns if names is None else names)
-        account = _Account(self)
+        account = Account(self.first_tick, self.totals)
         for entry, future in self._ahead(self.tick_chunks if entries is None else entries, wanted):
             try:
                 ticks = future.result()
@@ -133,7 +134,7 @@ class Reader:
             except DamagedChunk as reason:
                 self._leave_out(entry, reason)
         if entries is None:
-            account.close()
+            self._close(account)
 
     def snapshots(self) -> Iterator[Snapshot]:
         """The snapshots of the law, in order, each verified by its digest."""
@@ -143,12 +144,12 @@ class Reader:
             if tick > before:
                 yield Snapshot(tick, data)
             else:
-                self.report(f"snapshots of the law are out of order: that of tick {tick} comes after {before}")
+                self._report(f"snapshots of the law are out of order: that of tick {tick} comes after {before}")
             before = max(before, tick)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Each chunk in the order of the file: either its ticks or its messages of the slow topics."""
-        account = _Account(self)
+        account = Account(self.first_tick, self.totals)
         for entry in self._entries:
             try:
                 content = self._content(entry)
@@ -160,7 +161,7 @@ class Reader:
                     yield None, self._checked(split_messages(content))
             except DamagedChunk as reason:
                 self._leave_out(entry, reason)
-        account.close()
+        self._close(account)
 
     @cached_property
     def events(self) -> list[Event]:
@@ -233,42 +234,22 @@ class Reader:
                     _require_digest(message)
                 good.append(message)
             except Malformed as reason:
-                self.report(str(reason) if message.channel == format.LAW else f"an event is malformed: {reason}")
+                self._report(str(reason) if message.channel == format.LAW else f"an event is malformed: {reason}")
         return good
 
     def _leave_out(self, entry: Entry, reason: DamagedChunk) -> None:
-        self.report(f"the chunk at byte {entry.offset} is damaged ({reason})")
+        self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
-    def report(self, problem: str) -> None:
-        """Raise RecordingError, or note that something is left out."""
+    def _close(self, account: Account) -> None:
+        if account.shortage and not self.left_out:
+            self._report(account.shortage)
+
+    def _report(self, problem: str) -> None:
         if not self.tolerant:
             raise RecordingError(f"{self.path}: {problem}; `rtloop recover` keeps what is whole")
         for problems in (self.problems, self.left_out):
             if problem not in problems:
                 problems.append(problem)
-
-
-class _Account:
-    """Ticks that were read from a file: each once, in order, as many as its recorder counted."""
-
-    def __init__(self, reader: Reader) -> None:
-        self._reader, self._totals = reader, reader.totals
-        self._next, self._count = reader.first_tick, 0
-        self._end = self._totals["ticks_executed"] if self._totals else LARGEST
-
-    def add(self, ticks: Ticks) -> None:
-        """Count a chunk. Raises DamagedChunk where it does not come next."""
-        if ticks.first < self._next:
-            raise DamagedChunk(f"out of order: tick {ticks.first}, where {self._next} or a later one comes next")
-        if ticks.last >= self._end:
-            raise DamagedChunk(f"out of order: tick {ticks.last}, but the run ended before tick {self._end}")
-        self._next = ticks.last + 1
-        self._count += len(ticks.rows)
-
-    def close(self) -> None:
-        """Report what is missing."""
-        if self._totals and self._count != self._totals["ticks_logged"] and not self._reader.left_out:
-            self._reader.report(f"it holds {self._count} of the {self._totals['ticks_logged']} ticks that were written")
 
 
 def _tick_of(snapshot: Message) -> int:

@@ -15,9 +15,8 @@ import traceback
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from click.testing import CliRunner
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader
 
 from rtloop.cli import main
 from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK
@@ -55,10 +54,10 @@ class Hang(BaseException):
 
 
 def executed(path: Path, axes: int) -> Executed:
-    """What of a file a replay executes and compares, by the stock reader."""
+    """What of a file a replay executes and compares, by the stock reader, which goes through it without its index."""
     found = Executed([], [], [])
     with path.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+        for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if channel.topic == "/ticks":
                 found.ticks.append(_compared(message.data, axes))
             elif channel.topic == "/law":
@@ -120,9 +119,8 @@ def _wrongly_identical(forgery: Forgery, path: Path, base: Base, original: Execu
         found = executed(path, len(base.header["axes"]))
     except Exception:  # the stock reader has many ways to give up
         return forgery.renewed
-    if forgery.origin:
-        found = found._replace(snapshots=original.snapshots)
-    return found != original
+    kept = forgery.origin or set(found.snapshots) <= set(original.snapshots)  # one less is compared, and no tick
+    return not kept or (found.ticks, found.commands) != (original.ticks, original.commands)
 
 
 def _hang(*_: object) -> None:
@@ -151,5 +149,4 @@ def run(folder: Path, first: int, count: int, every: int) -> None:
 
 
 if __name__ == "__main__":
-    np.seterr(all="warn")
     run(Path(sys.argv[1]), *map(int, sys.argv[2:5]))

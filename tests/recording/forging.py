@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -128,8 +129,10 @@ def _taken_apart(path: Path) -> Base:
         return Base(reader.header, chunks, format.tick_dtype(reader.columns))
 
 
-def packed(base: Base, first: bytes | None = None) -> bytes:
-    """The file; `first`: content of its first chunk."""
+def packed(
+    base: Base, first: bytes | None = None, forge: Callable[[list[ChunkIndex]], object] = lambda index: None
+) -> bytes:
+    """The file; `first`: content of its first chunk; `forge` may change the index."""
     start = first_chunk(base.header, base.header["columns"]) if first is None else first
     compressor, index = zstandard.ZstdCompressor(level=1), []
     data = MAGIC + pack_records([Header(format.PROFILE, format.LIBRARY)])
@@ -139,6 +142,7 @@ def packed(base: Base, first: bytes | None = None) -> bytes:
         size = len(chunk) - CHUNK_HEAD.size
         index.append(ChunkIndex(len(chunk), len(data), "zstd", size, LATE, 0, places, 0, len(content)))
         data += chunk
+    forge(index)
     repeated = [*format.schemas(base.header["columns"]), *format.channels()]
     statistics = Statistics(0, 4, {}, len(index), 0, 0, 0, 0, 3)
     return data + pack_end(0, len(data), repeated, statistics, pack_records(index))
@@ -234,7 +238,9 @@ def forge_ticks(base: Base, random: Random) -> Forgery:
     records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
     name, row = _any(base.dtype.names or (), random), int(random.integers(len(records)))
     if base.dtype[name].kind == "f":
-        value = _any(NUMBERS, random) if random.random() < 0.8 else np.nextafter(records[name][row], np.inf)
+        value = _any(NUMBERS, random)
+        if random.random() < 0.2:  # the next double
+            value = (records[name][row : row + 1].view(np.uint64) + np.uint64(1)).view(np.float64)[0]
     else:
         value = np.array(_any(COUNTS, random)).astype(base.dtype[name])
     records[name][row] = value
@@ -268,6 +274,23 @@ def forge_order(base: Base, random: Random) -> Forgery:
     return Forgery(what, packed(base._replace(chunks=chunks)))
 
 
+def forge_index(base: Base, random: Random) -> Forgery:
+    """An entry of the index changed, left out, or put in twice."""
+    place, kind = int(random.integers(len(base.chunks) + 1)), int(random.integers(3))
+    names = {field.name for field in fields(ChunkIndex)} - {"compression", "message_index_offsets"}
+    name = _any(sorted(names), random)
+    value = int(_any([count for count in COUNTS if count >= 0], random))
+
+    def forge(index: list[ChunkIndex]) -> None:
+        if kind == 0:
+            index[place] = replace(index[place], **{name: value})
+        else:
+            index[place : place + 1] = [index[place]] * (kind - 1) * 2
+
+    what = (f"{name}: {value}", "left out", "twice")[kind]
+    return Forgery(f"index {place} {what}", packed(base, forge=forge))
+
+
 def damage(base: Base, random: Random) -> Forgery:
     """A byte of the file flipped, or the file cut off."""
     data = bytearray(packed(base))
@@ -280,7 +303,7 @@ def damage(base: Base, random: Random) -> Forgery:
 
 KINDS: tuple[tuple[Callable[[Base, Random], Forgery], float], ...] = (
     *((forge_header, 0.2), (forge_event, 0.2), (forge_snapshot, 0.25), (forge_ticks, 0.15)),
-    *((forge_bytes, 0.1), (forge_order, 0.05), (damage, 0.05)),
+    *((forge_bytes, 0.1), (forge_order, 0.03), (forge_index, 0.03), (damage, 0.04)),
 )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.recording.forged_worker import CODES
 
 ROOT = Path(__file__).resolve().parents[2]
-COUNT, EVERY = 80, 20
+COUNT, EVERY = 40, 20
 MOST_MIB = 600
 
 

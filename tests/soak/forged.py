@@ -39,6 +39,7 @@ class Table:
             self.counts[use][f"exit {outcome}" if good else outcome.split()[0]] += 1
             if not good:
                 self.wrong.append(f"{line['number']} ({what}): {use}: {outcome}")
+                print(self.wrong[-1], flush=True)
 
     def show(self) -> None:
         """Command by command."""
