@@ -23,15 +23,10 @@ from rtloop.recording.replay import replay
 from rtloop.recording.summary import summarise
 from rtloop.replaying import replay_on_the_rig
 from rtloop.running import recover_leftovers
-from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, bases, first_chunk, packed
+from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed
 from tests.recording.law_fields import fields_of
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
-    return bases(tmp_path_factory.mktemp("untrusted"))[0]
 
 
 def with_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:

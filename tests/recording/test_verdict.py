@@ -15,12 +15,7 @@ from rtloop.recording import format
 from rtloop.recording.load import load
 from rtloop.recording.replay import ReplayReport, replay
 from rtloop.recording.summary import summarise
-from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, bases, first_chunk, packed
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
-    return bases(tmp_path_factory.mktemp("verdict"))[0]
+from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, packed
 
 
 @pytest.fixture
