@@ -126,9 +126,12 @@ class _Replay:
 
     def _end(self, expected: int) -> None:
         """Hold what was found against what the files say that they hold."""
-        self._pass_left_out()
         totals = [extent.totals for extent in self._recording.extents]
         last = totals[-1]
+        for snapshot in [] if self._next is None else [self._next, *self._snapshots]:
+            if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
+                self._report.pass_over(None, None, f"a snapshot of the law at tick {snapshot.tick}, behind the end")
+        self._pass_left_out()
         if last is None:
             self._report.pass_over(expected, None, "the recording states no end; `rtloop recover` completes it")
             return

@@ -18,13 +18,15 @@ from typing import Any, NamedTuple
 from click.testing import CliRunner
 from mcap.reader import NonSeekingReader
 
+from rtloop import signals
 from rtloop.cli import main
-from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK
+from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK, axis_column
 from tests.recording.forging import TICKS, Base, Forgery, bases, forged, packed
 
 SECONDS = 30
 CODES = (0, 1, 66, 73, 78)
 SHORT_TAGS = 15
+COMPUTED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 COMMANDS = {"set_mode": ("value",), "reset_trip": (), "stop": (), "load_law": ("axis", "value")}
 """Kinds that a replay executes, and what the loop looks at in each."""
 USES: dict[str, list[str]] = {
@@ -73,10 +75,11 @@ def executed(path: Path, axes: int) -> Executed:
 
 
 def _compared(data: bytes, axes: int) -> bytes:
-    """Tick, flags, mode and what belongs to the axes, from the fields of a message: a tag, then eight bytes."""
+    """Tick, mode and what the law computes, from the fields of a message: a tag, then eight bytes."""
     tags = [1 if field < SHORT_TAGS else 2 for field in range(COMMON_COUNT + axes * PER_AXIS_COUNT)]
     starts = [sum(tags[: field + 1]) + 8 * field for field in range(len(tags))]
-    return b"".join(data[starts[field] : starts[field] + 8] for field in (TICK, MODE, *range(COMMON_COUNT, len(tags))))
+    computed = [axis_column(axis, signal) for axis in range(axes) for signal in COMPUTED]
+    return b"".join(data[starts[field] : starts[field] + 8] for field in (TICK, MODE, *computed))
 
 
 def use(forgery: Forgery, folder: Path, names: list[str], base: Base, original: Executed) -> dict[str, str]:

@@ -148,6 +148,17 @@ def packed(
     return data + pack_end(0, len(data), repeated, statistics, pack_records(index))
 
 
+def with_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:
+    """The file with one number of a snapshot replaced."""
+    i, j = base.messages(format.LAW)[which]
+    messages = base.chunks[i].messages
+    data = bytearray(messages[j].payload[DIGEST_BYTES:])
+    dtype, start = next((dtype.base, start) for name, dtype, start in fields_of(base.header["axes"]) if name == field)
+    data[start : start + dtype.itemsize] = np.array([value]).astype(dtype).tobytes()
+    messages[j] = messages[j]._replace(payload=hashlib.sha256(data).digest() + data)
+    return packed(base.with_chunk(i, base.chunks[i].with_messages(messages)))
+
+
 def first_chunk(header: dict[str, Any] | bytes, columns: Any) -> bytes:
     payload = header if isinstance(header, bytes) else json.dumps(header).encode()
     records: list[Schema | Channel] = [*format.schemas(columns), *format.channels()]

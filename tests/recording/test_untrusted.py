@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -23,21 +22,9 @@ from rtloop.recording.replay import replay
 from rtloop.recording.summary import summarise
 from rtloop.replaying import replay_on_the_rig
 from rtloop.running import recover_leftovers
-from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed
-from tests.recording.law_fields import fields_of
+from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed, with_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def with_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:
-    """The file with one number of a snapshot replaced."""
-    i, j = base.messages(format.LAW)[which]
-    messages = base.chunks[i].messages
-    data = bytearray(messages[j].payload[DIGEST_BYTES:])
-    dtype, start = next((dtype.base, start) for name, dtype, start in fields_of(base.header["axes"]) if name == field)
-    data[start : start + dtype.itemsize] = np.array([value]).astype(dtype).tobytes()
-    messages[j] = messages[j]._replace(payload=hashlib.sha256(data).digest() + data)
-    return packed(base.with_chunk(i, base.chunks[i].with_messages(messages)))
 
 
 def with_event(base: Base, kind: str, change: Any) -> bytes:

@@ -15,7 +15,7 @@ from rtloop.recording import format
 from rtloop.recording.load import load
 from rtloop.recording.replay import ReplayReport, replay
 from rtloop.recording.summary import summarise
-from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, packed
+from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, packed, with_snapshot
 
 
 @pytest.fixture
@@ -134,6 +134,12 @@ def test_early_snapshots_that_are_gone(base: Base, path: Path):
     report = refused(path)
     assert (report.unverified, ranges(report.not_verified[0])) == (200, {"first_tick": 0, "count": 200})
     assert report.ticks == TICKS - 200
+
+
+@pytest.mark.parametrize("which", [3, 4])
+def test_a_snapshot_that_is_put_behind_the_end(which: int, base: Base, path: Path):
+    path.write_bytes(with_snapshot(base, "tick", 4_000, which))
+    assert any("4000" in entry["why"] for entry in refused(path).not_verified)
 
 
 def test_a_recording_that_states_no_end(base: Base, path: Path):
