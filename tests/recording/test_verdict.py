@@ -136,6 +136,13 @@ def test_early_snapshots_that_are_gone(base: Base, path: Path):
     assert report.ticks == TICKS - 200
 
 
+def test_an_index_that_leaves_a_chunk_out_is_not_used(base: Base, path: Path):
+    path.write_bytes(packed(base, forge=lambda index: index.pop(3)))
+    report = replay(load(path))
+    assert any("chunk index" in problem for problem in report.problems)
+    assert (report.identical, report.ticks, report.snapshots) == (True, TICKS, 4)
+
+
 @pytest.mark.parametrize("which", [3, 4])
 def test_a_snapshot_that_is_put_behind_the_end(which: int, base: Base, path: Path):
     path.write_bytes(with_snapshot(base, "tick", 4_000, which))
