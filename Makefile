@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # Tests that compute, two at a time; the others start processes and wait for clocks, and come one after the other.
 COMPUTING := tests/law tests/hil tests/design tests/benchmarks
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -54,6 +54,10 @@ bench: $(VENV)/.bench
 # Killed runs, damaged files, other processors, an hour at 10 kHz: about half an hour, 2 GB in the temporary folder.
 soak-recordings: $(READY)
 	$(BIN)/python -m tests.soak.recordings
+
+# Ten thousand forged recordings through every command: half an hour to an hour.
+soak-forged: $(READY)
+	$(BIN)/python -m tests.soak.forged
 
 # Identification on 50 rigs drawn at random, three times: about ten minutes.
 soak-identification: $(READY)

@@ -154,7 +154,8 @@ def print_drivers() -> None:
 
 
 def _size(summary: dict[str, Any]) -> str:
-    return f"{summary['size_bytes'] / 2**20:.1f} MiB, {summary['bytes_per_tick']:.1f} bytes a tick"
+    each = summary["bytes_per_tick"]
+    return f"{summary['size_bytes'] / 2**20:.1f} MiB" + ("" if each is None else f", {each:.1f} bytes a tick")
 
 
 def _scheduling(realtime: dict[str, Any]) -> str:

@@ -27,22 +27,33 @@ STEP_METRICS = (
 
 
 def print_replay(path: Path, report: ReplayReport) -> None:
-    """The verdict, the gaps, the first difference."""
+    """The verdict, the gaps, what is not verified and what cannot be, the first difference."""
     console = _console()
     for gap in report.gaps:
         console.print(f"gap: {gap['count']} ticks from tick {gap['first_tick']} on are not in the recording")
     _print_problems(console, report.problems)
-    if report.unverified:
-        console.print(f"{report.unverified:,} ticks before the next snapshot of the law were passed over")
+    for entry in report.not_verified:
+        console.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
+    console.print(f"not judged: {'; '.join(report.not_judged)}")
     checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
-    if report.first_difference is None:
-        console.print(f"[green]identical[/]: {_name(path)}: {checked} compared in bytes")
-        return
-    found = report.first_difference
-    console.print(
-        f"[red]different[/]: {_name(path)}: tick {found['tick']}, {found['signal']}: recorded {found['recorded']!r}, "
-        f"replayed {found['replayed']!r} ({checked} compared)"
-    )
+    name, found = _name(path), report.first_difference
+    if report.identical:
+        console.print(f"[green]identical[/]: {name}: {checked} compared in bytes")
+    elif found is None:
+        console.print(f"[red]not verified as a whole[/]: {name}: no difference in {checked} compared in bytes")
+    else:
+        values = f"recorded {found['recorded']!r}, replayed {found['replayed']!r}"
+        console.print(
+            f"[red]different[/]: {name}: tick {found['tick']}, {found['signal']}: {values} ({checked} compared)"
+        )
+
+
+def _range(entry: dict[str, Any]) -> str:
+    """Which ticks are not verified, as far as they are known."""
+    first, count = entry["first_tick"], entry["count"]
+    if first is None:
+        return ""
+    return f"ticks from {first} on: " if count is None else f"{count:,} ticks from tick {first} on: "
 
 
 def print_differences(report: dict[str, Any]) -> None:
@@ -105,10 +116,10 @@ def _print_problems(console: Console, problems: list[str]) -> None:
         console.print(f"[red]problem[/]: {_name(problem)}")
 
 
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
+
+
 def _name(text: object) -> str:
     """As it is: brackets in the name of a file are no markup."""
     return escape(str(text))
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"

@@ -93,6 +93,8 @@ def recover_leftovers(folder: Path) -> None:
             click.echo(f"warning: {error}", err=True)
             continue
         click.echo(f"{report['output']}: {report['ticks']:,} ticks recovered from {part.name}, which is kept", err=True)
+        for problem in report["problems"]:
+            click.echo(f"warning: {part}: {problem}", err=True)
 
 
 @contextmanager

@@ -118,14 +118,18 @@ def plot(
 ) -> int:
     """Draw reference and position, error, drive, timing and events."""
     from rtloop.progress import Counter
+    from rtloop.recording.load import load
     from rtloop.recording.page import write_page
     from rtloop.recording.plot import plot as plot_recording
 
-    draw = write_page if html else plot_recording
+    draw, recording = write_page if html else plot_recording, load(files)
     with Counter("ticks read", sys.stderr) as counter:
         end_s = math.inf if end_s is None else end_s
-        picture = draw(files, out, start_s=start_s, end_s=end_s, progress=counter.show)
-    _show({"recording": str(files[0]), "output": str(picture)}, as_json, lambda _: click.echo(picture))
+        picture = draw(recording, out, start_s=start_s, end_s=end_s, progress=counter.show)
+    for problem in recording.problems:
+        click.echo(f"problem: {problem}", err=True)
+    report = {"recording": str(files[0]), "output": str(picture), "problems": recording.problems}
+    _show(report, as_json, lambda _: click.echo(picture))
     return 0
 
 

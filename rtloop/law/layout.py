@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rtloop.law.validity import COUNT, SWITCH, Allowed, Bits, require_allowed
+from rtloop.signals import TRIP_MASK, Flag, Mode
+
 REVISION = 2
 """Of what the law does with its memory. 1 kept the pre-filter's through changes of mode, and of sections alone."""
 LANES = 4
@@ -139,6 +142,31 @@ LOOP_STATE = np.dtype(
 )
 """State common to all axes: Mode; latched causes and those of this tick, as Flag bits; flags of this tick; 1 when
 every output is at its safe value."""
+TRIPS = Bits(sum(Flag) & TRIP_MASK)
+ALLOWED_COEFFICIENTS = {
+    "tap_count": Allowed(0, MAX_TAPS),
+    "section_count": Allowed(0, MAX_SECTIONS),
+    "play_count": Allowed(0, MAX_PLAYS, LANES),
+    "order": Allowed(0, MAX_ORDER, BLOCK),
+    "coupled": SWITCH,
+    "row_start": Allowed(0, MAX_ORDER),
+    "row_stop": Allowed(0, MAX_ORDER),
+    **dict.fromkeys(("frozen_ticks", "tracking_ticks", "oscillation_swings", "swing_ticks", "late_ticks"), COUNT),
+}
+ALLOWED_STATE = {
+    "entering": Allowed(0, 2),
+    "usable": SWITCH,
+    "swing_direction": Allowed(-1, 1),
+    **dict.fromkeys(("frozen_count", "tracking_count", "swing_age", "swing_count", "late_count"), COUNT),
+}
+ALLOWED_LOOP_STATE = {
+    "mode": Allowed(min(Mode), max(Mode)),
+    "trip": TRIPS,
+    "new_trip": TRIPS,
+    "tick_flags": Bits(sum(Flag)),
+    "settled": SWITCH,
+}
+"""What whole numbers may be in records that come from elsewhere; of `tap_index`, see `split_snapshot`."""
 CONDITIONS = np.dtype(
     [
         ("driver_status", np.int64),
@@ -179,9 +207,10 @@ def snapshot_bytes(axes: int) -> int:
 
 
 def split_snapshot(snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[int, Records, Records, Records]:
-    """Tick, coefficients, axes' state and loop state of a snapshot, as copies.
+    """Tick, coefficients, axes' state and loop state of a snapshot, as copies that the kernels can work on.
 
-    Raises ValueError where the length does not fit `axes`.
+    Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed; a
+    `tap_index` of -1 says that the taps are still to be filled.
     """
     data = bytes(snapshot)
     if len(data) != snapshot_bytes(axes):
@@ -190,7 +219,13 @@ def split_snapshot(snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[
     for dtype, count in ((COEFFICIENTS, axes), (STATE, axes), (LOOP_STATE, 1)):
         parts.append(copied(np.frombuffer(data, dtype, count, offset)))
         offset += count * dtype.itemsize
-    return int.from_bytes(data[:8], "little"), parts[0], parts[1], parts[2]
+    coefficients, states, loop = parts
+    for number, (axis, state) in enumerate(zip(coefficients, states, strict=True)):
+        require_allowed(f"axis {number}", axis, ALLOWED_COEFFICIENTS)
+        taps = Allowed(-1, max(int(axis["tap_count"]), 1) - 1)
+        require_allowed(f"axis {number}", state, {**ALLOWED_STATE, "tap_index": taps})
+    require_allowed("the loop", loop[0], ALLOWED_LOOP_STATE)
+    return int.from_bytes(data[:8], "little"), coefficients, states, loop
 
 
 def layout_description() -> dict[str, Any]:

@@ -15,6 +15,8 @@ from rtloop.recording.events import FINAL
 from rtloop.recording.load import Recording
 
 Progress = Callable[[int], None]
+BEYOND_DRAWING = 1e30
+"""What is larger is left out of a picture, as is what is no number; a single-precision page holds the rest."""
 BAD = ("tripped", "driver_failed", "gap")
 
 
@@ -62,8 +64,9 @@ def read_bands(
     for rows in recording.between(["deadline_ns", *names], start_s, end_s):
         edges = np.arange(0, len(rows), stretch)
         times.append(rows[edges, 0] * 1e-9)
-        lows.append(np.fmin.reduceat(rows[:, 1:], edges))
-        highs.append(np.fmax.reduceat(rows[:, 1:], edges))
+        values = np.where(np.abs(rows[:, 1:]) < BEYOND_DRAWING, rows[:, 1:], np.nan)
+        lows.append(np.fmin.reduceat(values, edges))
+        highs.append(np.fmax.reduceat(values, edges))
         done += len(rows)
         if progress:
             progress(done)

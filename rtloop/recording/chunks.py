@@ -13,6 +13,7 @@ from rtloop.recording.container import (
     CHUNK_HEAD,
     CHUNK_MARK,
     CHUNK_MARK_OFFSET,
+    DATA_END_BYTES,
     FOOTER_BYTES,
     FOOTER_HEAD,
     MAGIC,
@@ -78,8 +79,21 @@ def indexed_chunks(source: Source) -> list[Entry]:
     opcode, length, start, _ = FOOTER_HEAD.unpack_from(tail)
     if opcode != Opcode.FOOTER or length != FOOTER_BYTES - PREFIX.size or not len(MAGIC) < start < source.size:
         raise DamagedChunk("its end is damaged")
-    summary = source.read(start, source.size - len(MAGIC) - start)
-    return [Entry(index.chunk_start_offset, index.chunk_length, index) for index in parse_summary(summary)]
+    indexes = parse_summary(source.read(start, source.size - len(MAGIC) - start))
+    _require_seamless(source, indexes, start - DATA_END_BYTES)
+    return [Entry(index.chunk_start_offset, index.chunk_length, index) for index in indexes]
+
+
+def _require_seamless(source: Source, indexes: list[ChunkIndex], end: int) -> None:
+    """Raise DamagedChunk unless the chunks, each with its message indexes, are all that stands in the data section."""
+    _, position = _record_at(source, len(MAGIC))
+    position += len(MAGIC)
+    for index in indexes:
+        if index.chunk_start_offset != position or index.chunk_length < CHUNK_HEAD.size:
+            raise DamagedChunk("its chunk index does not go with its chunks")
+        position += index.chunk_length + index.message_index_length
+    if position != end:
+        raise DamagedChunk("its chunk index does not go with its chunks")
 
 
 def scanned_chunks(source: Source) -> tuple[list[Entry], list[str]]:

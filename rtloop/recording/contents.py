@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 from mcap.opcode import Opcode
 
 from rtloop.recording import format
@@ -19,6 +17,11 @@ class Message(NamedTuple):
     channel: int
     log_time: int
     payload: bytes
+
+
+def may_hold_messages(entry: Entry) -> bool:
+    """Whether a chunk may hold messages of the slow topics."""
+    return entry.index is None or any(channel != format.TICKS for channel in entry.index.message_index_offsets)
 
 
 def may_hold(entry: Entry, channel: int) -> bool:
@@ -50,16 +53,6 @@ def read_chunk(source: Source, entry: Entry) -> bytes:
 def is_ticks(content: bytes) -> bool:
     """Whether a chunk holds ticks."""
     return content[:1] == bytes([Opcode.MESSAGE]) and _channel(content[PREFIX.size :]) == format.TICKS
-
-
-def tick_rows(content: bytes, dtype: np.dtype[Any], names: Sequence[str]) -> np.ndarray[Any, Any]:
-    """The columns `names` of a chunk of ticks, shape (n, names). Raises DamagedChunk."""
-    if len(content) % dtype.itemsize:
-        raise DamagedChunk("its length is not that of whole ticks")
-    records = np.frombuffer(content, dtype)
-    if np.any(records["_length"] != dtype.itemsize - PREFIX.size):
-        raise DamagedChunk("it holds more than ticks")
-    return format.tick_rows(records, names)
 
 
 def split_messages(content: bytes) -> list[Message]:

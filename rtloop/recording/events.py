@@ -55,6 +55,11 @@ def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None
     return record
 
 
+def known(kinds: Any, name: str) -> bool:
+    """Whether an event may call a member of `kinds` so: by its name, or by its number where this version has none."""
+    return name.upper() in kinds.__members__ or (name.isascii() and name.isdigit() and len(name) < 10)
+
+
 def recorder_event(kind: str, tick: int, time_ns: int, what: dict[str, Any]) -> Event:
     """An event of the recorder's own."""
     return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": what}

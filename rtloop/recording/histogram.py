@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 NS_PER_US = 1000.0
+NO_TIME_US = 1e15
+"""No run lasts so long: thirty years."""
 CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
@@ -23,9 +25,9 @@ class Histogram:
         self._maximum = -math.inf
 
     def add(self, values_us: np.ndarray[Any, Any]) -> None:
-        """Count values in µs; NaN is not counted."""
-        if not len(values_us) or np.isnan(values_us.max()):
-            values_us = values_us[np.isfinite(values_us)]
+        """Count values in µs; NaN, and what is no time, is not counted."""
+        if not len(values_us) or not values_us.max() < NO_TIME_US:
+            values_us = values_us[values_us < NO_TIME_US]
         if not len(values_us):
             return
         self._maximum = max(self._maximum, float(values_us.max()))

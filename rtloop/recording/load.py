@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,21 +18,31 @@ Signal = np.ndarray[Any, Any]
 SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": "Hz"}
 
 
+class Extent(NamedTuple):
+    """What a file says of its ticks: the first one, and what was counted at its end; None where it has none."""
+
+    first_tick: int
+    totals: dict[str, Any] | None
+
+
 class Recording:
     """One run: `recording["x_position_um"]` is an array of shape (ticks,), read from the files and then kept.
 
     Ticks that are missing from the recording are missing from every array alike; `tick` says which are there.
-    `problems` says what is wrong with the files; damaged chunks are left out.
+    `problems` says what is wrong with the files, as far as they were read; what is damaged is left out, and those of
+    the problems that leave something out are `left_out` as well. `extents` is what each file says of its ticks.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._signals: dict[str, Signal] = {}
         self.problems: list[str] = []
+        self.left_out: list[str] = []
         with Parts(paths) as readers:
             self.paths = tuple(reader.path for reader in readers)
             self.header: dict[str, Any] = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
+            self.extents = tuple(Extent(reader.first_tick, reader.totals) for reader in readers)
             self.problems += absent_parts(readers)
             self._note_problems(readers)
 
@@ -77,14 +88,13 @@ class Recording:
 
     def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
         """Arrays (n, names) of consecutive ticks, for what does not fit into memory."""
-        with Parts(self.paths) as readers:
+        with self._reading() as readers:
             for reader in readers:
                 yield from reader.blocks(names)
-            self._note_problems(readers)
 
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
         """Arrays (n, names) of the ticks that were due between two times; chunks outside are not read."""
-        with Parts(self.paths) as readers:
+        with self._reading() as readers:
             for reader in readers:
                 entries = reader.chunks_between(start_s, end_s)
                 for rows in reader.blocks([self.columns[DEADLINE], *names], entries):
@@ -93,18 +103,26 @@ class Recording:
                         yield rows[:, 1:]
                     elif inside.any():
                         yield rows[inside, 1:]
-            self._note_problems(readers)
 
     def snapshots(self) -> Generator[Snapshot]:
         """The recorded states of the law, in order."""
-        with Parts(self.paths) as readers:
+        with self._reading() as readers:
             for reader in readers:
                 yield from reader.snapshots()
-            self._note_problems(readers)
+
+    @contextmanager
+    def _reading(self) -> Iterator[list[Reader]]:
+        """The files, opened once more; what turns out to be wrong with them is noted, however far they are read."""
+        with Parts(self.paths) as readers:
+            try:
+                yield readers
+            finally:
+                self._note_problems(readers)
 
     def _note_problems(self, readers: Sequence[Reader]) -> None:
-        found = [problem for reader in readers for problem in reader.problems]
-        self.problems += [problem for problem in found if problem not in self.problems]
+        for reader in readers:
+            for mine, found in ((self.problems, reader.problems), (self.left_out, reader.left_out)):
+                mine += [problem for problem in found if problem not in mine]
 
 
 def load(path: Files) -> Recording:

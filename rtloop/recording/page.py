@@ -14,7 +14,7 @@ import numpy as np
 from rtloop.errors import OutputError
 from rtloop.recording.bands import Band, Progress, drawn_signals, marks, read_bands, title
 from rtloop.recording.load import Recording, load
-from rtloop.recording.parts import Files, find_files
+from rtloop.recording.parts import Files
 
 POINTS = 100_000
 """About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
@@ -26,7 +26,7 @@ SHAPES = (
 
 
 def write_page(
-    files: Files,
+    files: Files | Recording,
     output: Path | str | None = None,
     *,
     start_s: float = 0.0,
@@ -34,8 +34,8 @@ def write_page(
     progress: Progress | None = None,
 ) -> Path:
     """Write the page, by default beside the recording. Raises RecordingError, OutputError."""
-    recording = load(files)
-    target = find_files(files)[0].with_suffix(".html") if output is None else Path(output)
+    recording = files if isinstance(files, Recording) else load(files)
+    target = recording.paths[0].with_suffix(".html") if output is None else Path(output)
     bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
     time_s = next(iter(bands.values())).time_s
     data = {

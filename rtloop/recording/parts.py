@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 from collections.abc import Sequence
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 from rtloop.recording.errors import RecordingError
@@ -46,6 +47,8 @@ class Parts(ExitStack):
             readers = [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
             readers.sort(key=_sequence)
             _require_one_run(readers)
+            for before, reader in pairwise(readers):
+                reader.begin_behind(before)
             return readers
         except BaseException:
             self.close()

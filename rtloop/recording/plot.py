@@ -9,8 +9,8 @@ import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.bands import Band, Mark, Progress, drawn_signals, marks, read_bands, title
-from rtloop.recording.load import load, unit_of
-from rtloop.recording.parts import Files, find_files
+from rtloop.recording.load import Recording, load, unit_of
+from rtloop.recording.parts import Files
 
 POINTS = 20_000
 MAX_LABELS = 12
@@ -18,7 +18,7 @@ REFERENCE, POSITION, ERROR, DRIVE, LATENESS = "0.15", "tab:blue", "tab:red", "ta
 
 
 def plot(
-    files: Files,
+    files: Files | Recording,
     output: Path | str | None = None,
     *,
     start_s: float = 0.0,
@@ -34,15 +34,15 @@ def plot(
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
-    recording = load(files)
-    target = find_files(files)[0].with_suffix(".png") if output is None else Path(output)
+    recording = files if isinstance(files, Recording) else load(files)
+    target = recording.paths[0].with_suffix(".png") if output is None else Path(output)
     axes = recording.header["axes"]
     bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
     time_s = next(iter(bands.values())).time_s
     figure = Figure(figsize=(12, 2.0 + 2.1 * (3 * len(axes) + 1)), layout="constrained")
     FigureCanvasAgg(figure)
     _draw(figure, axes, bands, marks(recording, time_s[0], time_s[-1]))
-    figure.suptitle(title(recording), fontsize=11)
+    figure.suptitle(title(recording), fontsize=11, parse_math=False)
     try:
         figure.savefig(target, format="png", dpi=110)
     except OSError as error:
@@ -96,4 +96,4 @@ def _mark_events(panels: list[Any], events: list[Mark]) -> None:
             panel.axvline(event.time_s, color="tab:red" if event.bad else "0.3", linewidth=0.7, linestyle=":")
     for event in events[:MAX_LABELS]:
         place, above = (event.time_s, 1.02), panels[0].get_xaxis_transform()
-        panels[0].text(*place, event.label, transform=above, rotation=30, fontsize=8)
+        panels[0].text(*place, event.label, transform=above, rotation=30, fontsize=8, parse_math=False)

@@ -8,7 +8,6 @@ to find chunks only.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,16 +19,27 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from rtloop.recording import format
+from rtloop.recording.account import Account
+from rtloop.recording.checked import Malformed, event_from
 from rtloop.recording.chunks import Entry, Source, indexed_chunks, scanned_chunks
 from rtloop.recording.container import DamagedChunk, unpack_chunk
-from rtloop.recording.contents import Message, is_ticks, may_hold, overlaps, read_chunk, split_messages, tick_rows
+from rtloop.recording.contents import (
+    Message,
+    is_ticks,
+    may_hold,
+    may_hold_messages,
+    overlaps,
+    read_chunk,
+    split_messages,
+)
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.events import FINAL, Event
 from rtloop.recording.header import read_header
-from rtloop.signals import DEADLINE
+from rtloop.recording.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
+DIGEST_BYTES = 32
 AHEAD = 16
 """Chunks that are decompressed beyond the one that is asked for."""
 
@@ -42,7 +52,9 @@ class Snapshot(NamedTuple):
 
 
 class Reader:
-    """An open recording. `tolerant`: damaged chunks are left out and named in `problems` instead of raising.
+    """An open recording. `tolerant`: what is damaged is left out and named in `problems` instead of raising.
+
+    `left_out` are those of the problems for which something is missing from what is read.
 
     Raises RecordingError, here and while reading.
     """
@@ -50,6 +62,7 @@ class Reader:
     def __init__(self, path: Path | str, *, tolerant: bool = False) -> None:
         self.path, self.tolerant = Path(path), tolerant
         self.problems: list[str] = []
+        self.left_out: list[str] = []
         self._source = Source(self.path)
         try:
             self._entries = self._find_chunks()
@@ -58,7 +71,8 @@ class Reader:
             self._source.close()
             raise
         self.columns: tuple[str, ...] = tuple(self.header["columns"])
-        self._dtype = format.tick_dtype(self.columns)
+        self._layout = TickLayout(self.columns)
+        self.first_tick: int = self.header.get("first_tick", 0)
 
     def __enter__(self) -> Self:
         return self
@@ -69,6 +83,11 @@ class Reader:
     def close(self) -> None:
         """Close the file."""
         self._source.close()
+
+    def begin_behind(self, before: Reader) -> None:
+        """Take no tick that belongs into the part `before` this one."""
+        if before.totals:
+            self.first_tick = max(self.first_tick, before.totals["ticks_executed"])
 
     @property
     def size_bytes(self) -> int:
@@ -81,11 +100,10 @@ class Reader:
         for entry in self.tick_chunks:
             try:
                 content = self._content(entry)
+                if is_ticks(content):
+                    return self._layout.start_ns(content)
             except DamagedChunk:
                 continue
-            if is_ticks(content):
-                first = np.frombuffer(content, self._dtype, count=1)
-                return int(first["_log_time"][0]) - int(first[self.columns[DEADLINE]][0])
         return int(self.header["created_unix_ns"])
 
     @property
@@ -93,10 +111,10 @@ class Reader:
         """The chunks that may hold ticks."""
         return [entry for entry in self._entries if may_hold(entry, format.TICKS)]
 
-    def chunks_between(self, start_s: float, end_s: float) -> list[Entry]:
-        """The chunks that may hold ticks due between two times, in s since the start of the run."""
+    def chunks_between(self, start_s: float, end_s: float) -> list[Entry] | None:
+        """The chunks that may hold ticks due between two times, in s since the start; None stands for all of them."""
         if start_s <= 0.0 and math.isinf(end_s):
-            return self.tick_chunks
+            return None
         start_ns, end_ns = start_s * 1e9 + self.start_unix_ns, end_s * 1e9 + self.start_unix_ns
         return [entry for entry in self.tick_chunks if overlaps(entry, start_ns, end_ns)]
 
@@ -106,40 +124,49 @@ class Reader:
         `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
         """
         wanted = self._known(self.columns if names is None else names)
-        waiting: deque[tuple[Entry, Future[Rows | None]]] = deque()
-        with ThreadPoolExecutor(WORKERS) as pool:
-            for entry in self.tick_chunks if entries is None else entries:
-                waiting.append((entry, pool.submit(self._rows_of, entry, wanted)))
-                if len(waiting) >= AHEAD:
-                    yield from self._ready(*waiting.popleft())
-            while waiting:
-                yield from self._ready(*waiting.popleft())
+        account = Account(self.first_tick, self.totals)
+        for entry, future in self._ahead(self.tick_chunks if entries is None else entries, wanted):
+            try:
+                ticks = future.result()
+                if ticks is not None:
+                    account.add(ticks)
+                    yield ticks.rows
+            except DamagedChunk as reason:
+                self._leave_out(entry, reason)
+        if entries is None:
+            self._close(account)
 
     def snapshots(self) -> Iterator[Snapshot]:
         """The snapshots of the law, in order, each verified by its digest."""
+        before = -1
         for message in self._messages(format.LAW):
-            digest, data = message.payload[:32], message.payload[32:]
-            if hashlib.sha256(data).digest() != digest:
-                self._report("a snapshot of the law is damaged")
-                continue
-            yield Snapshot(int.from_bytes(data[:8], "little"), data)
+            tick, data = _tick_of(message), message.payload[DIGEST_BYTES:]
+            if tick > before:
+                yield Snapshot(tick, data)
+            else:
+                self._report(f"snapshots of the law are out of order: that of tick {tick} comes after {before}")
+            before = max(before, tick)
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Each chunk in the order of the file: either its ticks or its messages of the slow topics."""
+        account = Account(self.first_tick, self.totals)
         for entry in self._entries:
             try:
                 content = self._content(entry)
                 if is_ticks(content):
-                    yield tick_rows(content, self._dtype, self.columns), []
+                    ticks = self._layout.ticks(content, self.columns)
+                    account.add(ticks)
+                    yield ticks.rows, []
                 else:
-                    yield None, split_messages(content)
+                    yield None, self._checked(split_messages(content))
             except DamagedChunk as reason:
-                self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
+                self._leave_out(entry, reason)
+        self._close(account)
 
     @cached_property
     def events(self) -> list[Event]:
         """The events, in the order of the file."""
-        return [json.loads(message.payload) for message in self._messages(format.EVENTS)]
+        return [event_from(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
 
     @property
     def totals(self) -> dict[str, Any] | None:
@@ -159,42 +186,77 @@ class Reader:
         except DamagedChunk as reason:
             entries, problems = scanned_chunks(self._source)
             self.problems += [f"{reason}: read from the beginning, without its index", *problems]
+            self.left_out += problems
             return entries
 
     def _content(self, entry: Entry) -> bytes:
         return unpack_chunk(read_chunk(self._source, entry))
 
-    def _rows_of(self, entry: Entry, names: Sequence[str]) -> Rows | None:
+    def _ahead(self, entries: Iterable[Entry], names: Sequence[str]) -> Iterator[tuple[Entry, Future[Ticks | None]]]:
+        """The entries with what comes of decompressing them."""
+        waiting: deque[tuple[Entry, Future[Ticks | None]]] = deque()
+        with ThreadPoolExecutor(WORKERS) as pool:
+            for entry in entries:
+                waiting.append((entry, pool.submit(self._ticks_of, entry, names)))
+                if len(waiting) >= AHEAD:
+                    yield waiting.popleft()
+            while waiting:
+                yield waiting.popleft()
+
+    def _ticks_of(self, entry: Entry, names: Sequence[str]) -> Ticks | None:
         """The ticks of a chunk; None if it holds something else. Raises DamagedChunk."""
         content = self._content(entry)
-        return tick_rows(content, self._dtype, names) if is_ticks(content) else None
-
-    def _ready(self, entry: Entry, future: Future[Rows | None]) -> Iterator[Rows]:
-        try:
-            rows = future.result()
-        except DamagedChunk as reason:
-            self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
-            return
-        if rows is not None:
-            yield rows
+        return self._layout.ticks(content, names) if is_ticks(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
-        """The messages of one of the slow topics."""
+        """The messages of one of the slow topics; what is wrong with the others in their chunks is reported too."""
         for entry in self._entries:
-            if may_hold(entry, channel):
+            if may_hold_messages(entry):
                 yield from (message for message in self._slow(entry) if message.channel == channel)
 
     def _slow(self, entry: Entry) -> list[Message]:
         """The messages of the slow topics in a chunk."""
         try:
             content = self._content(entry)
-            return [] if is_ticks(content) else split_messages(content)
+            return [] if is_ticks(content) else self._checked(split_messages(content))
         except DamagedChunk as reason:
-            self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
+            self._leave_out(entry, reason)
             return []
+
+    def _checked(self, messages: list[Message]) -> list[Message]:
+        """Those of the messages that say something; of the others it is reported what is wrong."""
+        good = []
+        for message in messages:
+            try:
+                if message.channel == format.EVENTS:
+                    event_from(message.payload, self.header["axes"])
+                elif message.channel == format.LAW:
+                    _require_digest(message)
+                good.append(message)
+            except Malformed as reason:
+                self._report(str(reason) if message.channel == format.LAW else f"an event is malformed: {reason}")
+        return good
+
+    def _leave_out(self, entry: Entry, reason: DamagedChunk) -> None:
+        self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
+
+    def _close(self, account: Account) -> None:
+        if account.shortage and not self.left_out:
+            self._report(account.shortage)
 
     def _report(self, problem: str) -> None:
         if not self.tolerant:
             raise RecordingError(f"{self.path}: {problem}; `rtloop recover` keeps what is whole")
-        if problem not in self.problems:
-            self.problems.append(problem)
+        for problems in (self.problems, self.left_out):
+            if problem not in problems:
+                problems.append(problem)
+
+
+def _tick_of(snapshot: Message) -> int:
+    return int.from_bytes(snapshot.payload[DIGEST_BYTES : DIGEST_BYTES + 8], "little")
+
+
+def _require_digest(snapshot: Message) -> None:
+    digest, data = snapshot.payload[:DIGEST_BYTES], snapshot.payload[DIGEST_BYTES:]
+    if hashlib.sha256(data).digest() != digest or len(data) < 8 or _tick_of(snapshot) > LARGEST:
+        raise Malformed("a snapshot of the law is damaged")

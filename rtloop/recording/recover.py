@@ -42,7 +42,7 @@ class Recovery:
 
     def __init__(self, reader: Reader, writer: Writer) -> None:
         self._reader, self._writer = reader, writer
-        self.next_tick: int = reader.header.get("first_tick", 0)
+        self.next_tick = reader.first_tick
         self.gaps: list[tuple[int, int]] = []
         self._end_ns = 0.0
         self._final: Message | None = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,46 +17,18 @@ from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.layout import layout_description, split_snapshot
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.events import json_value, message_of
+from rtloop.recording.events import GAP, RECOVERED, json_value, message_of
 from rtloop.recording.load import Recording
 from rtloop.recording.reader import Snapshot
 from rtloop.recording.rerun import Law, Rerun, Rows, Tape
 from rtloop.recording.snapshots import first_difference
+from rtloop.recording.verdict import MEASURED, ReplayReport, not_judged
 from rtloop.signals import Flag
 
-MEASURED = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
-"""Columns that a clock made and that no output depends on; so is the flag OVERRUN."""
+FEW_PERIODS, RATE_TOLERANCE = 50, 0.05
+"""Over fewer periods no rate is compared; a card's own clock may be a little off."""
 LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
 Progress = Callable[[int], None]
-
-
-@dataclass
-class ReplayReport:
-    """`ticks` compared; `unverified` ticks before a snapshot or after a gap; the first difference, if any."""
-
-    ticks: int = 0
-    unverified: int = 0
-    gaps: list[dict[str, int]] = field(default_factory=list)
-    snapshots: int = 0
-    first_difference: dict[str, Any] | None = None
-    problems: list[str] = field(default_factory=list)
-
-    @property
-    def identical(self) -> bool:
-        """At least one tick was compared and none differed."""
-        return self.ticks > 0 and self.first_difference is None
-
-    def as_dict(self) -> dict[str, Any]:
-        """The object of `rtloop replay --json`."""
-        return {
-            "ticks": self.ticks,
-            "identical": self.identical,
-            "first_difference": self.first_difference,
-            "unverified": self.unverified,
-            "gaps": self.gaps,
-            "snapshots_compared": self.snapshots,
-            "problems": self.problems,
-        }
 
 
 def replay(recording: Recording, progress: Progress | None = None) -> ReplayReport:
@@ -75,6 +46,15 @@ def check_layout(recording: Recording) -> None:
             f"{recording.paths[0]}: recorded by rtloop {version}, whose law is laid out differently; replay it with "
             "that version"
         )
+
+
+def law_of(snapshot: Snapshot, recording: Recording) -> Law:
+    """Coefficients and state, which the kernels can work on. Raises RecordingError where they cannot."""
+    try:
+        _, *law = split_snapshot(snapshot.data, len(recording.header["axes"]))
+    except ValueError as error:
+        raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
+    return Law(*law)
 
 
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
@@ -98,28 +78,67 @@ class _Replay:
         self._commands = recorded_commands(recording, (*LAW_COMMANDS, Kind.LOAD_LAW))
         self._next: Snapshot | None = next(snapshots, None)
         self._rerun: Rerun | None = None
-        self._report = ReplayReport(problems=recording.problems)
+        self._report = ReplayReport(problems=recording.problems, not_judged=not_judged(recording.header))
+        self._found = 0
+        gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
+        self._gaps = sorted(gaps, key=lambda gap: gap["first_tick"])
 
     def run(self) -> ReplayReport:
         """Replay all blocks, up to the first difference."""
-        expected: int | None = None
+        expected = self._recording.extents[0].first_tick
         with closing(self._recording.blocks()) as blocks:
             for block in blocks:
                 for rows in consecutive(block):
                     first = int(rows[0, signals.TICK])
-                    if expected is not None and first != expected:
-                        self._report.gaps.append({"first_tick": expected, "count": first - expected})
-                        self._rerun = None
+                    self._pass_gap(expected, first)
                     expected = first + len(rows)
                     self._consume(rows)
+                    self._found += len(rows)
                 if self._report.first_difference:
+                    behind = self._report.first_difference["tick"] + 1
+                    self._report.pass_over(behind, None, "behind the first difference")
+                    self._pass_left_out()
                     return self._report
                 if self._progress:
                     self._progress(self._report.ticks)
         if not self._report.ticks:
             path = self._recording.paths[0]
             raise RecordingError(f"{path}: holds no tick after a snapshot of the law to replay from")
+        self._end(expected)
         return self._report
+
+    def _pass_gap(self, expected: int, first: int) -> None:
+        """Go on at a tick behind the expected one; that nothing was recorded between is the recorder's word alone."""
+        if first == expected:
+            return
+        self._rerun = None
+        self._report.gaps.append({"first_tick": expected, "count": first - expected})
+        at = expected
+        for gap in self._gaps:
+            if gap["first_tick"] <= at:
+                at = max(at, gap["first_tick"] + gap["count"])
+        if at < first:
+            self._report.pass_over(expected, first - expected, "not in the recording")
+
+    def _pass_left_out(self) -> None:
+        for problem in self._recording.left_out:
+            self._report.pass_over(None, None, problem)
+
+    def _end(self, expected: int) -> None:
+        """Hold what was found against what the files say that they hold."""
+        totals = [extent.totals for extent in self._recording.extents]
+        last = totals[-1]
+        for snapshot in [] if self._next is None else [self._next, *self._snapshots]:
+            if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
+                self._report.pass_over(None, None, f"a snapshot of the law at tick {snapshot.tick}, behind the end")
+        self._pass_left_out()
+        if last is None:
+            self._report.pass_over(expected, None, "the recording states no end; `rtloop recover` completes it")
+            return
+        written = sum(one["ticks_logged"] for one in totals if one)
+        if self._found == written and last["result"] != RECOVERED:  # what its disk had no room for was never recorded
+            self._gaps.append({"first_tick": expected, "count": last["ticks_executed"] - expected})
+        self._pass_gap(expected, last["ticks_executed"])
 
     def _consume(self, rows: Rows) -> None:
         """Replay consecutive rows, in stretches that end where a snapshot lies."""
@@ -129,7 +148,7 @@ class _Replay:
             until = tick + len(rows) if self._next is None else self._next.tick
             count = min(len(rows), until - tick)
             if self._rerun is None:
-                self._report.unverified += count
+                self._report.pass_over(tick, count, "no snapshot of the law to start from stands before them")
             else:
                 count = min(count, self._rerun.room(tick))
                 self._compare(self._rerun, rows[:count])
@@ -144,8 +163,9 @@ class _Replay:
         if self._next is None or self._next.tick != tick:
             return None
         snapshot, self._next = self._next, next(self._snapshots, None)
+        law = law_of(snapshot, self._recording)
         if self._rerun is None:
-            self._start(snapshot)
+            self._start(snapshot.tick, law)
             return None
         self._rerun.expect_snapshot(snapshot.data)
         return snapshot
@@ -157,19 +177,18 @@ class _Replay:
         if replayed != recorded and not self._report.first_difference:
             self._differs(snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"]))
 
-    def _start(self, snapshot: Snapshot) -> None:
+    def _start(self, tick: int, law: Law) -> None:
         header = self._recording.header
-        try:
-            _, *law = split_snapshot(snapshot.data, len(header["axes"]))
-        except ValueError as error:
-            raise RecordingError(f"{self._recording.paths[0]}: {error}") from None
-        still_to_come = self._commands[self._commands["tick"] > snapshot.tick]
-        self._rerun = Rerun(header, Tape(header), Law(*law), still_to_come, snapshot.tick)
+        still_to_come = self._commands[self._commands["tick"] > tick]
+        self._rerun = Rerun(header, Tape(header), law, still_to_come, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
+        self._compare_rate(recorded)
         replayed = rerun.execute(recorded)
         count = len(replayed)
         same = _same(recorded[:count], replayed)
+        if self._report.first_difference:
+            return
         if same.all():
             self._report.ticks += count
             if count < len(recorded):
@@ -180,6 +199,16 @@ class _Replay:
         self._report.ticks += row + 1
         values = float(recorded[row, column]), float(replayed[row, column])
         self._differs(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
+
+    def _compare_rate(self, recorded: Rows) -> None:
+        """The deadlines, whatever clock made them, follow the rate."""
+        periods = len(recorded) - 1 + recorded[1:, signals.PERIODS_MISSED].sum()
+        span_ns, rate_hz = (
+            recorded[-1, signals.DEADLINE] - recorded[0, signals.DEADLINE],
+            self._recording.header["rate_hz"],
+        )
+        if periods >= FEW_PERIODS and not 1 - RATE_TOLERANCE < span_ns * 1e-9 * rate_hz / periods < 1 + RATE_TOLERANCE:
+            self._differs(int(recorded[0, signals.TICK]), "rate_hz", rate_hz, 1e9 * periods / span_ns)
 
     def _differs(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}

@@ -65,7 +65,8 @@ class Tape:
         tape, first = self._rows[: len(rows)], TIMING_COLUMNS + 1
         tape[:, 0], tape[:, 2] = rows[:, signals.DEADLINE], rows[:, signals.PERIODS_MISSED]
         # lateness was recorded in µs, from whole ns: the rounding restores these, and so the very same µs
-        tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
+        with np.errstate(over="ignore"):
+            tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
         flags = rows[:, signals.FLAGS].astype(np.int64)
         lost = (flags & int(Flag.HEARTBEAT_LOST)) != 0
         tape[:, 3] = np.where(lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again

@@ -63,8 +63,9 @@ class Totals:
         for name, histogram in self.histograms.items():
             histogram.add(column[name])
         closed = column["mode"] == Mode.CLOSED_LOOP
-        for axis in self.axes:
-            axis.add(column[f"{axis.name}_error_um"], column[f"{axis.name}_drive_v"], closed)
+        with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a recording
+            for axis in self.axes:
+                axis.add(column[f"{axis.name}_error_um"], column[f"{axis.name}_drive_v"], closed)
 
     @property
     def span_s(self) -> float:

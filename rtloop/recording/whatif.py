@@ -16,11 +16,11 @@ import numpy as np
 from drivers.base import Driver, Pointers
 from rtloop import signals
 from rtloop.law.law import set_mode
-from rtloop.law.layout import Records, initial_state, split_snapshot
+from rtloop.law.layout import Records, initial_state
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.recording.outcome import Differences, Performance
-from rtloop.recording.replay import LAW_COMMANDS, check_layout, consecutive, recorded_commands
+from rtloop.recording.replay import LAW_COMMANDS, check_layout, consecutive, law_of, recorded_commands
 from rtloop.recording.rerun import Law, Rerun, Rows, Source, Tape
 from rtloop.signals import Mode
 
@@ -50,7 +50,7 @@ def recorded_coefficients(recording: Recording) -> Records:
         first = next(snapshots, None)
     if first is None:
         raise RecordingError(f"{recording.paths[0]}: holds no snapshot of the law")
-    return split_snapshot(first.data, len(recording.header["axes"]))[1]
+    return law_of(first, recording).coefficients
 
 
 def other_law(recording: Recording, coefficients: Records, progress: Progress | None = None) -> dict[str, Any]:

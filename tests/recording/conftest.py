@@ -6,7 +6,14 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.recording.forging import Base, bases
 from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess
+
+
+@pytest.fixture(scope="session")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
+    """A good recording taken apart."""
+    return bases(tmp_path_factory.mktemp("base"))[0]
 
 
 @pytest.fixture

@@ -111,13 +111,15 @@ def write_recording(path: Path, rows: np.ndarray[Any, Any], **header: Any) -> Pa
         )
         writer.write_ticks(block)
 
-    def final(logged: int) -> Message:
-        what = {"ticks_executed": len(rows), "ticks_logged": logged, "ticks_lost": 0, "events_lost": 0}
-        event = recorder_event("finished", len(rows), 0, {**what, "result": "finished", "complete": True})
-        return Message(EVENTS, START_UNIX_NS, json.dumps(event).encode())
-
-    writer.finish(final)
+    writer.finish(lambda logged: final_message(len(rows), logged))
     return path
+
+
+def final_message(executed: int, logged: int) -> Message:
+    """The event that ends a recording of so many ticks."""
+    what = {"ticks_executed": executed, "ticks_logged": logged, "ticks_lost": executed - logged, "events_lost": 0}
+    event = recorder_event("finished", executed, 0, {**what, "result": "finished", "complete": executed == logged})
+    return Message(EVENTS, START_UNIX_NS, json.dumps(event).encode())
 
 
 class HandMadeLoop:

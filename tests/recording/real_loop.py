@@ -73,6 +73,10 @@ class RealLoop:
         """Ticks executed."""
         return int(self._assembly.loop.tick)
 
+    def take_snapshots_every(self, ticks: int) -> None:
+        """Another distance than a second's."""
+        self._assembly.loop.snapshot_ticks = ticks
+
     def run(self, ticks: int) -> None:
         """Execute `ticks` more."""
         self._assembly.run(self.tick + ticks)

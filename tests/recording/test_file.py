@@ -19,12 +19,19 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from rtloop.errors import OutputError
-from rtloop.recording.contents import Message
-from rtloop.recording.format import EVENTS, TICKS, chunk_rows, tick_dtype, tick_schema
+from rtloop.recording.format import TICKS, chunk_rows, tick_dtype, tick_schema
 from rtloop.recording.reader import Reader
 from rtloop.recording.writer import Writer
-from rtloop.signals import columns
-from tests.recording.hand_made_loop import COLUMNS, START_UNIX_NS, make_header, make_rows, snapshot, write_recording
+from rtloop.signals import DRIVER_STATUS, FLAGS, MODE, PERIODS_MISSED, columns
+from tests.recording.hand_made_loop import (
+    COLUMNS,
+    START_UNIX_NS,
+    final_message,
+    make_header,
+    make_rows,
+    snapshot,
+    write_recording,
+)
 
 COUNT = 3_000
 SPECIAL = (
@@ -85,6 +92,7 @@ def test_any_double_survives(values: np.ndarray, tmp_path: Path):
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
     rows = np.column_stack([np.arange(5.0), np.arange(5) * 1e5, values])
+    rows[:, [PERIODS_MISSED, FLAGS, MODE, DRIVER_STATUS]] = 1.0  # whole numbers, which a reader insists on
     write_recording(path, rows)
     assert stock_rows(path).tobytes() == rows.tobytes()
     with Reader(path) as reader:
@@ -163,7 +171,7 @@ def test_the_message_index_for_viewers_that_need_it(tmp_path: Path):
     writer = Writer(path, header, START_UNIX_NS, message_index=True)
     for start in (0, 1_000, 2_000):
         writer.write_ticks(rows[start : start + 1_000])
-    writer.finish(lambda _: Message(EVENTS, START_UNIX_NS, b"{}"))
+    writer.finish(lambda logged: final_message(len(rows), logged))
     with path.open("rb") as file:
         records = list(StreamReader(file, emit_chunks=True).records)
     indexes = [r for r in records if isinstance(r, MessageIndex) and r.channel_id == TICKS]
@@ -185,10 +193,11 @@ def test_space_that_is_to_stay_free_ends_the_file_well(tmp_path: Path, rows: np.
     writer.write_ticks(rows[1000:2000])
     with pytest.raises(OutputError, match="9 MiB are free, at least 9 MiB are to stay free"):
         writer.write_ticks(rows[2000:])
-    writer.finish(lambda logged: Message(EVENTS, 1, json.dumps({"kind": "finished", "what": {"n": logged}}).encode()))
+    writer.finish(lambda logged: final_message(len(rows), logged))
     with Reader(tmp_path / "run.mcap") as reader:
         assert np.concatenate(list(reader.blocks())).tobytes() == rows[:2000].tobytes()
-        assert reader.totals == {"n": 2000}
+        assert reader.totals
+        assert (reader.totals["ticks_executed"], reader.totals["ticks_logged"]) == (len(rows), 2000)
 
 
 def test_a_growing_file_keeps_little_of_each_chunk_in_memory(tmp_path: Path):

@@ -61,7 +61,7 @@ def test_records_everything_in_order(loop: HandMadeLoop, recorder: RecorderProce
 def test_events_keep_their_values_and_say_what_they_mean(loop, recorder, tmp_path):
     recorder.start(tmp_path / "run.mcap")
     record = np.zeros(1, MESSAGE)
-    record["tick"], record["kind"], record["origin"], record["identity"] = 12, Kind.SET_REFERENCE, Origin.OPERATOR, 7
+    record["tick"], record["kind"], record["origin"], record["identity"] = 12, Kind.DRIVER_FAILED, Origin.OPERATOR, 7
     record["values"][0, :4] = [np.nan, -0.0, np.inf, 5e-324]
     loop.command(3, Mode.FEEDFORWARD)
     loop.put("events", record[0])
@@ -69,10 +69,10 @@ def test_events_keep_their_values_and_say_what_they_mean(loop, recorder, tmp_pat
     loop.trip(15)
     loop.end()
     recorder.result()
-    mode, reference, trip, _ = load(tmp_path / "run.mcap").events
+    mode, failure, trip, _ = load(tmp_path / "run.mcap").events
     assert (mode["kind"], mode["who"], mode["what"]["mode"]) == ("set_mode", "schedule", "feedforward")
     assert (trip["axis"], trip["what"]["causes"], trip["time_ns"]) == ("x", ["position", "stale"], 1_500_000)
-    assert message_of(reference, AXES).tobytes() == record.tobytes()
+    assert message_of(failure, AXES).tobytes() == record.tobytes()
 
 
 def test_snapshots_and_commands_stand_in_front_of_the_ticks_they_precede(loop, recorder, tmp_path):

@@ -46,11 +46,22 @@ def test_one_bit_of_one_input_is_found_at_its_tick(whole: Path, tmp_path: Path):
     assert found["replayed"] == nudged[tick] * 10.0
 
 
-@pytest.mark.parametrize("signal_name", ["x_reference_um", "x_command_um", "x_drive_v", "mode", "flags", "x_demand_v"])
+@pytest.mark.parametrize("signal_name", ["x_reference_um", "x_command_um", "x_drive_v", "x_demand_v"])
 def test_one_bit_of_any_other_signal_is_found_at_its_tick(signal_name: str, whole: Path, tmp_path: Path):
     column = load(whole).columns.index(signal_name)
     path = rewrite(whole, tmp_path / "run.mcap", rows=lambda rows: flip_bit(rows, 20_111, column))
     assert difference(path)["tick"] == 20_111
+
+
+@pytest.mark.parametrize(("signal_name", "by"), [("mode", -1.0), ("flags", 16.0)])
+def test_another_mode_or_flag_is_found_at_its_tick(signal_name: str, by: float, whole: Path, tmp_path: Path):
+    column = load(whole).columns.index(signal_name)
+
+    def change(rows: Rows) -> None:
+        rows[rows[:, 0] == 20_111, column] += by
+
+    found = difference(rewrite(whole, tmp_path / "run.mcap", rows=change))
+    assert (found["tick"], found["signal"]) == (20_111, signal_name)
 
 
 def test_one_unit_in_the_last_place_of_a_coefficient_is_found(whole: Path, tmp_path: Path):

@@ -1,0 +1,201 @@
+"""What the texts of a file may say, its header and its events: the one place where they are believed or not.
+
+Everything behind relies on the types, ranges and names that stand here. Of a command it is checked what the kernels
+make of it: a mode, the number of an axis, the kind of a generator and its place in a table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import pydantic_core
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rtloop import signals
+from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
+from rtloop.law.reference import Generator
+from rtloop.recording.events import FINAL, GAP, Event, known
+from rtloop.recording.format import FORMAT
+from rtloop.signals import Mode
+
+HIGHEST_RATE_HZ, LOWEST_RATE_HZ = 1e6, 1e-3
+LARGEST_TICK, LARGEST_NS = 1 << 53, 1 << 62
+"""What a double counts exactly; what leaves room to add two of them in 64 bits."""
+SHOWN = 60
+"""Characters of a wrong value in a message."""
+
+Text = Annotated[str, Field(max_length=1000, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,99}$")]
+Number = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
+Tick = Annotated[int, Field(ge=0, le=LARGEST_TICK)]
+Words = dict[str, Any]
+
+
+class Malformed(ValueError):
+    """What is wrong, where, and what is allowed."""
+
+
+class _Checked(BaseModel):
+    """Keys that are not known are left alone: a later version may have more."""
+
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+
+class _Host(_Checked):
+    cpu: Text | None = None
+    kernel: Text | None = None
+
+
+class _Realtime(_Checked):
+    scheduler: Name | None = None
+    priority: Number | None = None
+    mlock: bool | None = None
+
+
+class _Law(_Checked):
+    sha256: Text | None = None
+
+
+class _Versions(_Checked):
+    rtloop: Text | None = None
+
+
+class _Header(_Checked):
+    format: Annotated[int, Field(ge=1)]
+    name: Text
+    created_unix_ns: Annotated[int, Field(ge=0, lt=LARGEST_NS)]
+    axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
+    observed: list[Name]
+    columns: Annotated[list[Name], Field(max_length=2000)]
+    rate_hz: Annotated[float, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
+    paced: bool
+    ticks_expected: Tick | None = None
+    configuration: str
+    law: _Law
+    realtime: _Realtime
+    versions: _Versions
+    host: _Host
+    sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
+    first_tick: Tick = 0
+
+
+class _Event(_Checked):
+    tick: Tick
+    time_ns: Annotated[int, Field(gt=-LARGEST_NS, lt=LARGEST_NS)]
+    kind: str
+    who: str
+    axis: str | None
+    what: Words
+
+
+class _Gap(_Checked):
+    first_tick: Tick
+    count: Annotated[int, Field(ge=1, le=LARGEST_TICK)]
+
+
+class _Totals(_Checked):
+    ticks_executed: Tick
+    ticks_logged: Tick
+    ticks_lost: Annotated[int, Field(ge=-LARGEST_TICK, le=LARGEST_TICK)]
+    events_lost: Tick
+    result: Text
+    complete: bool
+    gaps: list[Any] = []
+
+
+class _Message(_Checked):
+    values: Annotated[list[Any], Field(min_length=MESSAGE_VALUES, max_length=MESSAGE_VALUES)]
+    identity: Number
+    mode: Name | None = None
+    causes: list[Name] = []
+
+
+def header_from(payload: bytes) -> dict[str, Any]:
+    """The header in a message of `/configuration`. Raises Malformed."""
+    header = _parsed(payload)
+    number = header.get("format")
+    if isinstance(number, int) and number > FORMAT:
+        raise Malformed(f"recording format {_shown(number)} is newer than this version reads ({FORMAT})")
+    _require(_Header, header)
+    for key in ("axes", "observed", "columns"):
+        if len(set(header[key])) < len(header[key]):
+            raise Malformed(f"{key}: {_shown(header[key])}; a name may stand there once")
+    return header
+
+
+def require_columns(header: dict[str, Any]) -> None:
+    """Raise Malformed where the columns are not those of the axes and the observed signals."""
+    expected = list(signals.columns(header["axes"], header["observed"]))
+    if header["columns"] != expected:
+        raise Malformed(f"columns: {_shown(header['columns'])}; axes and observed make {_shown(expected)}")
+
+
+def event_from(payload: bytes, axes: Sequence[str]) -> Event:
+    """The event in a message of `/events`, of a recording with these axes. Raises Malformed."""
+    event = _parsed(payload)
+    _require(_Event, event)
+    kind, what = event["kind"], event["what"]
+    if event["axis"] is not None and event["axis"] not in axes:
+        raise Malformed(f"axis: {_shown(event['axis'])}; null or one of {', '.join(axes)} is allowed")
+    if kind == GAP or kind in FINAL:
+        _require(_Gap if kind == GAP else _Totals, what, "what.")
+        return event
+    for key, names in (("kind", Kind), ("who", Origin)):
+        if not known(names, event[key]):
+            raise Malformed(f"{key}: {_shown(event[key])}; {', '.join(names.__members__).lower()} or a number")
+    _require(_Message, what, "what.")
+    _require_command(kind, event["axis"], [_number(value) for value in what["values"]])
+    return event
+
+
+def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
+    """Raise Malformed where the loop could not execute a command."""
+    first, *parameters = values
+    if kind == "load_law" and axis is None:
+        raise Malformed("axis: null; a law is loaded for one axis")
+    allowed = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
+    if allowed and first not in allowed:
+        raise Malformed(f"what.values: {first:g} for the {kind[kind.index('_') + 1 :]}; "
+                        f"{', '.join(f'{one:d}' for one in allowed)} are allowed")  # fmt: skip
+    lowest = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
+    for least, value in zip(lowest, parameters, strict=False):
+        if not (value.is_integer() and least <= value <= LARGEST_TICK):
+            raise Malformed(f"what.values: {value:g}; a whole number from {least} is an index of a reference")
+
+
+def _number(value: Any) -> float:
+    """A number, or the word for one that JSON does not have."""
+    if value in ("nan", "inf", "-inf"):
+        return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    raise Malformed(f"what.values: {_shown(value)}; a number, 'nan', 'inf' or '-inf' is allowed")
+
+
+def _parsed(payload: bytes) -> dict[str, Any]:
+    try:
+        found = pydantic_core.from_json(payload, allow_inf_nan=False)
+    except ValueError:
+        raise Malformed("it is not JSON") from None
+    if not isinstance(found, dict):
+        raise Malformed(f"{_shown(found)}; an object is needed")
+    return found
+
+
+def _require(model: type[BaseModel], found: dict[str, Any], place: str = "") -> None:
+    try:
+        model.model_validate(found)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        where = place + ".".join(str(part) for part in first["loc"])
+        raise Malformed(f"{where}: {_shown(first['input'])}; {first['msg'].lower()}") from None
+
+
+def _shown(value: Any) -> str:
+    text = ascii(value)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 1]}…"

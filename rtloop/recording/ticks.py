@@ -1,0 +1,92 @@
+"""The ticks of a chunk: an array of records, of which each is checked to be one before a number of it is handed out.
+
+What is used as an index, a count or a time must be one: `tick`, `deadline_ns`, `periods_missed`, `flags`, `mode`,
+`driver_status`. Every other signal may be any double.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.recording import format
+from rtloop.recording.container import DamagedChunk
+from rtloop.signals import Mode
+
+LARGEST, LARGEST_NS = float(1 << 53), 1 << 62
+WHOLE = {
+    "tick": (0, LARGEST),
+    "deadline_ns": (0, LARGEST),
+    "periods_missed": (0, LARGEST),
+    "flags": (0, 2**32 - 1),
+    "mode": (min(Mode), max(Mode)),
+    "driver_status": (-(2**31), 2**31 - 1),
+}
+"""Columns of whole numbers, with the least and the largest."""
+
+
+class Ticks(NamedTuple):
+    """Columns of consecutive records, shape (n, columns), and the index of the first and of the last tick."""
+
+    rows: np.ndarray[Any, Any]
+    first: int
+    last: int
+
+
+class TickLayout:
+    """What the ticks of a recording with `columns` look like."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self.columns = tuple(columns)
+        self._blank = format.blank_ticks(self.columns, 1)
+        varying = ("_log_time", "_publish_time", *self.columns)
+        same = np.ones(self._blank.itemsize, bool)
+        for name in varying:
+            _, start, *_ = (self._blank.dtype.fields or {})[name]
+            same[start : start + 8] = False
+        self._fixed = np.flatnonzero(same)
+        self._fixed_bytes = self._blank.view(np.uint8)[self._fixed]
+
+    def ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
+        """The columns `names` of a chunk of ticks. Raises DamagedChunk."""
+        dtype = self._blank.dtype
+        if len(content) % dtype.itemsize:
+            raise DamagedChunk("its length is not that of whole ticks")
+        fixed = np.frombuffer(content, np.uint8).reshape(-1, dtype.itemsize)[:, self._fixed]
+        if not np.array_equal(fixed, np.broadcast_to(self._fixed_bytes, fixed.shape)):
+            raise DamagedChunk("it holds more than ticks")
+        records: np.ndarray[Any, Any] = np.frombuffer(content, dtype)
+        _require_whole(records)
+        _require_times(records)
+        tick = records["tick"]
+        return Ticks(format.tick_rows(records, names), int(tick[0]), int(tick[-1]))
+
+    def start_ns(self, content: bytes) -> int:
+        """Log time of the start of the run, in ns since the UNIX epoch, by a chunk of ticks. Raises DamagedChunk."""
+        ticks = self.ticks(content, ["deadline_ns"])
+        records: np.ndarray[Any, Any] = np.frombuffer(content, self._blank.dtype, count=1)
+        return int(records["_log_time"][0]) - int(ticks.rows[0, 0])
+
+
+def _require_whole(records: np.ndarray[Any, Any]) -> None:
+    for name, (low, high) in WHOLE.items():
+        values = records[name]
+        good = (values >= low) & (values <= high) & (values == np.floor(values))
+        if not good.all():
+            wrong = float(values[np.argmin(good)])
+            raise DamagedChunk(f"{name}: {wrong:g}; a whole number from {low:g} to {high:g} is allowed")
+
+
+def _require_times(records: np.ndarray[Any, Any]) -> None:
+    """Ticks and deadlines that grow, and log times that go with the deadlines."""
+    for name in ("tick", "deadline_ns"):
+        growing = np.diff(records[name]) > 0
+        if not growing.all():
+            row = int(np.argmin(growing)) + 1
+            raise DamagedChunk(f"out of order: {name} {records[name][row]:g} after {records[name][row - 1]:g}")
+    starts = records["_log_time"] - records["deadline_ns"].astype(np.uint64)
+    same = np.all(starts == starts[0]) and np.array_equal(records["_publish_time"], records["_log_time"])
+    if not same or records["_log_time"].max() >= LARGEST_NS:
+        raise DamagedChunk("its log times do not go with its deadlines")

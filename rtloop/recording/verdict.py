@@ -1,0 +1,73 @@
+"""What a replay says of a recording: what was compared, what was not and why, and what no replay can judge."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rtloop import signals
+
+MEASURED = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
+"""Columns that a clock made and that no output depends on; so is the flag OVERRUN."""
+
+
+@dataclass
+class ReplayReport:
+    """`ticks` compared, `gaps` between them, `not_verified` of what was recorded and why, the first difference, if any.
+
+    What the recorder itself says it never had (a gap in its ring) is a gap, and nothing that was recorded.
+    """
+
+    ticks: int = 0
+    gaps: list[dict[str, int]] = field(default_factory=list)
+    not_verified: list[dict[str, Any]] = field(default_factory=list)
+    snapshots: int = 0
+    first_difference: dict[str, Any] | None = None
+    problems: list[str] = field(default_factory=list)
+    not_judged: list[str] = field(default_factory=list)
+
+    @property
+    def identical(self) -> bool:
+        """Every recorded tick was executed and compared, in order, once, and none differed."""
+        return self.ticks > 0 and self.first_difference is None and not self.not_verified
+
+    @property
+    def unverified(self) -> int:
+        """Recorded ticks that were not compared, as far as their number is known."""
+        return sum(entry["count"] or 0 for entry in self.not_verified)
+
+    def pass_over(self, first_tick: int | None, count: int | None, why: str) -> None:
+        """Note what is not verified; what follows on the same for the same reason is one."""
+        if self.not_verified and first_tick is not None and count is not None:
+            last = self.not_verified[-1]
+            if last["why"] == why and last["count"] and last["first_tick"] + last["count"] == first_tick:
+                last["count"] += count
+                return
+        self.not_verified.append({"first_tick": first_tick, "count": count, "why": why})
+
+    def as_dict(self) -> dict[str, Any]:
+        """The object of `rtloop replay --json`."""
+        return {
+            "ticks": self.ticks,
+            "identical": self.identical,
+            "first_difference": self.first_difference,
+            "not_verified": self.not_verified,
+            "unverified": self.unverified,
+            "gaps": self.gaps,
+            "snapshots_compared": self.snapshots,
+            "problems": self.problems,
+            "not_judged": self.not_judged,
+        }
+
+
+def not_judged(header: Mapping[str, Any]) -> list[str]:
+    """What no replay can judge: nothing that the law computes depends on it."""
+    return [
+        f"measured times: {', '.join(signals.COMMON[column].name for column in MEASURED)}, flag OVERRUN, rate_hz, host",
+        "inputs as far as no output depends on them: adc_v, reference_um, deadline_ns, periods_missed, sample_age_us, "
+        "enable_v",
+        f"observed signals: {', '.join(header['observed']) or 'there are none'}",
+        "events but for the commands that the law obeys: generators of references, texts, who, time_ns, identity",
+        "the state that the first snapshot starts from; the configuration's text",
+    ]

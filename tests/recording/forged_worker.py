@@ -1,0 +1,155 @@
+"""Uses forged recordings in a process of its own, so that what kills it is known: `… FOLDER FIRST COUNT [EVERY]`.
+
+Prints a line of JSON before each file (its number) and after it (what came of each command). Every use must end with
+an exit code of the command line, within its time and memory, and `identical` is held against the stock reader.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import signal
+import sys
+import traceback
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from click.testing import CliRunner
+from mcap.reader import NonSeekingReader
+
+from rtloop import signals
+from rtloop.cli import main
+from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK, axis_column
+from tests.recording.forging import TICKS, Base, Forgery, bases, forged, packed
+
+SECONDS = 30
+CODES = (0, 1, 66, 73, 78)
+SHORT_TAGS = 15
+COMPUTED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
+COMMANDS = {"set_mode": ("value",), "reset_trip": (), "stop": (), "load_law": ("axis", "value")}
+"""Kinds that a replay executes, and what the loop looks at in each."""
+USES: dict[str, list[str]] = {
+    "info": ["info", "run.mcap", "--json"],
+    "info, words": ["info", "run.mcap"],
+    "replay": ["replay", "run.mcap", "--json"],
+    "replay, words": ["replay", "run.mcap"],
+    "page": ["plot", "run.mcap", "--html"],
+    "csv": ["export", "run.mcap", "--to", "csv"],
+    "recover": ["recover", "run.mcap", "--json"],
+    "plot": ["plot", "run.mcap"],
+    "resimulate": ["replay", "run.mcap", "--resimulate", "--json"],
+}
+SELDOM = ("info, words", "replay, words", "plot", "resimulate")
+
+
+class Executed(NamedTuple):
+    """What a replay compares of each tick, the snapshots of the law, the commands."""
+
+    ticks: list[bytes]
+    snapshots: list[bytes]
+    commands: list[Any]
+
+
+class Hang(BaseException):
+    """A command takes too long."""
+
+
+def executed(path: Path, axes: int) -> Executed:
+    """What of a file a replay executes and compares, by the stock reader, which goes through it without its index."""
+    found = Executed([], [], [])
+    with path.open("rb") as file:
+        for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+            if channel.topic == "/ticks":
+                found.ticks.append(_compared(message.data, axes))
+            elif channel.topic == "/law":
+                found.snapshots.append(message.data)
+            elif channel.topic == "/events":
+                event = json.loads(message.data)
+                if event["kind"] in COMMANDS:
+                    obeyed = {"axis": event["axis"], "value": event["what"]["values"][0]}
+                    found.commands.append(
+                        (event["tick"], event["kind"], *(obeyed[key] for key in COMMANDS[event["kind"]]))
+                    )
+    return found
+
+
+def _compared(data: bytes, axes: int) -> bytes:
+    """Tick, mode and what the law computes, from the fields of a message: a tag, then eight bytes."""
+    tags = [1 if field < SHORT_TAGS else 2 for field in range(COMMON_COUNT + axes * PER_AXIS_COUNT)]
+    starts = [sum(tags[: field + 1]) + 8 * field for field in range(len(tags))]
+    computed = [axis_column(axis, signal) for axis in range(axes) for signal in COMPUTED]
+    return b"".join(data[starts[field] : starts[field] + 8] for field in (TICK, MODE, *computed))
+
+
+def use(forgery: Forgery, folder: Path, names: list[str], base: Base, original: Executed) -> dict[str, str]:
+    """What came of each command: its exit code, or how it failed."""
+    outcomes = {}
+    for name in names:
+        for left in folder.iterdir():
+            left.unlink()
+        (folder / "run.mcap").write_bytes(forgery.data)
+        arguments = [str(folder / word) if word == "run.mcap" else word for word in USES[name]]
+        outcomes[name] = outcome = _outcome(arguments)
+        if name == "replay" and outcome == "0" and _wrongly_identical(forgery, folder / "run.mcap", base, original):
+            outcomes[name] = "wrongly identical"
+    return outcomes
+
+
+def _outcome(arguments: list[str]) -> str:
+    signal.alarm(SECONDS)
+    try:
+        result = CliRunner().invoke(main, arguments)
+    except Hang:
+        return "hang"
+    finally:
+        signal.alarm(0)
+    error = result.exception
+    if error is not None and not isinstance(error, SystemExit):
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return f"traceback {type(error).__name__}: {str(error)[:80]} ({Path(last.filename).name}:{last.lineno})"
+    if "Warning" in result.stderr:
+        return f"warning {result.stderr[-150:]}"
+    if result.exit_code not in CODES:
+        return f"exit {result.exit_code}"
+    if result.exit_code == 66 and not (result.stderr.startswith("rtloop: ") and result.stderr.count("\n") == 1):
+        return f"message {result.stderr[:100]!r}"
+    return str(result.exit_code)
+
+
+def _wrongly_identical(forgery: Forgery, path: Path, base: Base, original: Executed) -> bool:
+    try:
+        found = executed(path, len(base.header["axes"]))
+    except Exception:  # the stock reader has many ways to give up
+        return forgery.renewed
+    kept = forgery.origin or set(found.snapshots) <= set(original.snapshots)  # one less is compared, and no tick
+    return not kept or (found.ticks, found.commands) != (original.ticks, original.commands)
+
+
+def _hang(*_: object) -> None:
+    raise Hang
+
+
+def run(folder: Path, first: int, count: int, every: int) -> None:
+    """Use `count` forgeries from number `first` on; the slow commands on one in `every`."""
+    signal.signal(signal.SIGALRM, _hang)
+    good: list[Base] = bases(folder)
+    originals = []
+    for base in good:
+        (folder / "whole.mcap").write_bytes(packed(base))
+        originals.append(executed(folder / "whole.mcap", len(base.header["axes"])))
+        assert len(originals[-1].ticks) == TICKS
+    place = folder / "use"
+    place.mkdir()
+    for number in range(first, first + count):
+        forgery = forged(good, number)
+        print(json.dumps({"number": number, "what": forgery.what}), flush=True)
+        names = [name for name in USES if name not in SELDOM or number % every == 0]
+        outcomes = use(forgery, place, names, good[number % len(good)], originals[number % len(good)])
+        peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+        print(json.dumps({"number": number, "outcomes": outcomes, "peak_mib": peak_mib}), flush=True)
+    shutil.rmtree(place)
+
+
+if __name__ == "__main__":
+    run(Path(sys.argv[1]), *map(int, sys.argv[2:5]))

@@ -1,0 +1,31 @@
+"""The fields of a snapshot of the law, and whole numbers to put into them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+
+COUNTS = (-(2**63), -(2**31), -129, -2, -1, 0, 1, 2, 3, 4, 5, 25, 65, 129, 255, 4_000, 2**31, 2**62, 2**63 - 1)
+
+
+class Field(NamedTuple):
+    """Owner and name, type, and offset in the snapshot."""
+
+    name: str
+    dtype: np.dtype[Any]
+    start: int
+
+
+def fields_of(axes: Sequence[str]) -> list[Field]:
+    """Every field of every record, and the tick in front of them."""
+    offset, fields = 8, [Field("tick", np.dtype("<u8"), 0)]
+    tables = [(axis, COEFFICIENTS) for axis in axes] + [(axis, STATE) for axis in axes] + [("loop", LOOP_STATE)]
+    for owner, table in tables:
+        for name, (dtype, start, *_) in (table.fields or {}).items():
+            fields.append(Field(f"{owner}.{name}", dtype, offset + start))
+        offset += table.itemsize
+    return fields

@@ -1,0 +1,34 @@
+"""A sample of forged recordings: nothing crashes, hangs or shows a traceback, and none is wrongly called identical."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.recording.forged_worker import CODES
+
+ROOT = Path(__file__).resolve().parents[2]
+COUNT, EVERY = 40, 20
+MOST_MIB = 600
+
+
+def test_a_sample_of_forged_files(tmp_path: Path):
+    """`make soak-forged` uses 10 000."""
+    command = [sys.executable, "-m", "tests.recording.forged_worker", tmp_path, "0", str(COUNT), str(EVERY)]
+    worker = subprocess.run([str(word) for word in command], cwd=ROOT, capture_output=True, text=True, check=False)
+    lines = [json.loads(line) for line in worker.stdout.splitlines()]
+    assert worker.returncode == 0, (lines[-1], worker.stderr[-1_000:])
+    assert len(lines) == 2 * COUNT
+    good = {str(code) for code in CODES}
+    wrong = [
+        (begun["what"], use, outcome)
+        for begun, ended in zip(lines[::2], lines[1::2], strict=True)
+        for use, outcome in ended["outcomes"].items()
+        if outcome not in good
+    ]
+    assert not wrong
+    outcomes = [line["outcomes"]["replay"] for line in lines[1::2]]
+    assert {"0", "1", "66"} <= set(outcomes)
+    assert lines[-1]["peak_mib"] < MOST_MIB

@@ -1,0 +1,190 @@
+"""What a file says is checked where it enters: counts, indices, numbers and texts, each named in the message."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.law.layout import MAX_ORDER, MAX_PLAYS, MAX_SECTIONS, MAX_TAPS
+from rtloop.recording import format
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import load
+from rtloop.recording.recover import recover
+from rtloop.recording.replay import replay
+from rtloop.recording.summary import summarise
+from rtloop.replaying import replay_on_the_rig
+from rtloop.running import recover_leftovers
+from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed, with_snapshot
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def with_event(base: Base, kind: str, change: Any) -> bytes:
+    """The file with one event changed by `change`, or replaced by it where it is bytes."""
+    for i, j in base.messages(format.EVENTS):
+        messages = base.chunks[i].messages
+        event = json.loads(messages[j].payload)
+        if event["kind"] == kind:
+            if not isinstance(change, bytes):
+                change(event)
+            payload = change if isinstance(change, bytes) else json.dumps(event).encode()
+            messages[j] = messages[j]._replace(payload=payload)
+            return packed(base.with_chunk(i, base.chunks[i].with_messages(messages)))
+    raise AssertionError(kind)
+
+
+def with_tick(base: Base, column: str, value: float) -> bytes:
+    """The file with one number of the fourth tick of the third chunk of ticks replaced."""
+    i = [i for i, chunk in enumerate(base.chunks) if not chunk.channels][2]
+    records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
+    records[column][3] = value
+    return packed(base.with_chunk(i, Chunk(records.tobytes())))
+
+
+INDICES = [
+    *[("x.tap_count", value, f"0 to {MAX_TAPS}") for value in (-1, MAX_TAPS + 1, 2**40)],
+    *[("x.section_count", value, f"0 to {MAX_SECTIONS}") for value in (-1, MAX_SECTIONS + 1)],
+    *[("x.play_count", value, f"a multiple of 4 from 0 to {MAX_PLAYS}") for value in (3, 68, 255)],
+    *[("x.order", value, f"a multiple of 8 from 0 to {MAX_ORDER}") for value in (4, 32, 255)],
+    *[("x.row_start", value, f"0 to {MAX_ORDER}") for value in (25, 255)],
+    *[("x.row_stop", value, f"0 to {MAX_ORDER}") for value in (25, 255)],
+    ("x.coupled", 2, "0 to 1"),
+    *[("x.tap_index", value, "-1 to 3") for value in (-2, 4, 10**6)],
+    *[("x.entering", value, "0 to 2") for value in (-1, 3)],
+    ("x.usable", 2, "0 to 1"),
+    ("x.swing_direction", 2, "-1 to 1"),
+    ("x.late_count", -1, "0 to "),
+    ("x.frozen_ticks", -1, "0 to "),
+    *[("loop.mode", value, "0 to 3") for value in (-1, 4)],
+    ("loop.settled", -1, "0 to 1"),
+    ("loop.trip", 1, "bits of "),
+]
+
+
+@pytest.mark.parametrize(("field", "value", "allowed"), INDICES)
+def test_counts_and_indices_of_a_snapshot_are_refused(field: str, value: int, allowed: str, base: Base, tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    for which in (0, 2):
+        path.write_bytes(with_snapshot(base, field, value, which))
+        with pytest.raises(RecordingError, match=rf"run\.mcap: .*{field.partition('.')[2]}.*: {value}; {allowed}"):
+            replay(load(path))
+    path.write_bytes(with_snapshot(base, field, value))
+    with pytest.raises(RecordingError, match=field.partition(".")[2]):
+        replay_on_the_rig([path], None)
+
+
+def test_uncompiled_kernels_see_an_index_out_of_range_and_none_in_what_is_let_through(base: Base):
+    """The law in numpy, whose indices are checked: over what is refused it trips up, over what is accepted never."""
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)}
+    i, j = base.messages(format.LAW)[1]
+    whole = base.chunks[i].messages[j].payload[DIGEST_BYTES:]
+    command = [sys.executable, "-m", "tests.recording.uncompiled_law"]
+    done = subprocess.run(command, input=whole, cwd=ROOT, env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()[-2_000:]
+    counts = json.loads(done.stdout)
+    assert counts["accepted"] > 100
+    assert counts["refused"] > 100
+    assert counts["accepted, out of range"] == 0
+    assert counts["refused, out of range"] > 20
+
+
+def forbidden(key: str, value: Any) -> Any:
+    """A change of `what`."""
+    return lambda event: event["what"].update({key: value})
+
+
+EVENTS = [
+    ("set_mode", b"{", "not JSON"),
+    ("set_mode", b"null", "object"),
+    ("set_mode", b"\xff\xfe", "not JSON"),
+    ("set_mode", b"[" * DEEP, "not JSON"),
+    ("set_mode", lambda event: event.update(tick=-1), "tick"),
+    ("set_mode", lambda event: event.update(tick=10**400), "tick"),
+    ("set_mode", lambda event: event.update(axis="y"), "axis.*'y'.*x"),
+    ("set_mode", lambda event: event.update(who="[/red]"), "who"),
+    ("set_mode", forbidden("values", [7.0, *[0.0] * 11]), "7 for the mode"),
+    ("set_mode", forbidden("values", [3.0]), "values"),
+    ("set_mode", forbidden("identity", None), "identity"),
+    ("load_law", lambda event: event.update(axis=None), "axis"),
+    ("load_law", forbidden("values", [2.0, *[0.0] * 11]), "2"),
+    ("set_reference", forbidden("values", [6.0, *[0.0] * 11]), "6"),
+    ("set_reference", forbidden("values", [1.0, -5.0, 10.0, 1.0, *[0.0] * 8]), "-5"),
+    ("finished", forbidden("ticks_executed", "many"), "ticks_executed"),
+    ("finished", lambda event: event.pop("what"), "what"),
+]
+
+
+@pytest.mark.parametrize(("kind", "change", "said"), EVENTS)
+def test_malformed_events_are_problems_by_name(kind: str, change: Any, said: str, base: Base, tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(with_event(base, kind, change))
+    assert any(re.search(f"event.*{said}", problem) for problem in summarise(path)["problems"])
+    assert any(re.search(f"event.*{said}", problem) for problem in load(path).problems)
+    assert not replay(load(path)).identical
+    assert any(re.search(f"event.*{said}", problem) for problem in recover(path)["problems"])
+
+
+def test_a_leftover_that_cannot_be_read_does_not_stop_the_recovery_of_others(
+    base: Base, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    whole = packed(base)
+    (tmp_path / "a.mcap.part").write_bytes(with_event(base, "set_mode", b"{"))
+    (tmp_path / "b.mcap.part").write_bytes(packed(base, first_chunk(b"{", base.header["columns"])))
+    (tmp_path / "c.mcap.part").write_bytes(whole[: len(whole) * 2 // 3])
+    recover_leftovers(tmp_path)
+    said = capsys.readouterr().err
+    assert (tmp_path / "a.mcap").exists()
+    assert "event" in said
+    assert f"warning: {tmp_path / 'b.mcap.part'}: " in said
+    assert (tmp_path / "c.mcap").exists()
+
+
+HEADERS = [
+    ("format", "1", "format"),
+    ("format", True, "format"),
+    ("rate_hz", -0.0, "rate_hz"),
+    ("rate_hz", float("inf"), "not JSON"),
+    ("axes", [], "axes"),
+    ("axes", ["x", "x"], "axes"),
+    ("axes", ["y"], "axes"),
+    ("observed", "none", "observed"),
+    ("observed", ["x_true_position_um"], "observed"),
+    ("created_unix_ns", 2**63, "created_unix_ns"),
+    ("law", None, "law"),
+    ("configuration", 5, "configuration"),
+    ("sequence", -1, "sequence"),
+    ("first_tick", 0.5, "first_tick"),
+    ("name", "$x^$\0", "name"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "said"), HEADERS)
+def test_malformed_headers_are_refused_by_name(key: str, value: Any, said: str, base: Base, tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    header = {**base.header, key: value}
+    path.write_bytes(packed(base, first_chunk(header, base.header["columns"])))
+    with pytest.raises(RecordingError, match=rf"run\.mcap: .*{said}") as caught:
+        replay(load(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("tick", np.nan), ("tick", -1.0), ("tick", 3.5), ("deadline_ns", np.inf), ("deadline_ns", 1e19), ("flags", np.nan),
+     ("flags", 0.5), ("mode", 4.0), ("mode", np.inf), ("periods_missed", -1.0), ("driver_status", 1e10)],
+)  # fmt: skip
+def test_ticks_that_cannot_be_are_left_out_and_named(column: str, value: float, base: Base, tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(with_tick(base, column, value))
+    summary = summarise(path)
+    assert (summary["ticks_logged"], summary["complete"]) == (500, False)
+    assert any(column in problem for problem in summary["problems"])
+    assert not replay(load(path)).identical

@@ -1,0 +1,68 @@
+"""The law without its compiler, on forged snapshots: numpy raises where the compiled kernels would write anywhere.
+
+Run as a module with NUMBA_DISABLE_JIT=1 and a good snapshot of one axis on stdin; prints how many snapshots were
+accepted and refused, and how many of each, with the check taken out, reach beyond an array.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from unittest.mock import patch
+
+import numpy as np
+
+from rtloop.law import layout
+from rtloop.law.law import evaluate, update
+from rtloop.law.layout import CONDITIONS, records
+from rtloop.signals import Mode
+from tests.recording.law_fields import COUNTS, fields_of
+
+TICKS, SEED, TRIES = 2, 3, 400
+
+
+def reaches_beyond(data: bytes, axes: int) -> bool:
+    """Whether the law, run from a snapshot whatever it says, leaves its arrays."""
+    with patch.object(layout, "require_allowed"):
+        _, coefficients, states, loop = layout.split_snapshot(data, axes)
+    loop.mode = Mode.CLOSED_LOOP
+    conditions = records(CONDITIONS, 1)[0]
+    try:
+        with np.errstate(all="ignore"):
+            for _ in range(TICKS):
+                evaluate(coefficients, states, loop[0], np.zeros(axes), np.ones(axes), conditions)
+                update(coefficients, states, loop[0])
+    except IndexError:
+        return True
+    return False
+
+
+def accepted(data: bytes, axes: int) -> bool:
+    """Whether a snapshot is let through."""
+    try:
+        layout.split_snapshot(data, axes)
+    except ValueError:
+        return False
+    return True
+
+
+def main() -> None:
+    """Forge whole numbers of a good snapshot."""
+    random, counts = np.random.default_rng(SEED), {"accepted": 0, "refused": 0}
+    beyond = {"accepted": 0, "refused": 0}
+    whole = sys.stdin.buffer.read()
+    fields = [field for field in fields_of(["x"]) if field.dtype.base.kind in "iu"]
+    for number in range(TRIES):
+        data = bytearray(whole)
+        _, dtype, start = fields[number % len(fields)]
+        start += int(random.integers(max(int(np.prod(dtype.shape)), 1))) * dtype.base.itemsize
+        value = np.array(COUNTS[int(random.integers(len(COUNTS)))]) if number % 3 else np.array(random.integers(5))
+        data[start : start + dtype.base.itemsize] = value.astype(dtype.base).tobytes()
+        kind = "accepted" if accepted(bytes(data), 1) else "refused"
+        counts[kind] += 1
+        beyond[kind] += reaches_beyond(bytes(data), 1)
+    print(json.dumps({**counts, **{f"{kind}, out of range": count for kind, count in beyond.items()}}))
+
+
+if __name__ == "__main__":
+    main()
