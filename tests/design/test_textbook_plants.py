@@ -14,6 +14,7 @@ from rtloop.config import load
 from rtloop.design.synthesise import synthesise
 from rtloop.design.transfer import Transfer
 from rtloop.design.weights import PAPER_WEIGHTS
+from rtloop.prepare import prepare
 
 RATE_HZ = 10_000.0
 HALF_RATE_RAD_S = math.pi * RATE_HZ
@@ -53,15 +54,14 @@ def run(*arguments: str | Path) -> Result:
 @pytest.mark.parametrize("modes", [ONE_MODE, TWO_MODES], ids=["one mode", "two modes"])
 @pytest.mark.parametrize("delay_ticks", [0, 3])
 def test_what_is_written_passes_check(tmp_path, modes, delay_ticks) -> None:
-    """Warnings are errors here, so none of them reaches a terminal either."""
+    """What `check` refuses, `prepare` raises. Warnings are errors here, so none of them reaches a terminal either."""
     out = tmp_path / "written.toml"
     made = run("design", "synthesise", specification(tmp_path, modes, 8.0, delay_ticks), "--out", out)
     assert made.exit_code == 0, made.output
-    checked = run("check", out, "--json")
-    assert checked.exit_code == 0, checked.output
-    running = json.loads(checked.stdout)["axes"][0]["running"]
-    assert running["stable"]
-    assert running["delay_ticks"] == delay_ticks
+    (check,) = prepare(load(out)).checks
+    assert check.running is not None
+    assert check.running.stable
+    assert check.running.delay_ticks == delay_ticks
 
 
 @pytest.mark.parametrize("modes", [ONE_MODE, TWO_MODES], ids=["one mode", "two modes"])
