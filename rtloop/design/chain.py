@@ -54,9 +54,10 @@ def designed(hysteresis: Measured, step: Measured, design: DesignOptions, order:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     shape = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
-    dynamics = identify_dynamics(excitation, order)
+    dynamics = identify_dynamics(excitation, order, criterion="held-out")
     plant = ModelOptions.model_validate(model_values(dynamics))
-    asked = design.model_copy(update={"plant": plant})
+    output = design.controller.model_copy(update={"rate_hz": 1 / step.period_s})
+    asked = design.model_copy(update={"plant": plant, "controller": output})
     return Chain(shape, dynamics, with_gain(shape.model, dynamics.static_gain), asked, synthesise_design(asked))
 
 
