@@ -8,11 +8,13 @@ Driver, limits and interlocks are those of the configuration that the step was r
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from rtloop.design.compare import LIGHT_DAMPING
 from rtloop.design.identified import (
     dynamics_provenance,
     feedforward_section,
@@ -32,6 +34,8 @@ from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import ModelOptions
 
 AT_REST = {"kind": "hold", "value": 0.0}
+SWINGS = 8
+"""Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +85,23 @@ def configuration_text(
         "specification": spec_name,
         "reference": AT_REST,
     }
-    raw["axis"] = [_replaced(one, parts) if one is _chosen(raw["axis"], axis) else one for one in raw["axis"]]
+    chosen = _chosen(raw["axis"], axis)
+    parts["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), chain.dynamics, step.period_s)
+    raw["axis"] = [_replaced(one, parts) if one is chosen else one for one in raw["axis"]]
     heading = [
         *hysteresis_provenance(chain.hysteresis, [hysteresis]),
         *dynamics_provenance(chain.dynamics, step, "hysteresis"),
         *comments,
     ]
     return section("", raw, heading)
+
+
+def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
+    """The interlocks with that against a growing resonance on: it is off where a stage shall ring without control."""
+    lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
+    if lowest_hz is None or interlocks.get("oscillation_swings", 0):
+        return dict(interlocks)
+    return {**interlocks, "oscillation_swings": SWINGS, "swing_ticks": math.ceil(0.75 / (lowest_hz * period_s))}
 
 
 def _section(content: str, name: str) -> Any:

@@ -40,12 +40,12 @@ class Excitation:
 
 
 def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
-    """Models of increasing order, until, behind the last gap, two more poles in turn do not pay."""
+    """Models of increasing order, from two poles below the last gap until, behind it, two more in turn do not pay."""
     guesses = _guesses(run)
     gap = guesses.gap(max(orders))
     found: list[Innovations] = []
     errors: list[float] = []
-    for order in orders:
+    for order in orders if len(orders) == 1 else [one for one in orders if one >= gap - 2]:
         start = guesses.model(order)
         if start is None and found and found[-1].order == order - 1:
             start = _grown(found[-1])
