@@ -26,7 +26,8 @@ noise."""
 ENOUGH_POLES = 9
 """An input that can tell so many apart has no gap in its spectrum, and can tell more."""
 EVALUATIONS = 20
-USELESS = 1e6
+USELESS, STEEPEST = 1e6, 1e30
+"""Stand in for errors and slopes of trial models that blow up."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,12 @@ def _descended(model: Innovations, run: Excitation, *, noise: bool) -> Innovatio
 
     def jacobian(values: Real) -> Real:
         tried = model.unpack(values, noise=noise)
-        return tried.sensitivities(run.input, errors(values), noise=noise).T
+        found = tried.sensitivities(run.input, errors(values), noise=noise).T
+        return np.clip(np.nan_to_num(found, nan=STEEPEST), -STEEPEST, STEEPEST)
 
     settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
-    found = least_squares(errors, model.pack(noise=noise), jacobian, **settings)  # pyright: ignore[reportArgumentType]
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = least_squares(errors, model.pack(noise=noise), jacobian, **settings)  # pyright: ignore[reportArgumentType]
     return model.unpack(found.x, noise=noise)
 
 

@@ -88,7 +88,7 @@ def modal_rig(seed: int) -> ModalRig:
     """The rig of this seed."""
     random = np.random.default_rng(seed)
     count, delay_ticks = int(random.integers(1, 7)), int(random.integers(0, 4))
-    hz = np.zeros(2)
+    hz = np.empty(0)
     while hz.size != count or np.any(np.diff(np.log(hz)) < 0.15):
         hz = np.sort(np.exp(random.uniform(np.log(150.0), np.log(3000.0), count)))
     damping = np.exp(random.uniform(np.log(0.002), np.log(0.05), count))

@@ -109,3 +109,16 @@ def test_what_does_not_run_is_refused_with_what_would_help(tmp_path) -> None:
     assert made.exit_code == 1
     assert "settling" in made.stderr
     assert "Traceback" not in made.output
+
+
+def test_a_plant_of_repeated_poles_gets_a_rig_that_takes_them(tmp_path) -> None:
+    out, spec = tmp_path / "written.toml", specification(tmp_path, ONE_MODE)
+    text = spec.read_text(encoding="utf-8")
+    start, end = text.index("gain ="), text.index("[specification]")
+    plant = (
+        "gain = 1e24\nnumerator = []\ndenominator = [[1.0, 1e6], [1.0, 1e6], [1.0, 2000.0, 1e6], [1.0, 1000.0, 1e6]]\n"
+    )
+    spec.write_text(text[:start] + plant + text[end:], encoding="utf-8")
+    made = run("design", "synthesise", spec, "--out", out)
+    assert made.exit_code == 0, made.output
+    assert prepare(load(out)).checks[0].running is not None
