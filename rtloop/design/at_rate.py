@@ -13,12 +13,15 @@ import numpy as np
 from hil.linear import Complex
 from rtloop.design.closedloop import discrete_loop
 from rtloop.design.discretise import Method, discretise
+from rtloop.design.margins import margins
 from rtloop.design.transfer import Transfer
 from rtloop.law.layout import MAX_ORDER
 
 FAR = 1000.0
 """A root beyond so many times half the sampling rate turns the phase there by less than 0.06°: it is left out."""
 MOST_DEAD_TIME_ORDER = 6
+LARGEST_SENSITIVITY = 3.0
+"""max |S| of a loop that may be written; 1/3 is its distance from −1, and 2 is what textbooks ask for."""
 
 
 def dead_time(delay_s: float, order: int) -> Transfer:
@@ -55,14 +58,18 @@ def within_rate(transfer: Transfer, rate_hz: float) -> Transfer:
 def runs(
     controller: Transfer, plant: Transfer, rate_hz: float, method: Method, prewarp_hz: float | None, delay_ticks: int
 ) -> bool:
-    """Whether the loop can run at this rate and is stable then: C(z), the plant behind its hold and delay."""
+    """Whether the loop can run at this rate, C(z) with the plant behind its hold and delay: stable, and not barely so.
+
+    Near half the rate C(z) differs from C(s); a light mode there may leave a loop that is stable on the model alone.
+    """
     if controller.order > MAX_ORDER:
         return False
     try:
         discrete = discretise(controller, 1 / rate_hz, method, prewarp_hz)
     except ValueError:
         return False
-    return discrete_loop(discrete, plant, delay_ticks).is_stable
+    loop = discrete_loop(discrete, plant, delay_ticks)
+    return loop.is_stable and margins(loop).max_sensitivity <= LARGEST_SENSITIVITY
 
 
 def _parted(roots: Complex, kept: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from rtloop.design.compare import LIGHT_DAMPING
 from rtloop.design.identified import (
     dynamics_provenance,
@@ -24,7 +26,7 @@ from rtloop.design.identified import (
 )
 from rtloop.design.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.measured import Measured, UnsuitableData
+from rtloop.design.measured import Measured, UnsuitableData, noise_of
 from rtloop.design.plays import model_output
 from rtloop.design.section import controller_section
 from rtloop.design.specification import DesignOptions
@@ -33,6 +35,8 @@ from rtloop.design.toml_text import section
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import ModelOptions
 
+LARGEST_ERROR = 3.0
+"""A loop is not designed on a model whose prediction errs by more than so many times the noise."""
 AT_REST = {"kind": "hold", "value": 0.0}
 SWINGS = 8
 """Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
@@ -59,6 +63,13 @@ def designed(hysteresis: Measured, step: Measured, design: DesignOptions, order:
     shape = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
+    noise_um = max(noise_of(step.position_um), 1e-6 * float(np.ptp(step.position_um)))
+    if dynamics.rms_error_um > LARGEST_ERROR * noise_um:
+        raise UnsuitableData(
+            f"{step.name}: no model explains it: order {dynamics.model.order} behind {dynamics.delay_ticks} samples errs by "
+            f"{dynamics.rms_error_um:.3g} µm rms, {LARGEST_ERROR:g} times the noise of {noise_um:.3g} µm is allowed; a longer "
+            "record, a step up and down, or a larger one would help"
+        )
     plant = ModelOptions.model_validate(model_values(dynamics))
     output = design.controller.model_copy(update={"rate_hz": 1 / step.period_s})
     asked = design.model_copy(update={"plant": plant, "controller": output})

@@ -20,8 +20,8 @@ from rtloop.design.innovations import Innovations
 
 ARX_ORDER = 40
 HANKEL_ROWS = 150
-GAP = 8.0
-"""Noise makes singular values that fall slowly; what stands so much above the next is a mode."""
+CLEAR, LIKELY = 8.0, 3.0
+"""Noise makes singular values that fall slowly; what stands so much above the next is a mode, or most likely one."""
 SMALLEST_IMAGE = 1e-3
 """Poles in z nearer to 0 are a delay, which has no rate."""
 
@@ -49,10 +49,10 @@ class Guesses:
         self._matrix = hankel(g[: rows + 1], g[rows : 2 * rows])
         self._left, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
 
-    def gap(self, most: int) -> int:
-        """The order, at most `most`, behind which the singular values last fall by GAP; 0 where they nowhere do."""
+    def gap(self, most: int, fall: float) -> int:
+        """The order, at most `most`, behind which the singular values last fall by `fall`; 0 where they nowhere do."""
         values = self.singular_values[: most + 1]
-        falls = np.flatnonzero(values[:-1] > GAP * values[1:])
+        falls = np.flatnonzero(values[:-1] > fall * values[1:])
         return int(falls[-1]) + 1 if falls.size else 0
 
     def model(self, order: int) -> Innovations | None:

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from hil.linear import Real
 from rtloop.design.innovations import Innovations
-from rtloop.design.markov import HANKEL_ROWS, Guesses, impulse_response, with_residues
+from rtloop.design.markov import CLEAR, HANKEL_ROWS, LIKELY, Guesses, impulse_response, with_residues
 from rtloop.design.measured import noise_of
 
 LARGEST_ORDER = 14
@@ -41,12 +41,13 @@ class Excitation:
 
 
 def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
-    """Models of increasing order, from two poles below the last gap until, behind it, two more in turn do not pay."""
+    """Models of increasing order, from two poles below the last clear gap of the impulse response's singular values
+    until, behind the last likely one, two more in turn do not pay."""
     guesses = _guesses(run)
-    gap = guesses.gap(max(orders))
+    clear, likely = guesses.gap(max(orders), CLEAR), guesses.gap(max(orders), LIKELY)
     found: list[Innovations] = []
     errors: list[float] = []
-    for order in orders if len(orders) == 1 else [one for one in orders if one >= gap - 2]:
+    for order in orders if len(orders) == 1 else [one for one in orders if one >= clear - 2]:
         start = guesses.model(order)
         if start is None and found and found[-1].order == order - 1:
             start = _grown(found[-1])
@@ -55,7 +56,7 @@ def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
             continue
         found.append(model)
         errors.append(rms_error(model, run))
-        if order > gap and len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
+        if order > likely and len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
             break
     return found
 
@@ -63,7 +64,7 @@ def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
 def model_at_gap(run: Excitation, orders: Sequence[int]) -> Innovations | None:
     """One model, of the order within `orders` that the impulse response shows; None where none is stable."""
     guesses = _guesses(run)
-    start = guesses.model(guesses.gap(max(orders)) if len(orders) > 1 else orders[0])
+    start = guesses.model(guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0])
     return start and refined(with_residues(start, run.input, run.position_um), run)
 
 

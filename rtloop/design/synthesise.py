@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.at_rate import dead_time, runs, within_rate
+from rtloop.design.at_rate import LARGEST_SENSITIVITY, dead_time, runs, within_rate
 from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
 from rtloop.design.closedloop import realised
 from rtloop.design.hinf import Hinf, NoController, smallest_gamma, synthesise_hinf
@@ -81,8 +81,8 @@ def synthesise(
         )
     raise DoesNotRun(
         f"specification: γ = {found.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
-        f"to {full.order} leaves a stable loop as it runs; a longer settling_ms (a smaller bandwidth_hz) or a higher "
-        "rate would help"
+        f"to {full.order} leaves a loop that is stable as it runs, with max |S| ≤ {LARGEST_SENSITIVITY:g}; a longer "
+        "settling_ms (a smaller bandwidth_hz) or a higher rate would help"
     )
 
 
