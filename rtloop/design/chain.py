@@ -35,8 +35,9 @@ from rtloop.design.toml_text import section
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import ModelOptions
 
-LARGEST_ERROR = 3.0
-"""A loop is not designed on a model whose prediction errs by more than so many times the noise."""
+LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
+"""A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
+all that the position moved, which the model of the hysteresis may leave."""
 AT_REST = {"kind": "hold", "value": 0.0}
 SWINGS = 8
 """Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
@@ -63,17 +64,22 @@ def designed(hysteresis: Measured, step: Measured, design: DesignOptions, order:
     shape = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
-    noise_um = max(noise_of(step.position_um), 1e-6 * float(np.ptp(step.position_um)))
-    if dynamics.rms_error_um > LARGEST_ERROR * noise_um:
-        raise UnsuitableData(
-            f"{step.name}: no model explains it: order {dynamics.model.order} behind {dynamics.delay_ticks} samples errs by "
-            f"{dynamics.rms_error_um:.3g} µm rms, {LARGEST_ERROR:g} times the noise of {noise_um:.3g} µm is allowed; a longer "
-            "record, a step up and down, or a larger one would help"
-        )
+    _require_explained(step, dynamics)
     plant = ModelOptions.model_validate(model_values(dynamics))
     output = design.controller.model_copy(update={"rate_hz": 1 / step.period_s})
     asked = design.model_copy(update={"plant": plant, "controller": output})
     return Chain(shape, dynamics, with_gain(shape.model, dynamics.static_gain), asked, synthesise_design(asked))
+
+
+def _require_explained(step: Measured, dynamics: DynamicsFit) -> None:
+    """Raise UnsuitableData for a model that misses more of its recording than noise and hysteresis leave."""
+    allowed_um = LARGEST_ERROR * max(noise_of(step.position_um), SMALL_PART * float(np.ptp(step.position_um)))
+    if dynamics.rms_error_um > allowed_um:
+        raise UnsuitableData(
+            f"{step.name}: no model explains it: that of order {dynamics.model.order} behind {dynamics.delay_ticks} "
+            f"samples errs by {dynamics.rms_error_um:.3g} µm rms; {allowed_um:.3g} µm is allowed, {LARGEST_ERROR:g} times the "
+            "noise. A step up and down, a larger one, or a longer record would help"
+        )
 
 
 def configuration_text(

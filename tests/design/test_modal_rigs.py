@@ -8,6 +8,7 @@ from click.testing import CliRunner
 
 from rtloop.cli import main
 from rtloop.config import load
+from rtloop.design.measured import UnsuitableData
 from rtloop.prepare import prepare
 from tests.design.modal_rigs import modal_rig
 from tests.recording.real_loop import record
@@ -51,3 +52,11 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path) -> None:
     assert axis.interlocks.oscillation_swings > 0
     trips, _ = run(out, prepare(load(out)).checks[0].running)
     assert trips == []
+
+
+def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:
+    """Two modes by one pole."""
+    with pytest.raises(
+        UnsuitableData, match=r"no model explains it: that of order 1 .* a larger one, or a longer record"
+    ):
+        designed_for(modal_rig(TWO_MODES_LATE_BY_1), tmp_path, order=1)

@@ -72,13 +72,13 @@ def one(rig: ModalRig, folder: Path) -> tuple[bool, str]:
     return not trips and not far, found + (f"; tripped: {', '.join(trips)}" if trips else "")
 
 
-def designed_for(rig: ModalRig, folder: Path) -> tuple[Chain, Path]:
+def designed_for(rig: ModalRig, folder: Path, order: int | None = None) -> tuple[Chain, Path]:
     """Two recordings, and the configuration that `design auto` writes. Raises RtloopError."""
     sine = record(folder / "sine.mcap", rig.configuration(sine=True), round(SINE_S * 1000))[0]
     steps = record(folder / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
     specification, out = folder / "spec.toml", folder / "designed.toml"
     specification.write_text(SPECIFICATION, encoding="utf-8")
-    return write_design(sine, steps, specification, out), out
+    return write_design(sine, steps, specification, out, order=order), out
 
 
 def verdict(chain: Chain) -> str:
