@@ -56,5 +56,5 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path) -> None:
 
 def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:
     """Two modes by one pole."""
-    with pytest.raises(UnsuitableData, match="no model explains it: that of order 1 .* would help"):
+    with pytest.raises(UnsuitableData, match=r"no model explains it: that of order 1 .* would help"):
         designed_for(modal_rig(TWO_MODES_LATE_BY_1), tmp_path, order=1)
