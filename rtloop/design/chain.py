@@ -77,8 +77,8 @@ def _require_explained(step: Measured, dynamics: DynamicsFit) -> None:
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
             f"{step.name}: no model explains it: that of order {dynamics.model.order} behind {dynamics.delay_ticks} "
-            f"samples errs by {dynamics.rms_error_um:.3g} µm rms, and {allowed_um:.3g} µm is allowed (about {LARGEST_ERROR:g} "
-            "times the noise). A step up and down, a larger one, or a longer record would help"
+            f"samples errs by {dynamics.rms_error_um:.3g} µm rms, and {allowed_um:.3g} µm is allowed (about "
+            f"{LARGEST_ERROR:g} times the noise). A step up and down, a larger one, or a longer record would help"
         )
 
 
