@@ -63,7 +63,7 @@ soak-forged: $(READY)
 soak-identification: $(READY)
 	$(BIN)/python -m tests.soak.identification
 
-# Recordings, identification, synthesis and a run on ten rigs drawn at random: about four minutes.
+# Recordings, identification, synthesis and a run on forty rigs drawn at random: about ten minutes.
 soak-chain: $(READY)
 	$(BIN)/python -m tests.soak.chain
 

@@ -9,7 +9,7 @@ import click
 
 from rtloop.config import parse
 from rtloop.design.assumptions import NoController
-from rtloop.design.chain import configuration_text, designed
+from rtloop.design.chain import Chain, configuration_text, designed
 from rtloop.design.identified import write_new
 from rtloop.design.measured import measured
 from rtloop.designing import verify_configuration
@@ -22,6 +22,21 @@ def design_from_recordings(
     hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, as_json: bool
 ) -> int:
     """Write the configuration `out`, verify it, and return the verdict's exit code. Raises RtloopError."""
+    chain = write_design(hysteresis, step, specs, out, axis, order)
+    dynamics, found = chain.dynamics, chain.synthesis
+    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in dynamics.modes)
+    click.echo(
+        f"{out}: h/H {chain.hysteresis.model_loop.percent:.2f} %; {modes}; {dynamics.delay_ticks} samples of delay; "
+        f"γ {found.achieved:.4g}, controller of order {found.controller.order}",
+        err=True,
+    )
+    return verify_configuration(out, None, None, as_json)
+
+
+def write_design(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None
+) -> Chain:
+    """From two recordings and a specification to a configuration at `out` that `check` accepts. Raises RtloopError."""
     specification = load_specification(specs)
     slow, fast = measured(hysteresis, axis), measured(step, axis)
     try:
@@ -35,10 +50,4 @@ def design_from_recordings(
     text = configuration_text(chain, slow, fast, axis, name, specification.text)
     prepare(parse(text, out.stem, folder, str(out)))
     write_new(out, text)
-    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in chain.dynamics.modes)
-    click.echo(
-        f"{out}: h/H {chain.hysteresis.model_loop.percent:.2f} %; {modes}; γ {chain.synthesis.achieved:.4g}, "
-        f"controller of order {chain.synthesis.controller.order}",
-        err=True,
-    )
-    return verify_configuration(out, None, None, as_json)
+    return chain

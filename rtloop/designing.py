@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rtloop.config import Configuration, load
+from rtloop.config import Configuration, load, parse
 from rtloop.design.assumptions import NoController
 from rtloop.design.augment import augmented
 from rtloop.design.discretise import discretise
-from rtloop.design.section import controller_section
+from rtloop.design.section import controller_configuration, controller_section
 from rtloop.design.specification import DesignOptions
 from rtloop.design.synthesise import Synthesis, synthesise_design
 from rtloop.design.verify import Verification, as_dict, verify
 from rtloop.design.verify_page import page
 from rtloop.errors import ConfigError, NoDesign, OutputError
 from rtloop.law.options import AxisOptions
+from rtloop.prepare import prepare
 from rtloop.report_design import print_synthesis, print_verification
 from rtloop.specifications import load_specification
 
 
-def synthesise_specification(spec: Path, out: Path | None, cross_check: bool, as_json: bool) -> int:
-    """Write [axis.controller] to `out` or stdout. Raises ConfigError, NoDesign, OutputError, MissingExtra."""
+def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> int:
+    """Write a configuration with the controller on `axis` to `out`, or [axis.controller] to stdout.
+
+    Raises ConfigError, NoDesign, OutputError, MissingExtra.
+    """
     path, text, design = load_specification(spec)
     try:
         found = synthesise_design(design)
@@ -33,14 +38,19 @@ def synthesise_specification(spec: Path, out: Path | None, cross_check: bool, as
     except ValueError as error:
         raise ConfigError(str(spec), [str(error)]) from None
     other = _slicot(found, design) if cross_check else None
-    section = controller_section(found, design, path.name, text)
     if out is not None:
-        _write(out, section.encode())
+        beside = os.path.relpath(path.resolve(), out.resolve().parent)
+        whole = controller_configuration(found, design, path.name, text, axis, beside)
+        prepare(parse(whole, out.stem, out.resolve().parent, str(out)))
+        _write(out, whole.encode())
     if as_json:
         click.echo(json.dumps(_as_dict(found, other, out)))
         return 0
     print_synthesis(found, other)
-    click.echo(section if out is None else f"{out}: put it below the [[axis]] that it is for", nl=out is not None)
+    if out is None:
+        click.echo(controller_section(found, design, path.name, text), nl=False)
+    else:
+        click.echo(f"{out}: rtloop check judges it; rtloop ctl controller {axis} {out} swaps it into a running loop")
     return 0
 
 

@@ -22,10 +22,12 @@ from rtloop.design.identified import (
     with_gain,
     write_new,
 )
+from rtloop.design.identify_delay import delayed
 from rtloop.design.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identify_hysteresis import Placement, Weights, identify_hysteresis
 from rtloop.design.measured import Measured, UnsuitableData, measured
 from rtloop.design.plays import model_output
+from rtloop.design.prediction_error import LARGEST_ORDER
 from rtloop.errors import ConfigError
 from rtloop.law.hysteresis import PlayModel
 from rtloop.plain import fields_of, plain
@@ -91,7 +93,8 @@ def dynamics_report(
     how: Input = "hysteresis",
     hysteresis: Path | None = None,
     order: int | None = None,
-    largest_order: int = 8,
+    largest_order: int = LARGEST_ORDER,
+    delay_ticks: int | None = None,
     criterion: Criterion = "aic",
     compare: Path | None = None,
     out: Path | None = None,
@@ -102,18 +105,19 @@ def dynamics_report(
     actuator = _actuator(runs[0], hysteresis, axis) if how == "hysteresis" else None
     inputs = [excitation(run, how, actuator) for run in runs]
     try:
-        fit = identify_dynamics(inputs[0], order, largest_order, criterion, inputs[1:])
+        fit = identify_dynamics(inputs[0], order, largest_order, criterion, inputs[1:], delay_ticks)
     except ValueError as fault:
         raise ConfigError("identify dynamics", [str(fault)]) from None
     found, compared = None, None
     if compare is not None:
-        found, compared = _compared(fit, excitation(measured(compare, axis), how, actuator))
+        other = excitation(measured(compare, axis), how, actuator)
+        found, compared = _compared(fit, delayed(other, fit.delay_ticks))
     if out is not None:
         write_new(out, _sections(fit, runs[0], how, actuator))
     if plot is not None:
         from rtloop.design.identification_plots import plot_dynamics
 
-        plot_dynamics(fit, inputs[0], found, plot)
+        plot_dynamics(fit, delayed(inputs[0], fit.delay_ticks), found, plot)
     tests = {"white": fit.tests.white, "independent": fit.tests.independent}
     return plain(
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs], "input": how}

@@ -53,7 +53,7 @@ def print_dynamics(report: dict[str, Any]) -> None:
     tests = report["tests"]
     console.print(
         f"static gain {report['static_gain']:.6g}, which belongs to the hysteresis (D(0) = 1); "
-        f"fit {report['fit_percent']:.2f} %"
+        f"delay {report['delay_ticks']} samples; fit {report['fit_percent']:.2f} %"
     )
     console.print(
         f"residuals: {'white' if tests['white'] else 'not white'} "

@@ -16,19 +16,21 @@ def design() -> None:
 
 @design.command()
 @click.argument("spec", type=OUTPUT)
-@click.option("--out", type=OUTPUT, help="The file to write [stdout].")
+@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (extra: slycot).")
 @JSON
 @fails_clearly
-def synthesise(spec: Path, out: Path | None, cross_check: bool, as_json: bool) -> int:
-    """Compute the H∞ controller that SPEC.toml asks for, reduce it, and write its section [axis.controller].
+def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> int:
+    """Compute the H∞ controller that SPEC.toml asks for, reduce it, and write it as [axis.controller].
 
-    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. Exit 1 where no controller
-    does what is asked, with the condition that fails.
+    SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. What --out writes is a
+    configuration around a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
+    controller into a running loop. Exit 1 where no controller does what is asked, with the condition that fails.
     """
     from rtloop.designing import synthesise_specification
 
-    return synthesise_specification(spec, out, cross_check, as_json)
+    return synthesise_specification(spec, out, axis, cross_check, as_json)
 
 
 @design.command()

@@ -84,8 +84,9 @@ def hysteresis(
     help="Input of the dynamics: output of the hysteresis model, recorded command v, or the drive itself.",
 )  # fmt: skip
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
-@click.option("--largest-order", default=8, show_default=True, type=click.IntRange(1, 20))
-@click.option("--criterion", default="aic", show_default=True, type=click.Choice(["aic", "validation"]))
+@click.option("--largest-order", default=14, show_default=True, type=click.IntRange(1, 20))
+@click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Samples of delay [0 to 3, found].")
+@click.option("--criterion", default="aic", show_default=True, type=click.Choice(["aic", "held-out", "validation"]))
 @click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine: measured frequency response.")
 @OUT
 @PLOT
@@ -93,8 +94,9 @@ def hysteresis(
 @fails_clearly
 def dynamics(
     runs: tuple[Path, ...], axis: str | None, hysteresis: Path | None, how: Literal["hysteresis", "command", "drive"],
-    order: int | None, largest_order: int, criterion: Literal["aic", "validation"], compare: Path | None,
-    out: Path | None, plot: Path | None, as_json: bool,
+    order: int | None, largest_order: int, delay_ticks: int | None,
+    criterion: Literal["aic", "held-out", "validation"], compare: Path | None, out: Path | None, plot: Path | None,
+    as_json: bool,
 ) -> int:  # fmt: skip
     """D(s) from the first RUN, a step or any other excitation from rest; further RUNs validate it."""
     from rtloop.identifying import dynamics_report
@@ -102,7 +104,7 @@ def dynamics(
 
     report = dynamics_report(
         runs, axis=axis, how=how, hysteresis=hysteresis, order=order, largest_order=largest_order,
-        criterion=criterion, compare=compare, out=out, plot=plot,
+        delay_ticks=delay_ticks, criterion=criterion, compare=compare, out=out, plot=plot,
     )  # fmt: skip
     _show(report, as_json, print_dynamics)
     return 0

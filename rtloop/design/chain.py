@@ -8,11 +8,15 @@ Driver, limits and interlocks are those of the configuration that the step was r
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from rtloop.design.compare import LIGHT_DAMPING
 from rtloop.design.identified import (
     dynamics_provenance,
     feedforward_section,
@@ -22,7 +26,7 @@ from rtloop.design.identified import (
 )
 from rtloop.design.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.measured import Measured, UnsuitableData
+from rtloop.design.measured import Measured, UnsuitableData, noise_of
 from rtloop.design.plays import model_output
 from rtloop.design.section import controller_section
 from rtloop.design.specification import DesignOptions
@@ -31,7 +35,12 @@ from rtloop.design.toml_text import section
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import ModelOptions
 
+LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
+"""A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
+all that the position moved, which the model of the hysteresis may leave."""
 AT_REST = {"kind": "hold", "value": 0.0}
+SWINGS = 8
+"""Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +63,23 @@ def designed(hysteresis: Measured, step: Measured, design: DesignOptions, order:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     shape = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
-    dynamics = identify_dynamics(excitation, order)
+    dynamics = identify_dynamics(excitation, order, criterion="held-out")
+    _require_explained(step, dynamics)
     plant = ModelOptions.model_validate(model_values(dynamics))
-    asked = design.model_copy(update={"plant": plant})
+    output = design.controller.model_copy(update={"rate_hz": 1 / step.period_s})
+    asked = design.model_copy(update={"plant": plant, "controller": output})
     return Chain(shape, dynamics, with_gain(shape.model, dynamics.static_gain), asked, synthesise_design(asked))
+
+
+def _require_explained(step: Measured, dynamics: DynamicsFit) -> None:
+    """Raise UnsuitableData for a model that misses more of its recording than noise and hysteresis leave."""
+    allowed_um = LARGEST_ERROR * max(noise_of(step.position_um), SMALL_PART * float(np.ptp(step.position_um)))
+    if dynamics.rms_error_um > allowed_um:
+        raise UnsuitableData(
+            f"{step.name}: no model explains it: that of order {dynamics.model.order} behind {dynamics.delay_ticks} "
+            f"samples errs by {dynamics.rms_error_um:.3g} µm rms, and {allowed_um:.3g} µm is allowed (about "
+            f"{LARGEST_ERROR:g} times the noise). A step up and down, a larger one, or a longer record would help"
+        )
 
 
 def configuration_text(
@@ -80,13 +102,23 @@ def configuration_text(
         "specification": spec_name,
         "reference": AT_REST,
     }
-    raw["axis"] = [_replaced(one, parts) if one is _chosen(raw["axis"], axis) else one for one in raw["axis"]]
+    chosen = _chosen(raw["axis"], axis)
+    parts["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), chain.dynamics, step.period_s)
+    raw["axis"] = [_replaced(one, parts) if one is chosen else one for one in raw["axis"]]
     heading = [
         *hysteresis_provenance(chain.hysteresis, [hysteresis]),
         *dynamics_provenance(chain.dynamics, step, "hysteresis"),
         *comments,
     ]
     return section("", raw, heading)
+
+
+def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
+    """The interlocks with that against a growing resonance on: it is off where a stage shall ring without control."""
+    lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
+    if lowest_hz is None or interlocks.get("oscillation_swings", 0):
+        return dict(interlocks)
+    return {**interlocks, "oscillation_swings": SWINGS, "swing_ticks": math.ceil(0.75 / (lowest_hz * period_s))}
 
 
 def _section(content: str, name: str) -> Any:

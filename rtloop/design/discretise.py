@@ -35,6 +35,8 @@ from rtloop.design.transfer import Transfer
 from rtloop.design.zeros import zeros_and_gain
 
 Method = Literal["matched", "tustin", "foh", "zoh"]
+SEEN = 36.0
+"""exp(36) is 4e15: adding 1 to it is lost in rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +147,25 @@ def _check(period_s: float, method: str, prewarp_hz: float | None) -> None:
 
 
 def _matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, float]:
-    """Zeros, poles, gain by z = exp(sT); the gain from the ratio at s = 0 with s and (z − 1)/T cancelled there."""
-    if np.any(transfer.zeros.real * period_s > 700) or np.any(transfer.poles.real * period_s > 700):
-        raise ValueError(f"period_s: {period_s:g} is so long that exp(sT) of a root overflows; a shorter one is needed")
-    zeros, poles = (np.exp(roots * period_s).astype(complex) for roots in (transfer.zeros, transfer.poles))
+    """Zeros, poles, gain by z = exp(sT); the gain from the ratio at s = 0 with s and (z − 1)/T cancelled there.
+
+    A zero whose image is beyond all digits, to the right of SEEN/T, has none: (z − image)/(1 − image) is 1.
+    """
+    if np.any(transfer.poles.real * period_s > SEEN):
+        raise ValueError(
+            f"poles: {transfer.poles.real.max():g} rad/s to the right grows beyond all digits in a period of "
+            f"{period_s:g} s; at most {SEEN / period_s:g} rad/s is allowed"
+        )
+    seen = transfer.zeros.real * period_s <= SEEN
+    zeros, poles = (np.exp(roots * period_s).astype(complex) for roots in (transfer.zeros[seen], transfer.poles))
     gain = complex(transfer.gain)
-    for root, image in zip(transfer.zeros, zeros, strict=True):
+    for root in transfer.zeros[~seen]:
+        gain *= -root
+    for root, image in zip(transfer.zeros[seen], zeros, strict=True):
         gain *= -root / (1 - image) if root else 1 / period_s
     for root, image in zip(transfer.poles, poles, strict=True):
         gain *= (1 - image) / -root if root else period_s
-    infinite = poles.size - zeros.size
+    infinite = poles.size - transfer.zeros.size
     return _with_zeros_at_minus_one(zeros, infinite), poles, gain.real / 2.0**infinite
 
 

@@ -40,7 +40,8 @@ def model_section(fit: DynamicsFit, comments: Sequence[str]) -> str:
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
     """The keys of [axis.model]."""
     d = fit.transfer
-    return {"form": "zpk", "gain": d.gain, "zeros": roots(d.zeros), "poles": roots(d.poles)}
+    found = {"form": "zpk", "gain": d.gain, "zeros": roots(d.zeros), "poles": roots(d.poles)}
+    return {**found, "delay_ticks": fit.delay_ticks}
 
 
 def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[str]:
@@ -61,7 +62,7 @@ def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
         f"Dynamics, identified by rtloop {__version__} from {sources([run])}, input: {how}",
         f"ARMAX of order {fit.model.order} at {1 / run.period_s:g} Hz: prediction error {fit.rms_error_um:.3g} µm rms, "
         f"fit {fit.fit_percent:.2f} %",
-        "modes: " + ", ".join(modes),
+        "modes: " + ", ".join(modes) + f"; behind {fit.delay_ticks} samples of delay",
         f"normalised to D(0) = 1; its static gain of {fit.static_gain:.6g} is in the hysteresis",
     ]
 

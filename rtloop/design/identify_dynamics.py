@@ -18,16 +18,25 @@ from typing import Literal
 import numpy as np
 
 from hil.linear import Real
+from rtloop.design.identify_delay import delayed, first_part, held_out_from, identified_delay
 from rtloop.design.innovations import Innovations
 from rtloop.design.inverse_hold import held_from
 from rtloop.design.measured import UnsuitableData
-from rtloop.design.prediction_error import LARGEST_ORDER, WORTH, Excitation, excited_order, fitted_models, rms_error
+from rtloop.design.prediction_error import (
+    LARGEST_ORDER,
+    WORTH,
+    Excitation,
+    excited_order,
+    fitted_models,
+    refined,
+    rms_error,
+)
 from rtloop.design.realisation import system_of
 from rtloop.design.residuals import ResidualTests, residual_tests
 from rtloop.design.transfer import Transfer
 from rtloop.design.zeros import zeros_and_gain
 
-Criterion = Literal["aic", "validation"]
+Criterion = Literal["aic", "held-out", "validation"]
 LEAST_EXCITED = 4
 """Poles that the input must be able to tell apart where the order is searched for."""
 
@@ -46,7 +55,8 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One order: rms one-step-ahead error, Akaike's criterion ln(V) + 2 d/N, and fit to other runs (NaN: none)."""
+    """One order: rms one-step-ahead error (of the part held out, where one is), Akaike's criterion ln(V) + 2 d/N, and
+    fit to other runs (NaN: none)."""
 
     order: int
     rms_error_um: float
@@ -66,6 +76,8 @@ class DynamicsFit:
     tests: ResidualTests
     candidates: tuple[Candidate, ...]
     model: Innovations
+    delay_ticks: int
+    """Samples between input and position beyond the one that a held output takes; `model` comes behind them."""
 
 
 def identify_dynamics(
@@ -74,11 +86,14 @@ def identify_dynamics(
     largest_order: int = LARGEST_ORDER,
     criterion: Criterion = "aic",
     validation: Sequence[Excitation] = (),
+    delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """The model of `order` poles, or of the order that `criterion` chooses up to `largest_order`.
+    """The model of `order` poles, or of the order that `criterion` chooses up to `largest_order`, behind `delay_ticks`
+    samples, or behind the delay that is found.
 
-    "aic" judges by the run itself, "validation" by the free-running output error on `validation`. Raises
-    UnsuitableData, and ValueError for options that contradict each other.
+    "aic" judges by the run itself, "held-out" by the prediction of its second part where the input changes there too,
+    "validation" by the free-running output error on `validation`. Raises UnsuitableData, and ValueError for options
+    that contradict each other.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': another recording is needed to validate on")
@@ -91,19 +106,25 @@ def identify_dynamics(
         )
     centred = replace(run, position_um=run.position_um - run.position_um[0])
     orders = [order] if order else range(1, min(largest_order, excited) + 1)
-    fitted = fitted_models(centred, orders)
+    if delay_ticks is None:
+        delay_ticks = identified_delay(centred, orders)
+    centred, validation = delayed(centred, delay_ticks), [delayed(one, delay_ticks) for one in validation]
+    start = held_out_from(centred) if criterion == "held-out" else None
+    fitted = fitted_models(first_part(centred, start), orders)
     if not fitted:
         raise UnsuitableData(
             f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed"
         )
-    candidates = [_candidate(model, centred, validation) for model in fitted]
+    candidates = [_candidate(model, centred, start, validation) for model in fitted]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
-    best = _chosen(candidates, score, by_aic=criterion == "aic")
-    return _described(fitted[best], centred, tuple(candidates))
+    model = fitted[_chosen(candidates, score, by_aic=criterion != "validation" and start is None)]
+    if start is not None:
+        model = refined(model, centred) or model
+    return _described(model, centred, tuple(candidates), delay_ticks)
 
 
-def _candidate(model: Innovations, run: Excitation, validation: Sequence[Excitation]) -> Candidate:
-    rms = rms_error(model, run)
+def _candidate(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
+    rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size
     return Candidate(
         model.order, rms, 2 * np.log(rms) + 2 * unknowns / run.input.size, _validation_rms(model, validation)
@@ -125,7 +146,7 @@ def _chosen(candidates: Sequence[Candidate], score: Callable[[Candidate], float]
     return int(np.argmin([score(candidate) for candidate in candidates]))
 
 
-def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate, ...]) -> DynamicsFit:
+def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int) -> DynamicsFit:
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
     gain = model.static_gain
@@ -145,6 +166,7 @@ def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate,
         residual_tests(run.input, errors, model.pack(noise=True).size),
         candidates,
         model,
+        delay_ticks,
     )
 
 

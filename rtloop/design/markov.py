@@ -9,6 +9,8 @@ few modes that its impulse response is made of.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.linalg import hankel
 from scipy.signal import lfilter
@@ -18,18 +20,24 @@ from rtloop.design.innovations import Innovations
 
 ARX_ORDER = 40
 HANKEL_ROWS = 150
+CLEAR, LIKELY = 8.0, 3.0
+"""Noise makes singular values that fall slowly; what stands so much above the next is a mode, or most likely one."""
 SMALLEST_IMAGE = 1e-3
 """Poles in z nearer to 0 are a delay, which has no rate."""
 
 
 def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> Real:
     """g_1 … g_length of y = Σ g_i u_k−i, by least squares of an ARX model of order `order`, from rest."""
-    delayed = np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in (y, u) for i in range(1, order + 1)])
-    columns = np.vstack([delayed, np.ones(y.size)]).T
+    columns = np.vstack([lagged((y, u), order), np.ones(y.size)]).T
     solution, *_ = np.linalg.lstsq(columns, y, rcond=1e-12)
     pulse = np.zeros(length + 1)
     pulse[0] = 1.0
     return np.asarray(lfilter([0.0, *solution[order:-1]], [1.0, *-solution[:order]], pulse), dtype=float)[1:]
+
+
+def lagged(signals: Sequence[Real], most: int) -> Real:
+    """Each signal 1 … `most` samples late, (signals × most, samples), at rest before the first sample."""
+    return np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in signals for i in range(1, most + 1)])
 
 
 class Guesses:
@@ -40,6 +48,12 @@ class Guesses:
         rows = min(HANKEL_ROWS, (g.size - 1) // 2)
         self._matrix = hankel(g[: rows + 1], g[rows : 2 * rows])
         self._left, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
+
+    def gap(self, most: int, fall: float) -> int:
+        """The order, at most `most`, behind which the singular values last fall by `fall`; 0 where they nowhere do."""
+        values = self.singular_values[: most + 1]
+        falls = np.flatnonzero(values[:-1] > fall * values[1:])
+        return int(falls[-1]) + 1 if falls.size else 0
 
     def model(self, order: int) -> Innovations | None:
         """`order` modes without noise model; None where a mode has no continuous counterpart or does not decay."""

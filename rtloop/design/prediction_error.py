@@ -14,17 +14,20 @@ from scipy.optimize import least_squares
 
 from hil.linear import Real
 from rtloop.design.innovations import Innovations
-from rtloop.design.markov import HANKEL_ROWS, Guesses, impulse_response, with_residues
+from rtloop.design.markov import CLEAR, HANKEL_ROWS, LIKELY, Guesses, impulse_response, with_residues
 from rtloop.design.measured import noise_of
 
-LARGEST_ORDER = 8
+LARGEST_ORDER = 14
 WORTH = 0.01
 """A higher order must lower the rms prediction error by more than this part; noise never fits exactly equally."""
 LEAST_EXCITATION = 1e-7
 """Singular value of the lagged inputs, relative to the largest, below which a direction was not excited, whatever the
 noise."""
+ENOUGH_POLES = 9
+"""An input that can tell so many apart has no gap in its spectrum, and can tell more."""
 EVALUATIONS = 20
-USELESS = 1e6
+USELESS, STEEPEST = 1e6, 1e30
+"""Stand in for errors and slopes of trial models that blow up."""
 
 
 @dataclass(frozen=True)
@@ -38,22 +41,35 @@ class Excitation:
 
 
 def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
-    """Models of increasing order, until two more poles in turn do not pay."""
-    guesses = Guesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
+    """Models of increasing order, from two poles below the last clear gap of the impulse response's singular values
+    until, behind the last likely one, two more in turn do not pay."""
+    guesses = _guesses(run)
+    clear, likely = guesses.gap(max(orders), CLEAR), guesses.gap(max(orders), LIKELY)
     found: list[Innovations] = []
     errors: list[float] = []
-    for order in orders:
+    for order in orders if len(orders) == 1 else [one for one in orders if one >= clear - 2]:
         start = guesses.model(order)
         if start is None and found and found[-1].order == order - 1:
             start = _grown(found[-1])
-        model = start and _refined(with_residues(start, run.input, run.position_um), run)
+        model = start and refined(with_residues(start, run.input, run.position_um), run)
         if model is None:
             continue
         found.append(model)
         errors.append(rms_error(model, run))
-        if len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
+        if order > likely and len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
             break
     return found
+
+
+def model_at_gap(run: Excitation, orders: Sequence[int]) -> Innovations | None:
+    """One model, of the order within `orders` that the impulse response shows; None where none is stable."""
+    guesses = _guesses(run)
+    start = guesses.model(guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0])
+    return start and refined(with_residues(start, run.input, run.position_um), run)
+
+
+def _guesses(run: Excitation) -> Guesses:
+    return Guesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
 
 
 def _grown(model: Innovations) -> Innovations:
@@ -67,7 +83,7 @@ def _grown(model: Innovations) -> Innovations:
     )
 
 
-def _refined(model: Innovations, run: Excitation) -> Innovations | None:
+def refined(model: Innovations, run: Excitation) -> Innovations | None:
     """The nearest least sum of squared prediction errors: first without noise model, then with; None if unstable."""
     for noise in (False, True):
         model = _descended(model, run, noise=noise)
@@ -77,16 +93,18 @@ def _refined(model: Innovations, run: Excitation) -> Innovations | None:
 def _descended(model: Innovations, run: Excitation, *, noise: bool) -> Innovations:
     def errors(values: Real) -> Real:
         tried = model.unpack(values, noise=noise)
-        if np.any(np.abs(tried.images) >= 1) or (found := tried.errors(run.input, run.position_um)) is None:
+        if np.any(tried.rates.real >= 0) or (found := tried.errors(run.input, run.position_um)) is None:
             return np.full(run.input.size, USELESS)
         return np.clip(np.nan_to_num(found, nan=USELESS), -USELESS, USELESS)
 
     def jacobian(values: Real) -> Real:
         tried = model.unpack(values, noise=noise)
-        return tried.sensitivities(run.input, errors(values), noise=noise).T
+        found = tried.sensitivities(run.input, errors(values), noise=noise).T
+        return np.clip(np.nan_to_num(found, nan=STEEPEST), -STEEPEST, STEEPEST)
 
     settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
-    found = least_squares(errors, model.pack(noise=noise), jacobian, **settings)  # pyright: ignore[reportArgumentType]
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = least_squares(errors, model.pack(noise=noise), jacobian, **settings)  # pyright: ignore[reportArgumentType]
     return model.unpack(found.x, noise=noise)
 
 
@@ -95,11 +113,11 @@ def _has_counterpart(model: Innovations) -> bool:
     return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
 
 
-def rms_error(model: Innovations, run: Excitation) -> float:
-    """Of the one-step-ahead prediction of a model that was fitted, µm."""
+def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
+    """Of the one-step-ahead prediction of a model that was fitted, from sample `start` on, µm."""
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
-    return float(np.sqrt(np.mean(errors**2)))
+    return float(np.sqrt(np.mean(errors[start:] ** 2)))
 
 
 def excited_order(run: Excitation) -> int:
@@ -107,9 +125,10 @@ def excited_order(run: Excitation) -> int:
 
     A direction counts where its share of the position, with the gain that the spans suggest, stands out of the noise.
     """
-    lags = 2 * LARGEST_ORDER + 2
+    lags = 2 * ENOUGH_POLES
     lagged = np.array([np.concatenate([np.zeros(i), run.input[: run.input.size - i]]) for i in range(lags)])
     sizes = np.linalg.svd(lagged @ lagged.T, compute_uv=False)
     gain = np.ptp(run.position_um) / max(np.ptp(run.input), 1e-300)
     noise = noise_of(run.position_um) / max(gain, 1e-300) * np.sqrt(lags)
-    return int((sizes > max(LEAST_EXCITATION**2 * sizes[0], noise**2)).sum()) // 2
+    found = int((sizes > max(LEAST_EXCITATION**2 * sizes[0], noise**2)).sum()) // 2
+    return found if found < ENOUGH_POLES else max(found, LARGEST_ORDER)

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+GROWTH = 1.1
+"""Far from the model nobody asks to a quarter of a percent, and a loop that tolerates much would take minutes."""
+
 
 def reach(holds: Callable[[float], bool], largest: float, step: float = 0.25, tolerance: float = 1e-4) -> float:
     """The smallest value in (0, `largest`] at which `holds` fails: stepwise outwards, then by bisection.
 
-    `largest` where it holds throughout. `holds` is taken to be true at 0; a failure narrower than a step may be missed.
+    `largest` where it holds throughout. `holds` is taken to be true at 0. The first step is `step`, each further one a
+    tenth longer; a failure narrower than a step may be missed.
     """
     low = 0.0
     while holds(min(low + step, largest)):
         low += step
         if low >= largest:
             return largest
+        step *= GROWTH
     high = min(low + step, largest)
     while high - low > tolerance:
         middle = 0.5 * (low + high)

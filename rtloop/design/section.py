@@ -1,15 +1,27 @@
-"""A synthesised controller as the section [axis.controller] of a configuration, with where it comes from."""
+"""A synthesised controller as the section [axis.controller] of a configuration, with where it comes from.
+
+Alone, or in a configuration of its own around a simulated rig that is the plant it was made for.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import tomllib
+from typing import Any
 
-from hil.linear import Complex
+import numpy as np
+
+from hil.linear import Complex, RepeatedPoles, modal_sum
 from rtloop import __version__
 from rtloop.design.specification import DesignOptions
 from rtloop.design.synthesise import Synthesis
+from rtloop.design.toml_text import roots, section
 from rtloop.design.transfer import Transfer
 
+STAND_IN_UM_PER_V = 4.3
+"""Of the rig that is written around a controller: a proportional actuator."""
+PARTED = 1e-5
+"""Repeated poles are this far apart, relatively, on a rig, which takes none that repeat."""
 _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced truncation"}
 
 
@@ -20,6 +32,59 @@ def controller_section(found: Synthesis, design: DesignOptions, source: str, tex
     """
     lines = [*provenance(found, design, source, text)]
     return "".join(f"# {line}\n" for line in lines) + _section(found.controller, design)
+
+
+def controller_configuration(
+    found: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str
+) -> str:
+    """A whole configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
+
+    Its rig is the plant of `design`; `specification` is the file's path relative to the configuration's.
+    """
+    assert design.plant is not None
+    plant, delay_ticks = design.plant.transfer(), design.plant.delay_ticks
+    actuator = {"thresholds_v": [0.0], "weights_um_per_v": [STAND_IN_UM_PER_V]}
+    values = {
+        "loop": {"rate_hz": design.controller.rate_hz},
+        "driver": {
+            "kind": "sim",
+            "latency_ticks": delay_ticks,
+            "channels": {axis: {"input": "adc0", "output": "dac0", "um_per_v": 10.0}},
+            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": _zpk(_with_single_poles(plant))},
+        },
+        "axis": [
+            {
+                "name": axis,
+                "specification": specification,
+                "feedforward": actuator,
+                "controller": tomllib.loads(_section(found.controller, design))["axis"]["controller"],
+                "model": {**_zpk(plant), "delay_ticks": delay_ticks},
+            }
+        ],
+    }
+    heading = [
+        *provenance(found, design, source, text),
+        "",
+        f"Driver, feedforward and limits stand in for yours: a simulated rig of the plant, {STAND_IN_UM_PER_V} µm/V.",
+        f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
+    ]
+    return section("", values, heading)
+
+
+def _zpk(transfer: Transfer) -> dict[str, Any]:
+    return {"form": "zpk", "gain": transfer.gain, "zeros": roots(transfer.zeros), "poles": roots(transfer.poles)}
+
+
+def _with_single_poles(plant: Transfer) -> Transfer:
+    """The plant, its repeated poles moved apart by PARTED at the same static gain."""
+    try:
+        modal_sum(plant.zeros, plant.poles, plant.gain)
+    except RepeatedPoles:
+        reals = int(np.sum(plant.poles.imag == 0))
+        counted = np.concatenate([np.arange(reals), np.arange(plant.order - reals) // 2])  # pairs stand side by side
+        factors = 1 + PARTED * counted
+        return Transfer(plant.zeros, factors * plant.poles, plant.gain * float(np.prod(factors)))
+    return plant
 
 
 def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:

@@ -128,6 +128,8 @@ class OutputOptions(Options):
 
     method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
     prewarp_hz: float | None = Field(default=None, gt=0)
+    rate_hz: float = Field(default=10_000.0, gt=0)
+    """Of the loop that will run it: it must be stable there, and roots far beyond are not written."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

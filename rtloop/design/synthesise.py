@@ -1,15 +1,18 @@
 """From a plant and weights to a controller that can run: augmented plant, H∞ controller, reduction.
 
-Nothing here discretises: the controller is written in s, and the loop's own rate makes C(z) of it.
+The controller is written in s, and the loop's own rate makes C(z) of it. What `synthesise_design` returns is stable as
+it runs at that rate; `synthesise` alone knows of no rate.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from hil.linear import Real
+from rtloop.design.at_rate import LARGEST_SENSITIVITY, dead_time, runs, within_rate
 from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
 from rtloop.design.closedloop import realised
 from rtloop.design.hinf import Hinf, NoController, smallest_gamma, synthesise_hinf
@@ -19,6 +22,10 @@ from rtloop.design.reduce import ReductionMethod, hankel_singular_values, reduce
 from rtloop.design.specification import DesignOptions, weights_of
 from rtloop.design.transfer import Transfer
 from rtloop.design.weights import Weights
+
+
+class DoesNotRun(NoController):
+    """There is a controller in continuous time, but none that can run."""
 
 
 class Synthesis(NamedTuple):
@@ -43,10 +50,12 @@ def synthesise(
     backoff: float = 0.004,
     largest_loss: float = 0.1,
     largest_gamma: float = np.inf,
+    finish: Callable[[Transfer], Transfer | None] = lambda controller: controller,
 ) -> Synthesis:
     """The whole chain. `order` of the reduced controller, by default the lowest whose weighted loop has a norm of at
-    most (1 + `largest_loss`)·γ. Raises NoController, also where γ_opt exceeds `largest_gamma`, and ValueError for an
-    order that leaves no stable loop.
+    most (1 + `largest_loss`)·γ, or the best there is. `finish` makes of a reduced controller what is written, None
+    where it would not run. Raises NoController, also where γ_opt exceeds `largest_gamma`, and ValueError for an order
+    that leaves no stable loop.
     """
     standard = augmented(plant, weights)
     found = synthesise_hinf(standard, backoff=backoff)
@@ -54,17 +63,27 @@ def synthesise(
         raise NoController(_contradiction(plant, weights, found.gamma_opt, largest_gamma))
     full = Transfer.from_state_space(*found.controller)
     allowed = np.inf if order is not None else (1 + largest_loss) * found.gamma
-    for candidate in range(full.order + 1) if order is None else [order]:
-        controller, achieved = _reduced(standard, full, candidate, reduction)
-        if np.isfinite(achieved) and achieved <= allowed:
-            return Synthesis(controller, full, achieved, weights, found, hankel_singular_values(full))
+    lowest = int(np.sum(full.poles.real >= 0))
+    tried: list[tuple[float, Transfer]] = []
+    for candidate in range(lowest, full.order + 1) if order is None else [order]:
+        controller, achieved = _reduced(standard, full, candidate, reduction, finish)
+        if np.isfinite(achieved):
+            tried.append((achieved, controller))
+        if achieved <= allowed:
+            break
+    if tried:
+        achieved, controller = min(tried, key=lambda one: one[0])
+        return Synthesis(controller, full, achieved, weights, found, hankel_singular_values(full))
     if order is not None:
         raise ValueError(
             f"order: {order} leaves an unstable loop with method {reduction!r}; "
             "a higher one, or none so that the lowest good one is found, would help"
         )
-    achieved = weighted_norm(standard, full)
-    return Synthesis(full, full, achieved, weights, found, hankel_singular_values(full))
+    raise DoesNotRun(
+        f"specification: γ = {found.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
+        f"to {full.order} leaves a loop that is stable as it runs, with max |S| ≤ {LARGEST_SENSITIVITY:g}; a longer "
+        "settling_ms (a smaller bandwidth_hz) or a higher rate would help"
+    )
 
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
@@ -73,28 +92,53 @@ def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
     return hinf_norm(standard.closed_with(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
 
-def _reduced(standard: GeneralisedPlant, full: Transfer, order: int, method: ReductionMethod) -> tuple[Transfer, float]:
-    """The controller of this order, and the norm of the weighted loop with it; infinite where there is none."""
+def _reduced(
+    standard: GeneralisedPlant,
+    full: Transfer,
+    order: int,
+    method: ReductionMethod,
+    finish: Callable[[Transfer], Transfer | None],
+) -> tuple[Transfer, float]:
+    """The controller of this order, finished, and the weighted loop's norm with it; infinite where there is none."""
     try:
-        controller = full if order == full.order else reduce_order(full, order, method).transfer
-        return controller, weighted_norm(standard, controller)
+        controller = finish(full if order == full.order else reduce_order(full, order, method).transfer)
+        return (full, np.inf) if controller is None else (controller, weighted_norm(standard, controller))
     except np.linalg.LinAlgError:
         return full, np.inf
 
 
 def synthesise_design(design: DesignOptions) -> Synthesis:
-    """From SPEC.toml. Raises ValueError for a specification that lacks something, NoController for one that contradicts
-    itself, with what would help.
+    """From SPEC.toml, for a loop that is stable as it runs at [controller] rate_hz behind the plant's delay.
+
+    A delay is in the plant that is designed for, with the half period that the hold takes. Without one the hold counts
+    only if nothing runs otherwise. Raises ValueError for a specification that lacks something, NoController for one
+    that contradicts itself, with what would help.
     """
     if design.plant is None:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
     plant, weights, how = design.plant.transfer(), weights_of(design), design.synthesis
     _check(plant, design)
-    return synthesise(
-        plant, weights, order=how.order, reduction=how.reduction,
-        backoff=how.backoff_percent / 100, largest_loss=how.largest_loss_percent / 100,
-        largest_gamma=how.largest_gamma,
-    )  # fmt: skip
+    ticks, output = design.plant.delay_ticks, design.controller
+
+    def finish(controller: Transfer) -> Transfer | None:
+        written = within_rate(controller, output.rate_hz)
+        sensed = design.sensor.seen_through(plant)
+        return written if runs(written, sensed, output.rate_hz, output.method, output.prewarp_hz, ticks) else None
+
+    def designed_for(delay_s: float) -> Synthesis:
+        return synthesise(
+            plant * dead_time(delay_s, ticks + 1), weights, order=how.order, reduction=how.reduction,
+            backoff=how.backoff_percent / 100, largest_loss=how.largest_loss_percent / 100,
+            largest_gamma=how.largest_gamma, finish=finish,
+        )  # fmt: skip
+
+    behind_the_hold_s = (ticks + 0.5) / output.rate_hz
+    if ticks:
+        return designed_for(behind_the_hold_s)
+    try:
+        return designed_for(0.0)
+    except DoesNotRun:
+        return designed_for(behind_the_hold_s)
 
 
 def _check(plant: Transfer, design: DesignOptions) -> None:

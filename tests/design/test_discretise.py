@@ -207,7 +207,14 @@ def test_refusals(arguments, message) -> None:
 
 
 def test_roots_that_a_rule_cannot_map_are_refused() -> None:
-    with pytest.raises(ValueError, match="overflows"):
-        discretise(Transfer.from_zpk([8e6], [-1], 1), T, "matched")
+    with pytest.raises(ValueError, match=r"poles: 8e\+06 rad/s to the right"):
+        discretise(Transfer.from_zpk([-1], [8e6], 1), T, "matched")
     with pytest.raises(ValueError, match="at infinity"):
         discretise(Transfer.from_zpk([2 / T], [-1], 1), T, "tustin")
+
+
+def test_a_zero_too_far_to_the_right_to_be_seen_leaves_its_gain() -> None:
+    """exp(800) has no digits beside 1; what is left is k/(z − p) with C(1) = C(0)."""
+    found = discretise(Transfer.from_zpk([8e6], [-100.0], -1e-5), T, "matched")
+    assert found.zeros.size == 0
+    assert found.gain / (1 - math.exp(-100.0 * T)) == pytest.approx(0.8, rel=1e-12)

@@ -1,113 +1,120 @@
-"""From two recordings to a controller that runs, on rigs drawn at random, every step by its command. `make soak-chain`.
+"""From two recordings to a controller that runs, on rigs drawn at random (`modal_rigs`). `make soak-chain`.
 
-A rig's weights are those of eq (4) ± 20 %, its resonance is ± 10 % off. The written configuration then runs a step of
-20 µm on that rig, noise and quantisation on, and is held against what the verification promised on the identified
-model. A draw whose recording is rightly refused (a 10 V step beyond the position interlock) is counted apart.
+Each rig is recorded under a slow sine and under steps, designed for as `rtloop design auto` does, and what was written
+then runs steps of 10 µm on that rig, in virtual time, with noise and quantisation on. A row says what became of it: the
+specification met, or by how much it is missed; or the refusal. Ends with 1 where an error other than a refusal came,
+a loop tripped, or a run was further from what `check` promises than LIMITS. Settling is shown, but not judged: a notch
+leaves a light mode undamped, and what the inverse leaves of the hysteresis makes it ring.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import re
-import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import rtloop
-from hil.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
+from rtloop.chaining import write_design
+from rtloop.config import load
+from rtloop.design.chain import Chain
+from rtloop.design.closedloop import discrete_loop
+from rtloop.design.discretise import discretise
+from rtloop.design.judgement import limits, specified
+from rtloop.design.loop import LoopAnalysis
+from rtloop.errors import RtloopError
+from rtloop.prepare import prepare
+from rtloop.signals import trip_causes
+from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, modal_rig
+from tests.recording.real_loop import record
 
-ROOT = Path(__file__).resolve().parents[2]
-DEPLOY = ROOT / "deploy"
-STEP_UM, DWELL_S, RATE_HZ = 20.0, 0.5, 10_000
-SECONDS = {"characterise": 25, "step-response": 1}
-LIMITS = {"settling_ms": 0.5, "step": 0.05, "overshoot_percent": 3.0, "static_percent": 0.2}
-"""How far a run may be from the promise: settling, the step at each reported time, overshoot, static error."""
-SMALLEST_SUM = 0.3
+STEP_UM, DWELL_S = 10.0, 0.2
+LIMITS = {"overshoot_percent": 20.0, "static_percent": 2.0}
+"""How far a run may be from the promise."""
 
 
 def main() -> int:
-    """Every draw, a line each, and the largest distances; 1 where a limit is exceeded."""
+    """Every draw, a line each."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=10)
+    parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    found: list[dict[str, float]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for seed in range(given.seed, given.seed + given.draws):
-            distances = one(seed, Path(folder))
-            if distances is not None:
-                found.append(distances)
-                print(
-                    f"rig {seed}: " + ", ".join(f"{name} {value:.4f}" for name, value in distances.items()), flush=True
-                )
-    print(f"{len(found)} of {given.draws} rigs were designed for; largest distance from the promise:")
-    largest = {name: max(distances[name] for distances in found) for name in LIMITS}
-    for name, limit in LIMITS.items():
-        print(f"  {name:20}{largest[name]:10.4f}  (limit {limit:g})")
-    return int(any(largest[name] > limit for name, limit in LIMITS.items()))
+    bad = 0
+    for seed in range(given.seed, given.seed + given.draws):
+        started = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            good, words = one(modal_rig(seed), Path(folder))
+        bad += not good
+        print(f"{seed:3} {words}  [{time.perf_counter() - started:.0f} s]{'' if good else '  BAD'}", flush=True)
+    print(f"{given.draws} rigs, {bad} bad")
+    return int(bad > 0)
 
 
-def one(seed: int, folder: Path) -> dict[str, float] | None:
-    """Distances from the promise on one rig; None where its step was refused."""
-    recordings = []
-    plant = drawn_plant(seed)
-    for name, seconds in SECONDS.items():
-        config = folder / f"{name}-{seed}.toml"
-        text = (DEPLOY / f"{name}.toml").read_text()
-        config.write_text(re.sub(r"\[driver\.plant\.hysteresis\]\ntruth = [^\n]*\n", lambda _: plant, text))
-        summary = command("run", config, "--unpaced", "--duration", seconds, "--out", folder, "--json")
-        recordings.append(summary["recording"])
-    written = folder / f"designed-{seed}.toml"
-    specification = DEPLOY / "paper-spec.toml"
-    verdict = command("design", "auto", *recordings, "--specs", specification, "--out", written, "--json")
-    if "error" in verdict:
-        print(f"rig {seed}: refused: {verdict['error'].rpartition('/')[2]}")
-        return None
-    promised = command("check", written, "--json")["axes"][0]["running"]
-    stepping = folder / f"stepping-{seed}.toml"
-    levels = f'kind = "steps"\nlevels = [{STEP_UM}, 0.0]\ndwell_s = {DWELL_S}'
-    stepping.write_text(written.read_text().replace('kind = "hold"\nvalue = 0.0', levels))
-    summary = command("run", stepping, "--unpaced", "--duration", 2 * DWELL_S, "--out", folder, "--json")
-    assert summary["trips"] == [], summary["trips"]
-    return distances_from(promised, rtloop.load(summary["recording"])["x_true_position_um"])
-
-
-def distances_from(promised: dict[str, Any], position_um: np.ndarray[Any, Any]) -> dict[str, float]:
-    """How far the first step (ticks,) is from what was promised."""
-    step = position_um[: round(DWELL_S * RATE_HZ)] / STEP_UM
-    final = float(np.mean(step[-500:]))
-    settling_s = (np.flatnonzero(np.abs(step / final - 1) > 0.05)[-1] + 1) / RATE_HZ
-    times = zip(promised["step_times_s"], promised["step_position"], strict=True)
-    return {
-        "settling_ms": 1e3 * abs(settling_s - promised["settling_time_s"]),
-        "step": max(abs(float(step[round(time_s * RATE_HZ)]) - value) for time_s, value in times),
-        "overshoot_percent": 100 * (float(np.max(step)) - 1) - promised["overshoot_percent"],
-        "static_percent": abs(100 * abs(final - 1) - promised["static_error_percent"]),
-    }
-
-
-def drawn_plant(seed: int) -> str:
-    """The rig's section of a configuration."""
-    random = np.random.default_rng(seed)
-    weights = np.zeros(1)
-    while np.any(np.cumsum(weights) < SMALLEST_SUM):
-        weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * (1 + random.uniform(-0.2, 0.2, len(NOMINAL_WEIGHTS_UM_PER_V)))
-    return (
-        f'[driver.plant.hysteresis]\ntruth = "custom"\nthresholds_v = {list(THRESHOLDS_V)}\n'
-        f"weights_um_per_v = {weights.tolist()}\n"
-        f"[driver.plant.dynamics]\nresonance_shift = {random.uniform(-0.1, 0.1)}\n"
+def one(rig: ModalRig, folder: Path) -> tuple[bool, str]:
+    """Whether the rig was designed for and ran as promised, or was refused by code 1; and what there is to say."""
+    drawn = f"{rig.hz.size} modes from {rig.hz[0]:4.0f} Hz, ζ ≥ {rig.damping.min():.4f}, delay {rig.delay_ticks}:"
+    try:
+        chain, written = designed_for(rig, folder)
+    except RtloopError as error:
+        return error.exit_code == 1, f"{drawn} refused, {error.exit_code}: {error}"
+    running = prepare(load(written)).checks[0].running
+    assert running is not None
+    trips, distances = run(written, running)
+    far = [name for name, limit in LIMITS.items() if not abs(distances[name]) <= limit]
+    found = (
+        f"{drawn} found delay {chain.dynamics.delay_ticks}, {chain.dynamics.model.order} poles; "
+        f"γ {chain.synthesis.achieved:.3f}, order {chain.synthesis.controller.order}; {verdict(chain)}; "
+        + ", ".join(f"{name} {value:+.2f}" for name, value in distances.items())
     )
+    return not trips and not far, found + (f"; tripped: {', '.join(trips)}" if trips else "")
 
 
-def command(*arguments: Any) -> dict[str, Any]:
-    """The JSON that a command prints."""
-    line = [sys.executable, "-m", "rtloop", *map(str, arguments)]
-    return json.loads(subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False).stdout)
+def designed_for(rig: ModalRig, folder: Path, order: int | None = None) -> tuple[Chain, Path]:
+    """Two recordings, and the configuration that `design auto` writes. Raises RtloopError."""
+    sine = record(folder / "sine.mcap", rig.configuration(sine=True), round(SINE_S * 1000))[0]
+    steps = record(folder / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
+    specification, out = folder / "spec.toml", folder / "designed.toml"
+    specification.write_text(SPECIFICATION, encoding="utf-8")
+    return write_design(sine, steps, specification, out, order=order), out
+
+
+def verdict(chain: Chain) -> str:
+    """ "meets it", or what is missed: achieved against required, as it runs."""
+    output = chain.design.controller
+    controller = discretise(chain.synthesis.controller, 1 / output.rate_hz, output.method, output.prewarp_hz)
+    assert chain.design.plant is not None
+    loop = discrete_loop(controller, chain.design.plant.transfer(), chain.design.plant.delay_ticks)
+    asked = chain.design.specification
+    values, required = specified(loop, asked), limits(asked)
+    missed = [
+        f"{name} {values[name]:.4g} for {limit.value:g}"
+        for name, limit in required.items()
+        if not limit.met(values[name])
+    ]
+    return "misses " + ", ".join(missed) if missed else "meets it"
+
+
+def run(written: Path, promised: LoopAnalysis) -> tuple[list[str], dict[str, float]]:
+    """Trips, and how far the first step of 10 µm up is from what was promised."""
+    levels = f'kind = "steps"\nlevels = [0.0, {STEP_UM}, 0.0]\ndwell_s = {DWELL_S}'
+    text = written.read_text(encoding="utf-8").replace('kind = "hold"\nvalue = 0.0', levels)
+    path = record(written.with_name("run.mcap"), text, round(3 * DWELL_S * RATE_HZ))[0]
+    recording = rtloop.load(path)
+    flags = np.unique(recording["flags"])
+    trips = sorted({cause for value in flags for cause in trip_causes(value)})
+    start = round(DWELL_S * RATE_HZ)
+    step = recording["x_true_position_um"][start + 1 : 2 * start] / STEP_UM
+    final = float(np.mean(step[-200:]))
+    outside = np.flatnonzero(np.abs(step / final - 1) > 0.05)
+    settling_ms = 1e3 * (outside[-1] + 1 if outside.size else 0) / RATE_HZ
+    return trips, {
+        "settling_ms": settling_ms - 1e3 * promised.settling_time_s,
+        "overshoot_percent": 100 * (float(step.max()) / final - 1) - promised.overshoot_percent,
+        "static_percent": 100 * abs(final - 1) - promised.static_error_percent,
+    }
 
 
 if __name__ == "__main__":

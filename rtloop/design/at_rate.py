@@ -1,0 +1,76 @@
+"""What a loop's rate means for a synthesis in continuous time: dead time in the plant, roots that no sample can see.
+
+exp(−sτ) ≈ N(−sτ)/N(sτ),   N(x) = Σ_k (2n − k)! n!/((2n)! k! (n − k)!) x^k       Padé 1892, order n of both
+s − z → −z,   1/(s − p) → −1/p                                                   roots far beyond the rate
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hil.linear import Complex
+from rtloop.design.closedloop import discrete_loop
+from rtloop.design.discretise import Method, discretise
+from rtloop.design.margins import margins
+from rtloop.design.transfer import Transfer
+from rtloop.law.layout import MAX_ORDER
+
+FAR = 1000.0
+"""A root beyond so many times half the sampling rate turns the phase there by less than 0.06°: it is left out."""
+MOST_DEAD_TIME_ORDER = 6
+LARGEST_SENSITIVITY = 3.0
+"""max |S| of a loop that may be written; 1/3 is its distance from −1, and 2 is what textbooks ask for."""
+
+
+def dead_time(delay_s: float, order: int) -> Transfer:
+    """Padé's all-pass for exp(−s·delay_s), of `order` at most MOST_DEAD_TIME_ORDER; 1 without a delay."""
+    n = min(order, MOST_DEAD_TIME_ORDER)
+    if delay_s == 0 or n == 0:
+        return Transfer.from_zpk([], [], 1.0)
+    factorial = math.factorial
+    coefficients = [
+        factorial(2 * n - k) * factorial(n) / (factorial(2 * n) * factorial(k) * factorial(n - k)) for k in range(n + 1)
+    ]
+    poles = np.roots(coefficients[::-1]) / delay_s
+    return Transfer.from_zpk(-poles, poles, (-1.0) ** n)
+
+
+def within_rate(transfer: Transfer, rate_hz: float) -> Transfer:
+    """Without the roots that lie FAR beyond half of `rate_hz`; the gain at 0 Hz stays.
+
+    Poles that are not stable stay, and so do as many poles as there are zeros left.
+    """
+    far = FAR * math.pi * rate_hz
+    zeros, gone = _parted(transfer.zeros, np.abs(transfer.zeros) <= far)
+    poles, left_out = _parted(transfer.poles, (np.abs(transfer.poles) <= far) | (transfer.poles.real >= 0))
+    if zeros.size > poles.size:
+        poles, left_out = transfer.poles, poles[:0]
+    gain = complex(transfer.gain)
+    for zero in gone:
+        gain *= -zero
+    for pole in left_out:
+        gain /= -pole
+    return Transfer(zeros, poles, gain.real)
+
+
+def runs(
+    controller: Transfer, plant: Transfer, rate_hz: float, method: Method, prewarp_hz: float | None, delay_ticks: int
+) -> bool:
+    """Whether the loop can run at this rate, C(z) with the plant behind its hold and delay: stable, and not barely so.
+
+    Near half the rate C(z) differs from C(s); a light mode there may leave a loop that is stable on the model alone.
+    """
+    if controller.order > MAX_ORDER:
+        return False
+    try:
+        discrete = discretise(controller, 1 / rate_hz, method, prewarp_hz)
+    except ValueError:
+        return False
+    loop = discrete_loop(discrete, plant, delay_ticks)
+    return loop.is_stable and margins(loop).max_sensitivity <= LARGEST_SENSITIVITY
+
+
+def _parted(roots: Complex, kept: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
+    return roots[kept], roots[~kept]

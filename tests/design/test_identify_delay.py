@@ -1,0 +1,57 @@
+"""Whole samples of delay, told from recordings: a mode and nothing else, seen late."""
+
+import numpy as np
+import pytest
+
+from hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
+from hil.rig import build_rig
+from rtloop.design.identify_dynamics import identify_dynamics
+from rtloop.design.prediction_error import Excitation
+from tests.design.rigs import _record
+
+PERIOD_S, GAIN_UM_PER_V = 1e-4, 2.0
+
+
+def excitation(hz: float, damping: float, delay_ticks: int, drive_v: np.ndarray) -> Excitation:
+    """A linear rig of one mode, 10 nm of noise and resolution, behind its converters."""
+    omega = 2 * np.pi * hz
+    rig = RigOptions(
+        plant=PlantOptions(
+            hysteresis=HysteresisOptions(truth="custom", thresholds_v=(0.0,), weights_um_per_v=(GAIN_UM_PER_V,)),
+            dynamics=DynamicsOptions(
+                form="factors", gain=omega**2, denominator=((1.0, 2 * damping * omega, omega**2),)
+            ),
+            sensor=SensorOptions(um_per_v=10.0, noise_um=0.010),
+        ),
+        seed=3,
+        latency_ticks=delay_ticks,
+    )
+    coefficients, state = build_rig(rig, ["x"], PERIOD_S)
+    adc_v = np.empty(drive_v.size)
+    _record(coefficients[0], state[0], drive_v, adc_v)
+    return Excitation("rig", GAIN_UM_PER_V * drive_v, 10.0 * adc_v, PERIOD_S)
+
+
+def up_and_down(duration_s: float = 0.6) -> np.ndarray:
+    time_s = PERIOD_S * np.arange(round(duration_s / PERIOD_S))
+    return np.where((time_s >= 0.05) & (time_s < 0.55 * duration_s), 10.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("drive", "delay_ticks"), [("up and down", 0), ("up and down", 3), ("one step", 1), ("one step", 2)]
+)
+def test_the_delay_is_found_and_no_pole_stands_in_for_it(drive, delay_ticks) -> None:
+    """Up and down leaves the second half to judge by; one step leaves only the fit itself."""
+    drive_v = up_and_down() if drive == "up and down" else np.where(np.arange(3000) < 500, 0.0, 10.0)
+    fit = identify_dynamics(excitation(800.0, 0.02, delay_ticks, drive_v))
+    assert fit.delay_ticks == delay_ticks
+    assert fit.model.order == 2
+    (mode,) = fit.modes
+    assert mode.frequency_hz == pytest.approx(800.0, rel=1e-3)
+    assert mode.damping == pytest.approx(0.02, rel=0.02)
+
+
+def test_a_noisy_drive_tells_the_delay_too() -> None:
+    drive_v = np.random.default_rng(5).uniform(-5, 5, 4000)
+    drive_v[:200] = 0.0
+    assert identify_dynamics(excitation(300.0, 0.01, 2, drive_v)).delay_ticks == 2

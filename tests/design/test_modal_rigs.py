@@ -1,0 +1,60 @@
+"""Strictly proper rigs by the whole chain (forty: `make soak-chain`), and the stage that the pages walk through."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli import main
+from rtloop.config import load
+from rtloop.design.measured import UnsuitableData
+from rtloop.prepare import prepare
+from tests.design.modal_rigs import modal_rig
+from tests.recording.real_loop import record
+from tests.soak.chain import LIMITS, designed_for, run, verdict
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+ONE_MODE_LATE_BY_3, TWO_MODES_LATE_BY_1 = 14, 38
+
+
+@pytest.mark.parametrize("seed", [ONE_MODE_LATE_BY_3, TWO_MODES_LATE_BY_1])
+def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
+    """Modes and delay are the rig's own; the loop meets its specification on the model, and runs on the rig."""
+    rig = modal_rig(seed)
+    chain, written = designed_for(rig, tmp_path)
+    assert chain.dynamics.delay_ticks == rig.delay_ticks > 0
+    light = sorted(mode.frequency_hz for mode in chain.dynamics.modes if mode.damping < 0.1)
+    assert light == pytest.approx(rig.hz, rel=1e-3)
+    assert verdict(chain) == "meets it"
+    running = prepare(load(written)).checks[0].running
+    assert running is not None
+    assert running.delay_ticks == rig.delay_ticks
+    trips, distances = run(written, running)
+    assert trips == []
+    assert all(abs(distances[name]) <= limit for name, limit in LIMITS.items()), distances
+
+
+def test_the_stage_of_ones_own_keeps_its_specification(tmp_path) -> None:
+    """deploy/own-stage*.toml, as docs/identification.md walks through them: every command ends with 0."""
+    recordings = [
+        record(tmp_path / f"{name}.mcap", (DEPLOY / f"{name}.toml").read_text(encoding="utf-8"), ticks)[0]
+        for name, ticks in (("own-stage-sine", 25_000), ("own-stage", 10_000))
+    ]
+    out = tmp_path / "my-stage.toml"
+    arguments = [*recordings, "--specs", DEPLOY / "own-stage-spec.toml", "--out", out, "--json"]
+    result = CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["meets"]
+    (axis,) = load(out).axes
+    assert axis.model is not None
+    assert axis.model.delay_ticks == 1
+    assert axis.interlocks.oscillation_swings > 0
+    trips, _ = run(out, prepare(load(out)).checks[0].running)
+    assert trips == []
+
+
+def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:
+    """Two modes by one pole."""
+    with pytest.raises(UnsuitableData, match=r"no model explains it: that of order 1 .* would help"):
+        designed_for(modal_rig(TWO_MODES_LATE_BY_1), tmp_path, order=1)
