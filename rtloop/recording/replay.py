@@ -27,6 +27,8 @@ from rtloop.signals import Flag
 
 FEW_PERIODS, RATE_TOLERANCE = 50, 0.05
 """Over fewer periods no rate is compared; a card's own clock may be a little off."""
+FILLING_REVISION, FILLING = 2, (Kind.SET_MODE, Kind.LOAD_LAW)
+"""Since this revision of the law these commands begin with a pre-filter filled anew."""
 LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
 Progress = Callable[[int], None]
 
@@ -61,7 +63,10 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray
     """The commands that took effect, as a schedule; those for references are not needed, whose samples are inputs."""
     commands = [message_of(event, recording.header["axes"]) for event in recording.events]
     parts = [command for command in commands if command is not None and command["kind"][0] in kinds]
-    return np.concatenate([np.zeros(0, MESSAGE), *parts])
+    found = np.concatenate([np.zeros(0, MESSAGE), *parts])
+    if recording.header["law"].get("revision", 1) < FILLING_REVISION:
+        found["values"][np.isin(found["kind"], FILLING), 1] = 1.0  # as it was: the pre-filter keeps its memory
+    return found
 
 
 def consecutive(rows: Rows) -> list[Rows]:
