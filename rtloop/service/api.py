@@ -36,7 +36,7 @@ from rtloop.service.bodies import (
     TuneBody,
     WaveformBody,
 )
-from rtloop.service.desk import Refused
+from rtloop.service.desk import Refused, Taken
 from rtloop.service.lanes import Busy, Lane, Lanes
 from rtloop.service.metrics import metrics_text
 from rtloop.service.service import Service
@@ -193,6 +193,8 @@ async def _answer(service: Service, lanes: Lanes, path: str, data: bytes | str) 
         return _error(422, "; ".join(error.faults))
     except (Busy, UnavailableError) as error:
         return _error(503, str(error))
+    except Taken as error:
+        return _error(504, str(error))
     except (QueueFull, RtloopError, DriverError) as error:
         return _error(409, str(error))
 
@@ -208,9 +210,10 @@ def openapi() -> dict[str, Any]:
         "/metrics": {"get": {"summary": "Prometheus text."}},
     }
     answers = {"200": {"description": "done; a command's `tick` is when it took effect"},
-               "409": {"description": "refused in this state"}, "413": {"description": "too large"},
+               "409": {"description": "refused in this state, and withdrawn"}, "413": {"description": "too large"},
                "422": {"description": "malformed, or outside the envelope"},
-               "503": {"description": "too many wait, or it takes too long"}}  # fmt: skip
+               "503": {"description": "too many wait, or it takes too long"},
+               "504": {"description": "taken by a loop that stands still: takes effect if that goes on"}}  # fmt: skip
     for path, (body, summary, _) in ACTIONS.items():
         operation: dict[str, Any] = {"summary": summary, "responses": answers}
         if body is not None:

@@ -40,6 +40,8 @@ class LiveLaw:
         self.offsets_v = offsets_v
         self._block, self._desk = block, desk
         self._lock = threading.Lock()
+        self._building = threading.Lock()
+        """Held while another law is built and verified: references do not wait for that."""
         self._first_spare = prepared.plan.table.size
         self._places = [0] * len(prepared.plan.axes)
         self._unsettled_tick: int | None = None
@@ -52,7 +54,7 @@ class LiveLaw:
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
         """Change keys of [axis.SECTION]; returns the tick. Raises ConfigError, Refused."""
-        with self._lock:
+        with self._building:
             number = self.axis_number(axis)
             options = self.prepared.configuration.axes[number]
             if section not in SECTIONS:
@@ -63,7 +65,7 @@ class LiveLaw:
 
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
         """Swap [axis.controller] as a whole; returns the tick. Raises ConfigError, Refused."""
-        with self._lock:
+        with self._building:
             number = self.axis_number(axis)
             merged = self.prepared.configuration.axes[number].model_dump(exclude_unset=True)
             merged["controller"] = dict(controller)
@@ -107,7 +109,7 @@ class LiveLaw:
 
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Take over another configuration; what changed. Raises Refused where that needs a restart."""
-        with self._lock:
+        with self._building, self._lock:
             old, new = self.prepared.configuration, prepared.configuration
             fixed = [part for part in FIXED if getattr(old, part) != getattr(new, part)]
             if fixed or prepared.plan.axes != self.prepared.plan.axes:
@@ -133,13 +135,14 @@ class LiveLaw:
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
         prepared = prepare_limited(_with_axis(configuration, number, axis))
-        try:
-            tick = self._stage(number, prepared)
-        except Taken:
+        with self._lock:
+            try:
+                tick = self._stage(number, prepared)
+            except Taken:
+                self.prepared = prepared
+                raise
             self.prepared = prepared
-            raise
-        self.prepared = prepared
-        return tick
+            return tick
 
     def _stage(self, number: int, prepared: Prepared) -> int:
         """Copy coefficients to where the loop takes them from, and have it take them."""

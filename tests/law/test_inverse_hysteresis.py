@@ -128,7 +128,7 @@ def test_any_model_that_inverts(seed):
         "dead_band": "exact",
         "dead_band_threshold_v": 1e-12,
     }
-    limits = {"drive_v": 1e4, "command_um": 1e4}
+    limits = {"drive_v": 1e4, "command_um": 1e4, "trip_slew_v_per_s": 1e5}
     coefficients = coefficients_of(Channel("wide", -1e5, 1e5), feedforward=feedforward, limits=limits)
     command = random_walk(seed, 3000, 30.0)
     signals = LawBench(coefficients, Mode.FEEDFORWARD).run(command)

@@ -11,7 +11,7 @@ from rtloop.recording import replay as replay_module
 from rtloop.recording.replay import replay
 
 OLD = Path(__file__).with_name("data") / "revision-1.mcap"
-"""2500 ticks through all modes, with a pre-filter of 32 taps and a section that kept its memory from one to the next."""
+"""2500 ticks through all modes, with a pre-filter of 32 taps and a section that kept its memory throughout."""
 
 
 def test_a_pre_filter_that_kept_its_memory_replays():
