@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
 from rtloop.law.reference import Generator
-from rtloop.recording.events import FINAL, GAP, Event, known
+from rtloop.recording.events import FINAL, GAP, RECORDING_FAILED, RECORDING_RESUMED, Event, known
 from rtloop.recording.format import FORMAT
 from rtloop.signals import Mode
 
@@ -56,6 +56,7 @@ class _Realtime(_Checked):
 
 class _Law(_Checked):
     sha256: Text | None = None
+    revision: Annotated[int, Field(ge=1, le=1000)] = 1
 
 
 class _Versions(_Checked):
@@ -105,6 +106,20 @@ class _Totals(_Checked):
     gaps: list[Any] = []
 
 
+class _Failure(_Checked):
+    error: str
+
+
+class _Resumed(_Checked):
+    first_tick: Tick
+    count: Tick
+
+
+_OF_RECORDER: dict[str, type[_Checked]] = {
+    **dict.fromkeys(FINAL, _Totals), GAP: _Gap, RECORDING_FAILED: _Failure, RECORDING_RESUMED: _Resumed
+}  # fmt: skip
+
+
 class _Message(_Checked):
     values: Annotated[list[Any], Field(min_length=MESSAGE_VALUES, max_length=MESSAGE_VALUES)]
     identity: Number
@@ -139,8 +154,8 @@ def event_from(payload: bytes, axes: Sequence[str]) -> Event:
     kind, what = event["kind"], event["what"]
     if event["axis"] is not None and event["axis"] not in axes:
         raise Malformed(f"axis: {_shown(event['axis'])}; null or one of {', '.join(axes)} is allowed")
-    if kind == GAP or kind in FINAL:
-        _require(_Gap if kind == GAP else _Totals, what, "what.")
+    if (model := _OF_RECORDER.get(kind)) is not None:
+        _require(model, what, "what.")
         return event
     for key, names in (("kind", Kind), ("who", Origin)):
         if not known(names, event[key]):
