@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.atomics import exchanged, load_acquire, store_release
-from hil.compiled import jit, seldom
+from hil.compiled import guarded, seldom
 from rtloop.engine.context import (
     axes_of,
     coefficients_of,
@@ -27,7 +27,7 @@ from rtloop.engine.memory import COMMAND_SLOTS, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
 from rtloop.law.filters import fill_prefilter_anew
-from rtloop.law.law import reset_trip, set_controller, set_mode
+from rtloop.law.law import counts_fit, reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.reference import GENERATOR_PARAMETERS
 
@@ -61,19 +61,19 @@ def withdraw(block: SharedBlock, position: int) -> bool:
     return bool(_exchange(block["commands_marks"], position))
 
 
-@jit
+@guarded
 def _offer(words, marks, position):
     store_release(marks, position % marks.size, np.uint64(position + 1))
     store_release(words, HEAD, np.uint64(position + 1))
 
 
-@jit
+@guarded
 def _exchange(marks, position):
     """Whether the caller is the one who takes, or withdraws, the command at `position`."""
     return exchanged(marks, position % marks.size, np.uint64(position + 1), GONE)
 
 
-@jit
+@guarded
 def apply_commands(loop):
     """Apply what is due at this tick: all of the schedule, and of the queue at most COMMANDS_PER_TICK."""
     schedule = messages(loop.schedule, loop.schedule_count)
@@ -105,7 +105,9 @@ def _apply(loop, command):
     elif command.kind == RESET_TRIP:
         reset_trip(state)
     elif command.kind == LOAD_LAW:
-        _load_law(loop, command.axis, command.values[0] != 0.0, command.values[1] == 0.0)
+        if not _load_law(loop, command.axis, command.values[0] != 0.0, command.values[1] == 0.0):
+            publish_event(loop, REFUSED, command.axis, command.origin, command.identity, (float(command.kind), 0.0))
+            return
     elif command.kind == STOP:
         store_release(words_of(loop), STOP_WORD, ONE)  # the loop reports it when it stops
         return
@@ -122,7 +124,7 @@ def _apply(loop, command):
     loop.events += 1
 
 
-@jit
+@guarded
 def _set_reference(loop, command):
     generators = generators_of(loop)
     for a in range(loop.axis_count):
@@ -134,9 +136,9 @@ def _set_reference(loop, command):
                 generators[a].parameters[i] = command.values[1 + i]
 
 
-@jit
+@guarded
 def _load_law(loop, axis, another, fitting):
-    """Take the staged coefficients of an axis and make its state fit.
+    """Take the staged coefficients of an axis and make its state fit; False where their counts do not fit a record.
 
     Another controller continues from the command in force. Another pre-filter begins with the reference in force; where
     not `fitting` (as in recordings of revision 1) it does so only where its memory would not fit.
@@ -145,6 +147,8 @@ def _load_law(loop, axis, another, fitting):
     size = (loop.axis_count) * COEFFICIENT_BYTES
     staged, active = octets(loop.staged, size), octets(loop.coefficients, size)
     before, after = coefficients_of(loop)[axis], staged_of(loop)[axis]
+    if not counts_fit(after):
+        return False
     refilled = before.tap_count != after.tap_count or before.section_count != after.section_count
     if fitting and not refilled:
         for i in range(after.section_count):
@@ -156,6 +160,7 @@ def _load_law(loop, axis, another, fitting):
     if another:
         set_controller(axes_of(loop)[axis])
     loop.next_snapshot = loop.tick
+    return True
 
 
 @seldom

@@ -20,6 +20,7 @@ from rtloop.law.filters import (
     prefilter,
 )
 from rtloop.law.hysteresis import follow_drive, inverse_drive
+from rtloop.law.layout import MAX_ORDER, MAX_PLAYS, MAX_SECTIONS, MAX_TAPS
 from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
 from rtloop.law.watch import watch
 from rtloop.signals import Flag, Mode
@@ -32,6 +33,15 @@ RAMPING = int(Flag.RAMPING)
 HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
 NEGLIGIBLE_BUMP = 1e-9
 ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
+
+
+@jit
+def counts_fit(coefficients):
+    """Whether every count of an axis stays within its record: the innermost loops do not look."""
+    fit = coefficients.play_count <= MAX_PLAYS and coefficients.order <= MAX_ORDER
+    for i in range(MAX_ORDER):
+        fit = fit and coefficients.row_stop[i] <= MAX_ORDER
+    return fit and coefficients.tap_count <= MAX_TAPS and coefficients.section_count <= MAX_SECTIONS
 
 
 @jit

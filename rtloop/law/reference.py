@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from hil.compiled import jit
+from hil.compiled import guarded
 
 GENERATOR_PARAMETERS = 8
 
@@ -50,7 +50,7 @@ HOLD, TABLE, SINE, TRIANGLE, CHIRP = 0, 1, 2, 3, 4
 TURN = 2.0 * math.pi
 
 
-@jit
+@guarded
 def reference_sample(generator, tick, period_s, table, inputs):
     """Reference of one axis at `tick`; `table` (n,) holds the samples of all tables, `inputs` the driver's volts."""
     if tick < generator.held_until:
@@ -75,7 +75,7 @@ def reference_sample(generator, tick, period_s, table, inputs):
     return inputs[np.int64(p[0])] * p[1] + p[2]
 
 
-@jit
+@guarded
 def _table_index(index, count, repeat):
     """Index within a table of `count` samples: from the start again, or held at the end."""
     if repeat:
@@ -83,13 +83,13 @@ def _table_index(index, count, repeat):
     return index if index < count else count - 1
 
 
-@jit
+@guarded
 def _phase(turns):
     """Fraction of a turn, in 0 ≤ phase < 1."""
     return turns - math.floor(turns)
 
 
-@jit
+@guarded
 def _chirp_turns(p, time_s):
     """Turns of a sweep that holds its last frequency once it has ended."""
     start_hz, end_hz, duration_s = p[1], p[2], p[3]

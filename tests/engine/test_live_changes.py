@@ -105,3 +105,17 @@ def test_a_count_beyond_its_record_is_a_trip_and_not_a_write(name: str, value: i
     assert [kind for _, kind, *_ in bench.events()] == [Kind.TRIPPED]
     assert bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes() == state
     assert bench.block["last_drive_v"][0] == pytest.approx(drive_v, abs=0.05)
+
+
+def test_a_law_whose_counts_do_not_fit_is_refused_and_the_old_one_goes_on():
+    bench = LoopBench(configuration(4, 1))
+    bench.run(100)
+    bench.events()
+    forged = bench.law.coefficients.copy()
+    forged["play_count"] = 68
+    bench.block["staged"][: forged.nbytes] = np.frombuffer(forged.tobytes(), np.uint8)
+    bench.send(Kind.LOAD_LAW, 1.0, axis=0)
+    bench.run(100)
+    assert bench.outcome is Outcome.DONE
+    assert [kind for _, kind, *_ in bench.events()] == [Kind.REFUSED]
+    assert bench.law.coefficients["play_count"][0] == 16
