@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 
 from hil.atomics import load_acquire
-from hil.compiled import guarded, seldom
+from hil.compiled import jit, seldom
 from hil.pointers import call
 from rtloop.engine.commands import apply_commands, publish_event
 from rtloop.engine.context import (
@@ -63,7 +63,7 @@ GIVE_UP_S = 1.0
 """A card that refuses every write for so long is left to whoever parks it."""
 
 
-@guarded
+@jit
 def run_ticks(loop, until_tick):
     """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome.
 
@@ -79,7 +79,7 @@ def run_ticks(loop, until_tick):
     return outcome
 
 
-@guarded
+@jit
 def _require_counts(loop):
     coefficients = coefficients_of(loop)
     for a in range(loop.axis_count):
@@ -87,7 +87,7 @@ def _require_counts(loop):
             raise IndexError("a count of the law is beyond its record")
 
 
-@guarded
+@jit
 def _run_ticks(loop, until_tick):
     while loop.tick < until_tick:
         _prepare(loop)
@@ -108,7 +108,7 @@ def _run_ticks(loop, until_tick):
     return DONE
 
 
-@guarded
+@jit
 def _prepare(loop):
     """What a tick does before its deadline: schedule and commands, stop request, snapshot of the law."""
     apply_commands(loop)
@@ -122,7 +122,7 @@ def _prepare(loop):
         loop.next_snapshot = loop.tick + loop.snapshot_ticks
 
 
-@guarded
+@jit
 def _tick(loop):
     timing = floats(loop.timing, 4)
     deadline_ns, wake_ns, missed, now_ns = timing[0], timing[1], timing[2], timing[3]
@@ -161,7 +161,7 @@ def _tick(loop):
     publish(ring, position)
 
 
-@guarded
+@jit
 def _now(loop):
     """ns since the start; NaN in virtual time, whose clock has no `now`."""
     if loop.now == 0:
@@ -170,7 +170,7 @@ def _now(loop):
     return floats(loop.timing, 1)[0]
 
 
-@guarded
+@jit
 def _note(loop, written):
     """Where the outputs are now: where they were, if the write failed; the law goes on from there."""
     axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
@@ -185,7 +185,7 @@ def _note(loop, written):
             last_drive_v[a] = axes[a].drive_v
 
 
-@guarded
+@jit
 def _evaluate(loop, status, now_ns, lateness_us):
     """References, interlocks and law; the drives go to the driver's outputs."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
@@ -212,7 +212,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
         outputs[output_index[a]] = axes[a].drive_v
 
 
-@guarded
+@jit
 def _fill_signals(loop, row):
     """Sample age, the signals of each axis, the observed signals."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
@@ -234,7 +234,7 @@ def _fill_signals(loop, row):
         row[column + i] = inputs[loop.input_count + 1 + i]
 
 
-@guarded
+@jit
 def _report(loop, status, written, missed):
     """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
     new_trip = state_of(loop).new_trip
