@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import warnings
 
 import pytest
@@ -59,23 +60,26 @@ def test_exactly_one_of_loop_and_producer_gets_each_command():
     """Both try at the same time, in processes of their own."""
     bench = LoopBench(RAW)
     bench.run(1)
+    producer = os.getpid()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads, none of which is ours
         pid = os.fork()
     if pid == 0:
-        while not bench.block.words[Word.STOP]:
+        while os.getppid() == producer:
             bench.assembly.run(int(bench.assembly.loop.tick) + 1)
             bench.block.words[Word.RECORDER_CURSOR] = bench.assembly.loop.tick
         os._exit(0)
     withdrawn = 0
-    for number in range(TRIES):
-        while number - int(bench.block.words[Word.COMMANDS_TAIL]) > COMMAND_SLOTS // 2:
+    try:
+        for number in range(TRIES):
+            while number - int(bench.block.words[Word.COMMANDS_TAIL]) > COMMAND_SLOTS // 2:
+                os.sched_yield()
+            withdrawn += withdraw(bench.block, send(bench.block, hold(0.0)))
+        while bench.block.words[Word.COMMANDS_TAIL] != TRIES:
             os.sched_yield()
-        withdrawn += withdraw(bench.block, send(bench.block, hold(0.0)))
-    while bench.block.words[Word.COMMANDS_TAIL] != TRIES:
-        os.sched_yield()
-    bench.block.words[Word.STOP] = 1
-    os.waitpid(pid, 0)
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
     taken = sum(event == Kind.SET_REFERENCE for event in bench.drain("events")["kind"])
     assert taken + withdrawn == TRIES
     assert withdrawn > 0
