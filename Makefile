@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 # Tests that compute, two at a time; the others start processes and wait for clocks, and come one after the other.
-COMPUTING := tests/law tests/hil tests/design tests/benchmarks tests/engine tests/recording
+COMPUTING := tests/law tests/hil tests/design tests/benchmarks tests/recording
 
 .PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
 
