@@ -24,6 +24,7 @@ from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured
 from tests.faults.processes import KILLED_SAFE_MS
 from tests.faults.requests import is_refused
+from tests.full_pipe import fill
 
 DEATHS, SEED = 200, 14
 FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
@@ -80,14 +81,7 @@ def full_pipe(bench: Bench) -> Measured:
     bench.stderr = writing
     bench.start_service()
     bench.await_drive()
-    os.set_blocking(writing, False)
-    filled = 0
-    while True:
-        try:
-            filled += os.write(writing, b"x" * 4096)
-        except BlockingIOError:
-            break
-    os.set_blocking(writing, True)  # of the pipe, and so for the service as well
+    filled = fill(writing)
     bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
     took_ms = bench.await_safe(KILLED_SAFE_MS)
     bench.await_restart()

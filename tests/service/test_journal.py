@@ -8,21 +8,14 @@ import os
 import pytest
 
 from rtloop.service.journal import Journal
+from tests.full_pipe import fill
 
 
 @pytest.fixture
 def pipe():
     """Reading and writing end of a pipe that is full."""
     reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    size = 0
-    while True:
-        try:
-            size += os.write(writing, b"x" * 4096)
-        except BlockingIOError:
-            break
-    os.set_blocking(writing, True)
-    yield reading, writing, size
+    yield reading, writing, fill(writing)
     os.close(reading)
 
 
