@@ -22,7 +22,7 @@ TICKS = 4000
 
 @pytest.mark.parametrize("latency", [0, 1])
 @pytest.mark.parametrize(("method", "lines"), [("tustin", TUSTIN), ("matched", MATCHED)])
-def test_steps_against_the_linear_loop(method, lines, latency, record_property):
+def test_steps_against_the_linear_loop(method, lines, latency):
     bench = LoopBench(text(IDEAL, AXIS, EXACT, CONTROLLER, lines, STEPS, latency=latency))
     rows = bench.run(TICKS)
     assert rows.shape[0] == TICKS
@@ -31,7 +31,6 @@ def test_steps_against_the_linear_loop(method, lines, latency, record_property):
     assert np.array_equal(bench.column(rows, "x_reference_um"), reference)
     oracle = closed_loop(reference, method, latency)
     error_um = np.abs(bench.column(rows, "x_true_position_um") - oracle.position_um).max()
-    record_property("error_um", error_um)
     assert error_um < 1e-9
     assert np.abs(bench.column(rows, "x_command_um") - oracle.command_um).max() < 1e-9
     assert np.abs(oracle.position_um).max() > 20

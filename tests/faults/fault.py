@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -79,7 +80,8 @@ def measure(fault: Fault) -> Row:
         except NotPossible as reason:
             row.skipped = str(reason)
         except (AssertionError, RtloopError) as error:
-            row.problems.append(str(error))
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            row.problems.append(str(error) or f"{where.name}: {where.line}")
     return row
 
 
