@@ -92,8 +92,8 @@ def guarded(function: Callable[..., Any]) -> Any:
 
 
 def seldom(function: Callable[..., Any]) -> Any:
-    """A kernel for what most ticks do not do: called, so that it does not crowd its callers."""
-    return numba.njit(cache=True, error_model="numpy")(function)
+    """A kernel for what most ticks do not do: called, not to crowd its callers, and with indices checked."""
+    return numba.njit(cache=True, error_model="numpy", boundscheck=True)(function)
 
 
 def intrinsic(function: Callable[..., Any]) -> Any:

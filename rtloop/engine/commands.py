@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.atomics import exchanged, load_acquire, store_release
-from hil.compiled import guarded, seldom
+from hil.compiled import guarded, jit, seldom
 from rtloop.engine.context import (
     axes_of,
     coefficients_of,
@@ -73,13 +73,26 @@ def _exchange(marks, position):
     return exchanged(marks, position % marks.size, np.uint64(position + 1), GONE)
 
 
-@guarded
+@jit
 def apply_commands(loop):
     """Apply what is due at this tick: all of the schedule, and of the queue at most COMMANDS_PER_TICK."""
+    if loop.scheduled < loop.schedule_count:
+        _apply_schedule(loop)
+    words = words_of(loop)
+    if load_acquire(words, HEAD) != words[TAIL]:
+        _apply_queue(loop)
+
+
+@seldom
+def _apply_schedule(loop):
     schedule = messages(loop.schedule, loop.schedule_count)
     while loop.scheduled < loop.schedule_count and schedule[loop.scheduled].tick <= loop.tick:
         _apply(loop, schedule[loop.scheduled])
         loop.scheduled += 1
+
+
+@seldom
+def _apply_queue(loop):
     words, queue = words_of(loop), messages(loop.commands, loop.command_count)
     marks = unsigned(loop.commands_marks, loop.command_count)
     tail = words[TAIL]

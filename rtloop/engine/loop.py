@@ -96,8 +96,6 @@ def _run_ticks(loop, until_tick):
         _tick(loop)
         loop.tick += 1
         state = state_of(loop)
-        if loop.refused * loop.period_s > GIVE_UP_S:
-            return FAILURE
         if state.settled != 0:
             if loop.failed != 0:
                 return FAILURE
@@ -172,17 +170,24 @@ def _now(loop):
 
 @jit
 def _note(loop, written):
-    """Where the outputs are now: where they were, if the write failed; the law goes on from there."""
-    axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    """Where the outputs are now, for whoever parks them."""
     if written < 0:
-        loop.refused += 1
-        state_of(loop).settled = 0
-        for a in range(loop.axis_count):
-            axes[a].drive_v = last_drive_v[a]
-    else:
-        loop.refused = 0
-        for a in range(loop.axis_count):
-            last_drive_v[a] = axes[a].drive_v
+        _hold(loop)
+        return
+    axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    loop.refused = 0
+    for a in range(loop.axis_count):
+        last_drive_v[a] = axes[a].drive_v
+
+
+@seldom
+def _hold(loop):
+    """A write failed: the outputs are where they were, and the law goes on from there. After GIVE_UP_S no further."""
+    axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    loop.refused += 1
+    state_of(loop).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
+    for a in range(loop.axis_count):
+        axes[a].drive_v = last_drive_v[a]
 
 
 @jit
