@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.linear import Complex, Real
-from rtloop.design.discretise import DiscreteController, discretised
+from rtloop.design.discretise import DiscreteController, held
 from rtloop.design.realisation import System, beside_imaginary_axis, realise
 from rtloop.design.transfer import Transfer
 
@@ -111,7 +111,7 @@ def discrete_loop(controller: DiscreteController, plant: Transfer, delay_ticks: 
     if delay_ticks < 0:
         raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
     period_s = controller.period_s
-    sampled = discretised(plant, period_s, "zoh").system
+    sampled = held(plant, period_s)
     images = np.concatenate([controller.zeros, controller.poles])
     roots = np.concatenate([_rates(images, period_s), plant.poles])
     return Loop(controller.system, _delayed(sampled, delay_ticks), controller.dc_gain * plant.dc_gain, roots, period_s)

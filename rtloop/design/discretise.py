@@ -121,15 +121,26 @@ def discretised(
     """The transfer function alone, without what only a controller needs: for plants, too. Raises as `discretise`."""
     _check(period_s, method, prewarp_hz)
     if transfer.gain == 0 or transfer.order == 0:
-        nothing = np.empty(0, dtype=complex)
-        static = System(np.empty((0, 0)), np.empty(0), np.empty(0), transfer.high_frequency_gain)
+        nothing, static = np.empty(0, dtype=complex), _static(transfer)
         return Discrete(nothing, nothing, static.d, static, "modal")
     if method in ("zoh", "foh"):
-        return _held(transfer, period_s, method == "foh")
+        system, form = _held(transfer, period_s, method == "foh")
+        zeros, gain = zeros_and_gain(system)
+        return Discrete(zeros, np.exp(transfer.poles * period_s), gain, system, form)
     zeros, poles, gain = (
         _matched(transfer, period_s) if method == "matched" else _tustin(transfer, period_s, prewarp_hz)
     )
     return Discrete(zeros, poles, gain, *realise(zeros, poles, gain, around_unit_circle()))
+
+
+def held(transfer: Transfer, period_s: float) -> System:
+    """A plant behind a zero-order hold, as a state space alone: its zeros cost more than all the rest."""
+    _check(period_s, "zoh", None)
+    return _static(transfer) if transfer.gain == 0 or transfer.order == 0 else _held(transfer, period_s, False)[0]
+
+
+def _static(transfer: Transfer) -> System:
+    return System(np.empty((0, 0)), np.empty(0), np.empty(0), transfer.high_frequency_gain)
 
 
 def _check(period_s: float, method: str, prewarp_hz: float | None) -> None:
@@ -188,7 +199,7 @@ def _with_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
     return np.concatenate([zeros, np.full(count, -1.0 + 0j)]).astype(complex)
 
 
-def _held(transfer: Transfer, period_s: float, ramp: bool) -> Discrete:
+def _held(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
     """Exact for a held input or for one that runs straight between samples."""
     points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
     modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)
@@ -198,6 +209,4 @@ def _held(transfer: Transfer, period_s: float, ramp: bool) -> Discrete:
     else:
         continuous = scaled(cascade(transfer.zeros, transfer.poles, transfer.gain), points)
         system = held_matrices(continuous, period_s, ramp)
-    system = scaled(system, around_unit_circle())
-    zeros, gain = zeros_and_gain(system)
-    return Discrete(zeros, np.exp(transfer.poles * period_s), gain, system, "modal" if modal else "cascade")
+    return scaled(system, around_unit_circle()), "modal" if modal else "cascade"

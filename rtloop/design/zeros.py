@@ -42,10 +42,14 @@ def _balanced(system: System) -> System:
     """The same system with the rows and columns of each state evened out by powers of two (Osborne 1960)."""
     a, b, c = system.a.copy(), system.b.copy(), system.c.copy()
     for _ in range(20):
+        even = True
         for i in range(b.size):
             column = np.abs(np.delete(a[:, i], i)).sum() + abs(c[i])
             row = np.abs(np.delete(a[i], i)).sum() + abs(b[i])
             factor = 2.0 ** np.round(0.5 * np.log2(row / column)) if row > 0 and column > 0 else 1.0
+            even = even and factor == 1.0
             a[:, i], c[i] = a[:, i] * factor, c[i] * factor
             a[i], b[i] = a[i] / factor, b[i] / factor
+        if even:
+            break
     return System(a, b, c, system.d)

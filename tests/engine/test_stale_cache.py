@@ -17,16 +17,16 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import json
-import numpy as np
-from rtloop.law.law import evaluate
-from rtloop.law.layout import COEFFICIENTS, CONDITIONS, initial_state, records
+from rtloop.law.law import set_mode
+from rtloop.law.layout import COEFFICIENTS, initial_state, records
 
-coefficients = records(COEFFICIENTS, 1)
-axes, loop = initial_state(coefficients)
-evaluate(coefficients, axes, loop[0], np.zeros(1), np.full(1, 5.0), records(CONDITIONS, 1)[0])
-hits = sum(evaluate.stats.cache_hits.values())
-print(json.dumps({"usable": bool(axes["usable"][0]), "from_cache": hits == 1}))
+axes, loop = initial_state(records(COEFFICIENTS, 1))
+set_mode(axes, loop[0], 1, False)
+hits = sum(set_mode.stats.cache_hits.values())
+print(json.dumps({"tap_index": int(axes["tap_index"][0]), "from_cache": hits == 1}))
 """
+"""A change of mode, whose kernel calls another in `filters.py`."""
+EDIT = ("rtloop/law/filters.py", "state.tap_index = ANEW", "state.tap_index = -2")
 
 
 @pytest.fixture
@@ -36,31 +36,31 @@ def project(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(project: Path) -> dict[str, bool]:
-    """Whether the law accepts a reference of 5, and whether its machine code came from the cache."""
+def run(project: Path) -> dict[str, object]:
+    """What the law does to a pre-filter, and whether its machine code came from the cache."""
     environment = {**os.environ, "PYTHONPATH": str(project), "XDG_CACHE_HOME": str(project / "cache")}
     done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=project, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def edit(path: Path, old: str, new: str) -> None:
-    source = path.read_text()
+def edit(project: Path, path: str, old: str, new: str) -> None:
+    source = (project / path).read_text()
     assert source.count(old) == 1
-    path.write_text(source.replace(old, new))
+    (project / path).write_text(source.replace(old, new))
 
 
 def test_an_edited_law_runs(project):
-    assert run(project) == {"usable": True, "from_cache": False}
-    assert run(project) == {"usable": True, "from_cache": True}
-    edit(project / "rtloop/law/safety.py", "USABLE_MAGNITUDE = 1e9", "USABLE_MAGNITUDE = 1.0")
-    assert run(project) == {"usable": False, "from_cache": False}
+    assert run(project) == {"tap_index": -1, "from_cache": False}
+    assert run(project) == {"tap_index": -1, "from_cache": True}
+    edit(project, *EDIT)
+    assert run(project) == {"tap_index": -2, "from_cache": False}
 
 
 def test_this_test_can_fail(project):
     """With a cache that does not look at the sources the edited law is the old one."""
     blind = 'def source_digest() -> str:\n    return "blind"\n\n\ndef unused() -> str:'
-    edit(project / "hil/compiled.py", "def source_digest() -> str:", blind)
-    assert run(project) == {"usable": True, "from_cache": False}
-    edit(project / "rtloop/law/safety.py", "USABLE_MAGNITUDE = 1e9", "USABLE_MAGNITUDE = 1.0")
-    assert run(project) == {"usable": True, "from_cache": True}
+    edit(project, "hil/compiled.py", "def source_digest() -> str:", blind)
+    assert run(project) == {"tap_index": -1, "from_cache": False}
+    edit(project, *EDIT)
+    assert run(project) == {"tap_index": -1, "from_cache": True}

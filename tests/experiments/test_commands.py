@@ -110,7 +110,6 @@ def test_what_cannot_be_done_is_said(tmp_path: Path) -> None:
     assert "harmonic.amplitude_um=2.0" in listed.output
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path, seed: int) -> None:
-    after_s = float(np.random.default_rng(seed).uniform(0.0, 4.0))
+def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path) -> None:
+    after_s = float(np.random.default_rng(1).uniform(0.0, 4.0))
     check(abort(tmp_path, after_s, "paper", str(PAPER)), tmp_path)
