@@ -1,8 +1,8 @@
 """Another law, built in a process of its own: one that takes too long is killed, and whoever asked is told.
 
-The process is started once and waits, so that nobody waits for its imports; a killed one is replaced by the next that
-is needed. It reads pickled configurations on its stdin and writes pickled answers to its stdout, and ends with its
-stdin: with the service.
+The process is started by the first change and waits for more; a killed one is replaced by the next that is needed. It
+reads pickled configurations on its stdin and writes pickled answers to its stdout, and ends with its stdin: with the
+service.
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ class Builder:
         """Of its process; None where none runs."""
         return None if self._process is None else self._process.pid
 
-    def start(self) -> None:
-        """Start the process where none runs, without waiting for it."""
+    def _start(self) -> None:
         if self._process is not None and self._process.poll() is None:
             return
         self.end()
@@ -61,7 +60,7 @@ class Builder:
     def prepare(self, configuration: Configuration) -> Prepared:
         """As `rtloop.prepare.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
         with self._lock:
-            self.start()
+            self._start()
             if not self._ready:
                 self._answer(START_S)
                 self._ready = True
@@ -125,9 +124,8 @@ def prepare_limited(configuration: Configuration) -> Prepared:
 
 
 @contextlib.contextmanager
-def builder_ready() -> Any:
-    """The process beside the service, warm before it is needed."""
-    _builder.start()
+def builder_ended() -> Any:
+    """In the end there is no process beside the service any more."""
     try:
         yield
     finally:

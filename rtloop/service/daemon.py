@@ -18,7 +18,7 @@ import uvicorn
 from hil.trusted import Untrusted, open_folder
 from rtloop.errors import UnavailableError
 from rtloop.service.api import application
-from rtloop.service.building import builder_ready
+from rtloop.service.building import builder_ended
 from rtloop.service.can_bus import supervised_by_can
 from rtloop.service.connections import BACKLOG, settings
 from rtloop.service.journal import Journal
@@ -36,7 +36,7 @@ def serve(config: Path) -> int:
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
     try:
-        with builder_ready(), _listening(service), supervised_by_can(service):
+        with builder_ended(), _listening(service), supervised_by_can(service):
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()
