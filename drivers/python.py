@@ -21,6 +21,7 @@ class PythonDriver(Driver):
     """Override `facts`, `start`, `read`, `write` and `stop`; set `sample_age_us` where the hardware knows it."""
 
     error: Exception | None = None
+    """What `read` or `write` raised first."""
     sample_age_us: float = 0.0
     status: int = 0
     """What the loop records for a read that succeeded; above 0 is degraded."""
@@ -63,7 +64,7 @@ class PythonDriver(Driver):
                     values[i] = value
                 return self.status
             except Exception as error:  # nothing may propagate into compiled code
-                self.error = error
+                self.error = self.error or error
                 return FAILED
 
         def write(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
@@ -75,7 +76,7 @@ class PythonDriver(Driver):
                 self.write(volts)
                 return 0
             except Exception as error:
-                self.error = error
+                self.error = self.error or error
                 return FAILED
 
         self._callbacks = _FUNCTION(read), _FUNCTION(write)

@@ -18,7 +18,6 @@ from hil.options import RigOptions
 from rtloop.config import Configuration, load
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
-from rtloop.experiments.interruption import Interruption
 from rtloop.experiments.page import page
 from rtloop.experiments.procedure import Experiment, Run, Setting
 from rtloop.experiments.registry import chosen, parameters
@@ -29,6 +28,7 @@ from rtloop.progress import StatusLine
 from rtloop.recording.errors import RecordingError
 from rtloop.report_experiments import Progress, print_report
 from rtloop.running import recording_path, recover_leftovers
+from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 
 

@@ -73,8 +73,10 @@ def print_summary(summary: dict[str, Any]) -> None:
     )
     table.add_row("lost", str(summary["ticks_lost"]), "complete" if summary["complete"] else "[red]not complete[/]")
     table.add_row("time", f"{summary['duration_s']:.3f} s", f"at {summary['rate_hz']:g} Hz")
-    if summary["lateness_us"] is not None:
-        table.add_row("achieved rate", f"{summary['achieved_rate_hz']:.1f} Hz", _scheduling(summary["realtime"]))
+    if summary["paced"]:
+        achieved = summary["achieved_rate_hz"]
+        rate = "–" if achieved is None else f"{achieved:.1f} Hz"
+        table.add_row("achieved rate", rate, _scheduling(summary["realtime"] or {}))
         table.add_row("periods missed", str(summary["periods_missed"]), "skipped by late ticks, never caught up")
         table.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
     else:
@@ -83,6 +85,8 @@ def print_summary(summary: dict[str, Any]) -> None:
         table.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
     for problem in summary["problems"]:
         table.add_row("[red]problem[/]", "", escape(problem))
+    if summary["driver_error"]:
+        table.add_row("[red]driver[/]", "", escape(summary["driver_error"]))
     for trip in summary["trips"]:
         table.add_row("[red]trip[/]", f"tick {trip['tick']}", ", ".join(trip["causes"]))
     console.print(table)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +18,13 @@ from rtloop.progress import Counter
 from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
 from rtloop.report import RunView, print_run
+from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 
 
-def run_configuration(config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool) -> int:
+def run_configuration(
+    config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool, interruption: Interruption
+) -> int:
     """Run, record, report; returns the exit code."""
     with Processes() as processes:
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
@@ -31,9 +32,13 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
             click.echo(f"warning: {warning}", err=True)
         path = recording_path(prepared, out)
         recover_leftovers(path.parent)
+        if interruption.requested:
+            return _stopped_before(as_json)
         supervisor = Supervisor(processes, prepared, path)
-        with stopped_by_signals(supervisor), RunView(prepared, sys.stderr) as view:
+        interruption.attend(supervisor)
+        with RunView(prepared, sys.stderr) as view:
             result = supervisor.run(view.show)
+        interruption.attend(None)
     summary = run_summary(prepared, result)
     summary["startup_s"] = supervisor.startup_s
     if as_json:
@@ -45,6 +50,14 @@ def run_configuration(config: Path, duration_s: float | None, paced: bool, out: 
     if summary["error"]:
         click.echo(f"rtloop: {summary['error']}", err=True)
     return result.exit_code or (LoopFault.exit_code if summary["trips"] else 0)
+
+
+def _stopped_before(as_json: bool) -> int:
+    """Ctrl-C came before there was a loop: no output was touched, and that is what was wanted."""
+    click.echo("stopped before the loop began: nothing was driven, nothing is recorded", err=True)
+    if as_json:
+        click.echo(json.dumps({"outcome": "stopped", "recording": None, "recordings": []}))
+    return 0
 
 
 def _cache_warnings() -> list[str]:
@@ -95,14 +108,3 @@ def recover_leftovers(folder: Path) -> None:
         click.echo(f"{report['output']}: {report['ticks']:,} ticks recovered from {part.name}, which is kept", err=True)
         for problem in report["problems"]:
             click.echo(f"warning: {part}: {problem}", err=True)
-
-
-@contextmanager
-def stopped_by_signals(supervisor: Supervisor) -> Any:
-    """SIGINT and SIGTERM ramp the loop down instead of ending this process."""
-    previous = {name: signal.signal(name, lambda *_: supervisor.stop()) for name in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for name, handler in previous.items():
-            signal.signal(name, handler)

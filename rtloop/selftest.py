@@ -28,7 +28,7 @@ from rtloop.prepare import Prepared, prepare
 from rtloop.progress import StatusLine
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
-from rtloop.running import stopped_by_signals
+from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal import console, table
 
@@ -129,7 +129,8 @@ def _run(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
     """One run; its recording, read, and what the host granted. Raises LoopFault unless it went to its end."""
     with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
         supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")
-        with stopped_by_signals(supervisor):
+        with Interruption() as interruption:
+            interruption.attend(supervisor)
             result: RunResult = supervisor.run()
         if result.error or result.outcome != "done":
             raise LoopFault(f"the self-test did not go to its end ({result.outcome}): {result.error or 'stopped'}")

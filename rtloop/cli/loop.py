@@ -32,9 +32,12 @@ POSITIVE = Positive(0.0, 1e6, min_open=True)
 @fails_clearly
 def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None, as_json: bool) -> int:
     """Run the loop of CONFIG and record every tick; Ctrl-C ramps down, finishes the recording and ends well."""
-    from rtloop.running import run_configuration
+    from rtloop.service.interruption import Interruption
 
-    return run_configuration(config, duration_s, not unpaced, out, as_json)
+    with Interruption() as interruption:
+        from rtloop.running import run_configuration
+
+        return run_configuration(config, duration_s, not unpaced, out, as_json, interruption)
 
 
 @click.command()

@@ -48,6 +48,8 @@ _COUNTERS = (
     "scheduled",
     "stopping",
     "failed",
+    "failed_tick",
+    "failed_status",
     "refused",
     "next_late_event",
     "next_snapshot",

@@ -248,6 +248,7 @@ def _report(loop, status, written, missed):
     if loop.failed == 0 and (status < 0 or written < 0):
         loop.failed = WRITE_FAILED if written < 0 else READ_FAILED
         failing, verb = (written, 1.0) if written < 0 else (status, 0.0)
+        loop.failed_tick, loop.failed_status = loop.tick, failing
         publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), verb))
     if missed > 0.0:
         if loop.tick >= loop.next_late_event:

@@ -33,6 +33,7 @@ MIN_RING_TICKS = 4096
 EVENT_SLOTS = 4096
 SNAPSHOT_SLOTS = 64
 COMMAND_SLOTS = 256
+FAULT_BYTES = 1024
 URGENT_SLOTS = 16
 """Of the command queue, for what makes the outputs safe: no flood of other commands fills them."""
 
@@ -137,6 +138,17 @@ class SharedBlock:
         """The control words, indexed by Word."""
         return self._arrays["words"]
 
+    @property
+    def fault(self) -> str | None:
+        """What the driver raised, as the loop's process put it; as much of it as there is room for."""
+        text = self["fault"].tobytes().rstrip(b"\0").decode(errors="ignore")
+        return text or None
+
+    @fault.setter
+    def fault(self, text: str) -> None:
+        data = text.encode(errors="replace")[:FAULT_BYTES]
+        self["fault"][: len(data)] = np.frombuffer(data, np.uint8)
+
     def claim(self) -> None:
         """Mark the calling process as the one that drives, for as long as it lives.
 
@@ -186,6 +198,7 @@ def _specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ..
         "last_drive_v": (real, (sizes.axes,)),
         "table": (real, (max(sizes.table_samples, 1),)),
         "staged": (np.dtype(np.uint8), (sizes.snapshot_bytes,)),
+        "fault": (np.dtype(np.uint8), (FAULT_BYTES,)),
         "commands": (MESSAGE, (COMMAND_SLOTS + URGENT_SLOTS,)),
         "commands_marks": (word, (COMMAND_SLOTS + URGENT_SLOTS,)),
     }

@@ -17,11 +17,11 @@ import sys
 import time
 from typing import Any
 
-from drivers.base import Driver
+from drivers.base import Driver, Facts, Pointers
 from drivers.errors import DriverError
 from rtloop.engine.assembly import UNLIMITED, Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, paced_clock, unpaced_clock
-from rtloop.engine.loop import Outcome
+from rtloop.engine.loop import WRITE_FAILED, Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
 from rtloop.engine.ramp import found_v, ramp_to_safe
@@ -64,33 +64,50 @@ def main() -> int:
     driver: Driver | None = None
     state = ProcessState.FAILED
     try:
-        driver = plan.driver()
-        facts = require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
+        driver, facts = _driver(plan)
         outcome = _run(plan, block, driver, facts)
-        report("finished", outcome=outcome.name.lower(), driver_error=_driver_error(driver))
+        report("finished", outcome=outcome.name.lower(), driver_error=block.fault)
         state = ProcessState.FINISHED
         code = EXIT_CODES[outcome]
-    except DriverError as error:
-        report("failed", message=str(error), exit_code=UnavailableError.exit_code)
-        code = UnavailableError.exit_code
-    except ValueError as error:
-        report("failed", message=f"driver.{error}", exit_code=ConfigError.exit_code)
-        code = ConfigError.exit_code
-    except RtloopError as error:
-        report("failed", message=str(error), exit_code=error.exit_code)
-        code = error.exit_code
+    except (DriverError, RtloopError) as error:
+        code = _failed(error)
     finally:
         try:
             if driver is not None:
                 driver.close()
         except DriverError as error:
-            report("failed", message=str(error), exit_code=UnavailableError.exit_code)
-            code, state = UnavailableError.exit_code, ProcessState.FAILED
+            code, state = _failed(error), ProcessState.FAILED
         block.words[Word.LOOP_STATE] = state
     return code
 
 
-def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
+def _failed(error: DriverError | RtloopError) -> int:
+    """Say why there is no run; the exit code."""
+    code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
+    report("failed", message=str(error), exit_code=code)
+    return code
+
+
+def _driver(plan: Plan) -> tuple[Driver, Facts]:
+    """The plan's driver, not yet opened. Raises ConfigError for what it cannot be."""
+    try:
+        driver = plan.driver()
+        return driver, require_facts(driver, plan.pacing.rate_hz, plan.pacing.paced)
+    except ValueError as error:
+        raise ConfigError(plan.name, [f"driver.{error}"]) from error
+
+
+def _opened(driver: Driver) -> Pointers:
+    """Whatever a third party's driver raises as it opens, said with its name. Raises DriverError."""
+    try:
+        return driver.open()
+    except DriverError:
+        raise
+    except Exception as error:
+        raise DriverError(f"driver {driver.kind!r}: it could not be opened: {_said(error)}") from error
+
+
+def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
     context = clock_context(plan.pacing.rate_hz)
     if plan.pacing.paced:
         clock = paced_clock(context, plan.pacing.spin_us)
@@ -98,7 +115,7 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
         die_with_parent()
         ring = block.ring("ticks")
         clock = unpaced_clock(context, ring.head, block.words, Word.RECORDER_CURSOR, ring.marks.size // 2)
-    pointers = driver.open()
+    pointers = _opened(driver)
     ramp_to_safe(driver, pointers, found_v(driver, None), plan.trip_slew_v_per_s)  # as somebody who died left them
     assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
@@ -127,12 +144,21 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Any) -> Outcome:
             assembly.run(UNLIMITED)
         return outcome
     finally:
+        if assembly.loop.failed:
+            block.fault = _fault(driver, assembly.loop)
         ramp_to_safe(driver, pointers, assembly.outputs_v, plan.trip_slew_v_per_s)  # where the loop did not
 
 
-def _driver_error(driver: Driver) -> str | None:
+def _fault(driver: Driver, loop: Any) -> str:
+    """Which driver failed at what, when, and why as far as it says so."""
+    verb = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
-    return None if error is None else f"{type(error).__name__}: {error}"
+    reason = f"its status was {loop.failed_status}" if error is None else _said(error)
+    return f"driver {driver.kind!r}: {verb} failed at tick {loop.failed_tick}: {reason}"
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 if __name__ == "__main__":

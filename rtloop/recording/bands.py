@@ -55,7 +55,8 @@ def read_bands(
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     if count == 0:
-        raise RecordingError(f"{recording.paths[0]}: holds no tick between {start_s:g} s and {end_s:g} s")
+        until = "" if end_s == np.inf else f" before {end_s:g} s"
+        raise RecordingError(f"{recording.paths[0]}: holds no tick from {start_s:g} s on{until}")
     stretch = max(-(-count // points), 1)
     times: list[Any] = []
     lows: list[Any] = []

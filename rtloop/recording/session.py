@@ -151,6 +151,7 @@ class Session:
             totals = {"ticks_executed": end_tick, "ticks_logged": logged, "ticks_lost": lost}
             totals |= {"events_lost": self._events_lost, "snapshots_lost": self._snapshots.lost, "result": result}
             what = {**totals, "complete": self._complete(lost, result), "error": self.error}
+            what |= {"driver_error": self._block.fault} if kind == FINISHED else {}
             return self._pending.own(kind, self._buffer.place(said_tick), what)
 
         if problem := self._files.finish(final):

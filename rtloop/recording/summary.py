@@ -120,6 +120,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
         "phases": {name: report and report["p50"] for name, report in reports.items() if name in MEASURED[2:]},
         "complete": whole,
         "result": finished["result"] if finished else None,
+        "driver_error": finished.get("driver_error") if finished else None,
         "problems": problems,
         "realtime": header.get("realtime"),
         "host": header.get("host"),

@@ -161,7 +161,7 @@ def test_plot_makes_a_picture(paced: bool, tmp_path: Path):
     with Image.open(plot(path, tmp_path / "run.png")) as picture:
         assert picture.format == "PNG"
         assert picture.width > 1000
-    with pytest.raises(RecordingError, match="no tick between"):
+    with pytest.raises(RecordingError, match="no tick from"):
         plot(path, tmp_path / "run.png", start_s=100.0)
 
 

@@ -67,15 +67,20 @@ dwell_s = 0.1
 """
 
 
-def test_a_plain_python_driver_closes_the_loop_at_10_khz(tmp_path: Path) -> None:
-    (tmp_path / "lag_driver.py").write_text(DRIVER)
-    metadata = tmp_path / "lag_driver-1.0.dist-info"
+def install(folder: Path, driver: str) -> tuple[Path, dict[str, str]]:
+    """The driver as a package in `folder`; a configuration that names it, and the environment that finds it."""
+    (folder / "lag_driver.py").write_text(driver)
+    metadata = folder / "lag_driver-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: lag-driver\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text("[rtloop.drivers]\nlag = lag_driver:LagDriver\n")
-    config = tmp_path / "lag.toml"
+    config = folder / "lag.toml"
     config.write_text(CONFIG.format(axis=one_axis(400.0)))
-    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+    return config, os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}"}
+
+
+def test_a_plain_python_driver_closes_the_loop_at_10_khz(tmp_path: Path) -> None:
+    config, environment = install(tmp_path, DRIVER)
     command = [sys.executable, "-m", "rtloop", "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr

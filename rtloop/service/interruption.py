@@ -1,11 +1,16 @@
-"""Ctrl-C while several runs follow each other."""
+"""Ctrl-C and SIGTERM, for a run or for several that follow each other.
+
+Nothing here is slow to import: the handlers stand before anything else is imported, for what is raised out of a signal
+in the middle of an import or a compilation may be lost there, and the run would go on.
+"""
 
 from __future__ import annotations
 
 import signal
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from rtloop.service.supervisor import Supervisor
+if TYPE_CHECKING:
+    from rtloop.service.supervisor import Supervisor
 
 
 class Interruption:

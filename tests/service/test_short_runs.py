@@ -1,0 +1,115 @@
+"""Runs that end as they begin: of no tick, one or two; tripped, stopped, or with a driver that fails at once."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import rtloop
+from rtloop.cli import main
+from rtloop.recording.session import Options, Session
+from tests.recording.real_loop import PAPER, RealLoop, changed
+from tests.service.test_python_driver import DRIVER, install
+from tests.service.test_run import ROOT, start
+
+NOT_THERE = 66
+TRIPPING = ("position_um = 60.0", "position_um = 0.001")
+FAILING = ("    def read(self):\n", '    def read(self):\n        raise OSError("cable [off]")\n')
+SECOND = (FAILING[0], f"{FAILING[0]}        if self.drive_v:\n            raise OSError('cable [off]')\n")
+
+
+def uses(path: Path) -> dict[str, int]:
+    """Exit codes of what can be done with a recording."""
+    name, out = str(path), str(path.with_suffix(""))
+    commands = {
+        "info": ["info", name],
+        "info --json": ["info", name, "--json"],
+        "plot": ["plot", name],
+        "page": ["plot", name, "--html"],
+        **{to: ["export", name, "--to", to] for to in ("csv", "npz", "parquet")},
+        "replay": ["replay", name],
+        "recover": ["recover", name, "--out", f"{out}-again.mcap"],
+    }
+    codes = {}
+    for use, command in commands.items():
+        done = CliRunner().invoke(main, command)
+        assert isinstance(done.exception, SystemExit | None), (use, done.exception)
+        assert "inf s" not in done.output
+        codes[use] = done.exit_code
+    return codes
+
+
+@pytest.mark.parametrize("finished", [True, False], ids=["finished", "left by a killed recorder"])
+@pytest.mark.parametrize("text", [PAPER, changed(TRIPPING)], ids=["driving", "tripped"])
+@pytest.mark.parametrize("ticks", [0, 1, 2])
+def test_a_recording_of_hardly_any_ticks(tmp_path: Path, ticks: int, text: str, finished: bool) -> None:
+    loop, path = RealLoop(text), tmp_path / "short.mcap"
+    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0))
+    if ticks:
+        loop.run(ticks)
+    session.drain()
+    if finished:
+        session.finish("finished")
+    else:
+        session._write_all()
+        path = Path(shutil.copy(f"{path}.part", tmp_path / "left.mcap.part"))
+    codes = uses(path)
+    if ticks:
+        assert codes == dict.fromkeys(codes, 0) | ({} if finished else {"replay": 1})
+    else:
+        assert {use for use, code in codes.items() if code} == {"plot", "page", "replay"}
+        assert {codes["plot"], codes["page"], codes["replay"]} == {NOT_THERE}
+
+
+@pytest.mark.parametrize(
+    ("change", "ticks", "clock"),
+    [(None, 1, []), (FAILING, 1, ["--unpaced"]), (FAILING, 1, []), (SECOND, 2, [])],
+    ids=["one tick", "fails at once, unpaced", "fails at once", "fails then"],
+)
+def test_a_run_of_a_tick_or_two(tmp_path: Path, change: tuple[str, str] | None, ticks: int, clock: list[str]) -> None:
+    """What the driver raised is on the screen, in the summary and in the recording, with driver and tick."""
+    config, environment = install(tmp_path, DRIVER.replace(*change) if change else DRIVER)
+    command = [sys.executable, "-m", "rtloop", "run", str(config), "--out", str(tmp_path), *clock]
+    command += ["--duration", f"{ticks / 10_000:g}"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert "Traceback" not in done.stderr, done.stderr
+    (path,) = tmp_path.glob("*.mcap")
+    recording = rtloop.load(path)
+    assert len(recording) == ticks
+    final = recording.events[-1]["what"]
+    summary = json.loads(CliRunner().invoke(main, ["info", str(path), "--json"]).output)
+    if change is None:
+        assert (done.returncode, final["driver_error"]) == (0, None), done.stderr
+    else:
+        said = f"driver 'lag': read failed at tick {ticks - 1}: OSError: cable [off]"
+        assert done.returncode != 0
+        assert f"rtloop: {said}" in done.stderr
+        assert (final["driver_error"], summary["driver_error"]) == (said, said)
+        assert "cable [off]" in " ".join(done.stdout.split())
+    assert uses(path)["replay"] == 0
+
+
+def test_ctrl_c_before_the_loop_runs_ends_well(tmp_path: Path) -> None:
+    """At random instants of the start: nothing is left of it, or a recording that can be read."""
+    chance = random.Random(15)
+    for number in range(2):
+        process = start("run", ROOT / "deploy" / "paper.toml", "--out", tmp_path / str(number), start_new_session=True)
+        time.sleep(chance.uniform(0.25, 3.5))
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+        assert "Traceback" not in err, err
+        assert process.returncode == 0, err
+        recorded = list((tmp_path / str(number)).glob("*"))
+        assert recorded or "nothing was driven, nothing is recorded" in err
+        for path in recorded:
+            assert uses(path)["info"] == 0
