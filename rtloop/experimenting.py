@@ -120,6 +120,7 @@ def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: Axi
 
 def _planned(experiment: Experiment, options: Any, base: Configuration, setting: Setting) -> list[Planned]:
     runs = experiment.runs(options, setting)
+    options = experiment.fitted(options, setting)
     values = options.model_dump(mode="json")
     return [
         Planned(experiment, run, derived(base, setting.axis.name, experiment.name, values, run, len(runs)))

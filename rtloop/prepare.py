@@ -29,6 +29,9 @@ from rtloop.signals import Mode
 COMPARED_PART = 0.2
 """C(z) is compared with C(s) up to this part of the rate; toward half of it every method must differ."""
 
+MOST_TICKS = 2**53
+"""A recording numbers its ticks by floating-point numbers."""
+
 
 @dataclass(frozen=True)
 class AxisCheck:
@@ -127,12 +130,12 @@ def _pacing(configuration: Configuration, paced: bool) -> Pacing:
 def _ticks(duration_s: float | None, rate_hz: float, findings: _Findings) -> int | None:
     if duration_s is None:
         return None
-    ticks = round(duration_s * rate_hz) if np.isfinite(duration_s) else 0
-    if ticks < 1:
-        findings.faults.append(
-            f"--duration: {duration_s} s is no tick at {rate_hz:g} Hz; at least one period is needed"
-        )
-    return ticks
+    ticks = duration_s * rate_hz
+    if not 0.5 < ticks <= MOST_TICKS:
+        allowed = f"at least one period and at most {MOST_TICKS / rate_hz:g} s are allowed at {rate_hz:g} Hz"
+        findings.faults.append(f"--duration: {duration_s:g} s: {allowed}")
+        return None
+    return round(ticks)
 
 
 def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck:

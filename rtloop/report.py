@@ -143,18 +143,32 @@ def _print_steps(prepared: Prepared, recording: str) -> None:
 
 
 def print_drivers() -> None:
-    """Every registered kind."""
+    """Every registered kind, as a table."""
     table = _table("kind", "moves hardware", "clock", "highest rate", "defined in")
+    for found in known_drivers():
+        if found["problem"]:
+            table.add_row(found["kind"], f"[red]{escape(found['problem'])}[/]", "", "", found["defined_in"])
+            continue
+        limit_hz = found["max_rate_hz"]
+        rate = "any" if limit_hz is None else f"{limit_hz:g} Hz"
+        table.add_row(found["kind"], "yes" if found["real"] else "no", "rtloop's", rate, found["defined_in"])
+    Console(highlight=False).print(table)
+
+
+def known_drivers() -> list[dict[str, Any]]:
+    """Every registered kind: what it is with its defaults, or the `problem` that keeps it from being used."""
+    found = []
     for kind, where in kinds().items():
+        entry = {"kind": kind, "defined_in": where, "real": None, "max_rate_hz": None, "problem": None}
         try:
             driver = driver_class(kind)
             facts = driver(driver.options_model(), {"x": driver.example}, 1000.0).facts
+            limit_hz = None if facts.max_rate_hz == float("inf") else facts.max_rate_hz
+            entry |= {"real": facts.real, "max_rate_hz": limit_hz}
         except (DriverError, ValueError) as error:
-            table.add_row(kind, f"[red]{escape(str(error))}[/]", "", "", where)
-            continue
-        rate = "any" if facts.max_rate_hz == float("inf") else f"{facts.max_rate_hz:g} Hz"
-        table.add_row(kind, "yes" if facts.real else "no", "rtloop's", rate, where)
-    Console(highlight=False).print(table)
+            entry["problem"] = str(error)
+        found.append(entry)
+    return found
 
 
 def _size(summary: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -74,9 +75,12 @@ def drivers(
     The self-test moves outputs: nothing fragile may hang on them.
     """
     if config is None:
-        from rtloop.report import print_drivers
+        from rtloop.report import known_drivers, print_drivers
 
-        print_drivers()
+        if as_json:
+            click.echo(json.dumps({"drivers": known_drivers()}))
+        else:
+            print_drivers()
         return 0
     from rtloop.selftest import Tolerances, selftest_configuration
 

@@ -107,7 +107,7 @@ def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) ->
 
 @click.command()
 @FILES
-@click.option("--out", type=OUTPUT, help="The picture to write [FILE with another ending].")
+@click.option("--out", type=OUTPUT, help="The picture to write: .png, .pdf or .svg [FILE with .png].")
 @click.option("--from", "start_s", type=Seconds(zero=True), default=0.0, help="Seconds since the start of the run.")
 @click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
 @click.option("--html", is_flag=True, help="One self-contained page to zoom and pan in, instead of a PNG.")

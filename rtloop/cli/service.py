@@ -136,7 +136,7 @@ def mode(context: click.Context, mode: str) -> int:
     return 0
 
 
-@ctl.command()
+@ctl.command(context_settings={"ignore_unknown_options": True})  # -5 is a number
 @click.argument("axis")
 @click.argument("value", type=float)
 @click.pass_context

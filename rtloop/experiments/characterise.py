@@ -32,7 +32,7 @@ class CharacteriseOptions(Options):
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
     """Half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop."""
-    timeline, largest_v = setting.timeline(), setting.axis.limits.drive_v
+    timeline, largest_v = setting.timeline(), setting.reach_v
     duration_s = options.cycles / options.frequency_hz
     timeline.add("rest", "raw", hold(0.0), REST_S)
     for label, amplitude_v in (("half", 0.5 * largest_v), ("major", largest_v)):

@@ -96,5 +96,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
+    commanded={"amplitude_um": 1.02},
     needs_controller=False,
 )

@@ -19,7 +19,7 @@ from hil.options import Numbers, Options
 from rtloop.config import ModeName
 from rtloop.experiments import paper
 from rtloop.experiments.lockin import response
-from rtloop.experiments.procedure import Experiment, Run, Setting, hold, sine
+from rtloop.experiments.procedure import CLOSED_PEAK, Experiment, Run, Setting, hold, sine
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis, Row, Said, Table
@@ -201,5 +201,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
+    commanded={"amplitude_um": CLOSED_PEAK},
     size=(11.0, 8.0),
 )

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from hil.options import Options
 from rtloop.config import Configuration, ModeName
 from rtloop.design.plays import loading_curve
+from rtloop.errors import ConfigError
 from rtloop.identifying import actuator_model
 from rtloop.law.options import AxisOptions
 
@@ -19,6 +23,8 @@ if TYPE_CHECKING:
 Reference = Mapping[str, Any]
 DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
 """Of 10 V each cycle is 0.1 V smaller, so that the rest differs from a virgin one by about as little."""
+CLOSED_PEAK = 1.4
+"""Of the command in closed loop, per step of the reference: the paper's, at 10 kHz; others are checked afterwards."""
 
 
 class Segment(NamedTuple):
@@ -96,8 +102,20 @@ class Setting:
         """One to be filled; an actuator that may have a memory is depolarised first."""
         timeline = Timeline(self.rate_hz)
         if not self.virgin:
-            timeline.depolarise(self.axis.limits.drive_v)
+            timeline.depolarise(self.reach_v)
         return timeline
+
+    @property
+    def reach_v(self) -> float:
+        """How far the drive may go to both sides."""
+        return min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
+
+    @property
+    def reach_um(self) -> float:
+        """How far the command may go to both sides: by its own limit, the drive's, and where the position trips."""
+        static_gain = self.axis.model.transfer().dc_gain if self.axis.model else 1.0
+        trips_um = self.axis.interlocks.position_um / max(abs(static_gain), 1e-9)
+        return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, trips_um)
 
     @property
     def um_per_v(self) -> float:
@@ -130,6 +148,10 @@ class Experiment:
     runs: Callable[[Any, Setting], list[Run]]
     analyse: Callable[[Sequence[Taken], Any], Analysis]
     draw: Callable[[Any, Mapping[str, Any], Any], None]
+    commanded: Mapping[str, float] = field(default_factory=dict)
+    """Options in µm, and how many times as much the command may have to be at its peak."""
+    both_ways: bool = True
+    """It drives to both sides of 0 V."""
     needs_controller: bool = True
     needs_rig: bool = False
     size: tuple[float, float] = (11.0, 5.0)
@@ -138,7 +160,28 @@ class Experiment:
         """Why this experiment cannot be done with a configuration; None where it can."""
         if self.needs_controller and axis.controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment closes the loop"
+        if self.both_ways and axis.limits.lowest_v == 0.0:
+            return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment drives to both sides"
         if self.needs_rig and not rig:
             kind = configuration.driver_kind
             return f"driver.kind {kind!r} has no option for it: only the simulated rig called inline can be changed"
         return None
+
+    def fitted(self, options: Options, setting: Setting) -> Options:
+        """The options, with what nobody set made as small as the axis's limits demand.
+
+        Raises ConfigError for what somebody set and the limits forbid.
+        """
+        smaller: dict[str, Any] = {}
+        for key, peak in self.commanded.items():
+            value = getattr(options, key)
+            asked_um, most_um = float(np.max(np.abs(value))), setting.reach_um / peak
+            if asked_um <= most_um:
+                continue
+            if key in options.model_fields_set:
+                allowed = f"axis {setting.axis.name!r} allows {most_um:.4g} µm here, by its limits and interlocks"
+                raise ConfigError("parameters of the experiments", [f"{self.name}.{key}: {asked_um:g} µm; {allowed}"])
+            step_um = 10.0 ** (math.floor(math.log10(most_um)) - 1)
+            scale = math.floor(most_um / step_um) * step_um / asked_um
+            smaller[key] = tuple(scale * one for one in value) if isinstance(value, tuple) else scale * value
+        return options.model_copy(update=smaller)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from hil.options import Numbers, Options
 from rtloop.experiments import paper
-from rtloop.experiments.procedure import Experiment, Run, Setting, hold
+from rtloop.experiments.procedure import CLOSED_PEAK, Experiment, Run, Setting, hold
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import envelope
@@ -137,6 +137,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
+    commanded={"step_um": CLOSED_PEAK},
     needs_rig=True,
     size=(11.0, 5.0),
 )

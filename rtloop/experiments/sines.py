@@ -11,7 +11,7 @@ from pydantic import Field
 from hil.options import Numbers, Options
 from rtloop.experiments import paper
 from rtloop.experiments.lockin import response
-from rtloop.experiments.procedure import Experiment, Run, Setting, hold, sine
+from rtloop.experiments.procedure import CLOSED_PEAK, Experiment, Run, Setting, hold, sine
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis, Row, Table
@@ -104,5 +104,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
+    commanded={"amplitude_um": CLOSED_PEAK},
     size=(11.0, 6.4),
 )

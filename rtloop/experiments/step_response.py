@@ -128,5 +128,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
+    both_ways=False,
     needs_controller=False,
 )

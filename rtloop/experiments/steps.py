@@ -10,7 +10,7 @@ from pydantic import Field
 
 from hil.options import Numbers, Options
 from rtloop.experiments import paper
-from rtloop.experiments.procedure import Experiment, Run, Setting, hold
+from rtloop.experiments.procedure import CLOSED_PEAK, Experiment, Run, Setting, hold
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import envelope
@@ -123,5 +123,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
+    commanded={"levels_um": CLOSED_PEAK},
     size=(11.0, 5.6),
 )

@@ -7,6 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hil.linear import Real
 from rtloop.design.measured import UnsuitableData
 from rtloop.experiments.derive import about
@@ -16,6 +18,7 @@ from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import AxisOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
+from rtloop.signals import Flag
 
 
 class Taken:
@@ -85,6 +88,8 @@ class Taken:
                 f"{self._named}ended after {last / self.rate_hz:.1f} of {self.ticks_planned / self.rate_hz:g} s; "
                 "not analysed"
             )
+        if not self._may_trip and (found := limited(self.recording["flags"])):
+            raise UnsuitableData(f"{self._named}{found}: what it shows is the limit; not judged")
         if missing := int(last) - self._ticks.size:
             raise UnsuitableData(f"{self._named}{missing} ticks are missing from the recording; not analysed")
 
@@ -121,6 +126,17 @@ class Taken:
     @property
     def _named(self) -> str:
         return f"{self.label}: " if self.label else ""
+
+
+def limited(flags: Real) -> str | None:
+    """How many ticks were clipped, by which limit, and the first of them; None where none was."""
+    values = flags.astype(np.int64)
+    found = []
+    for flag, name in ((Flag.COMMAND_LIMITED, "the command"), (Flag.DRIVE_LIMITED, "the drive")):
+        ticks = np.flatnonzero(values & flag)
+        if ticks.size:
+            found.append(f"{name} was clipped in {ticks.size} ticks, the first of them {ticks[0]}")
+    return "; ".join(found) or None
 
 
 def whole(segment: Segment) -> slice:

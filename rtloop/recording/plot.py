@@ -12,6 +12,7 @@ from rtloop.recording.bands import Band, Mark, Progress, drawn_signals, marks, r
 from rtloop.recording.load import Recording, load, unit_of
 from rtloop.recording.parts import Files
 
+FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
 MAX_LABELS = 12
 REFERENCE, POSITION, ERROR, DRIVE, LATENESS = "0.15", "tab:blue", "tab:red", "tab:green", "tab:purple"
@@ -25,8 +26,9 @@ def plot(
     end_s: float = np.inf,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a PNG of the time from `start_s` to `end_s`, by default beside the recording.
+    """Write a picture of the time from `start_s` to `end_s`, by default a PNG beside the recording.
 
+    The output's ending says of which format, one of FORMATS.
     Raises RecordingError, OutputError, MissingExtra.
     """
     try:
@@ -34,8 +36,11 @@ def plot(
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
+    target = None if output is None else Path(output)
+    if target is not None and target.suffix not in FORMATS:
+        raise OutputError(f"{target}: no picture ends in {target.suffix!r}; possible are {', '.join(FORMATS)}")
     recording = files if isinstance(files, Recording) else load(files)
-    target = recording.paths[0].with_suffix(".png") if output is None else Path(output)
+    target = target or recording.paths[0].with_suffix(FORMATS[0])
     axes = recording.header["axes"]
     bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
     time_s = next(iter(bands.values())).time_s
@@ -44,7 +49,7 @@ def plot(
     _draw(figure, axes, bands, marks(recording, time_s[0], time_s[-1]))
     figure.suptitle(title(recording), fontsize=11, parse_math=False)
     try:
-        figure.savefig(target, format="png", dpi=110)
+        figure.savefig(target, format=target.suffix[1:], dpi=110)
     except OSError as error:
         raise OutputError(f"{target}: {error.strerror}") from None
     return target
