@@ -15,10 +15,12 @@ from rtloop.experiments.derive import about, derived
 from rtloop.experiments.harmonic import bandwidth
 from rtloop.experiments.procedure import Setting
 from rtloop.experiments.registry import EXPERIMENTS, chosen, parameters
+from rtloop.experiments.report import report, take
 from rtloop.experiments.robustness import Outcome, stable_range
 from rtloop.experiments.step_response import fitted_ringing
 from rtloop.experiments.verdict import Row, Said
 from rtloop.prepare import prepare
+from tests.recording.real_loop import record
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PAPER = load(DEPLOY / "paper.toml")
@@ -143,3 +145,57 @@ def test_the_range_of_shifts_ends_at_the_first_that_does_not_settle() -> None:
                 (-9, -6, -3, 0, 2, 5)]  # fmt: skip
     assert stable_range(outcomes) == (-3, 2)
     assert np.isnan(stable_range([Outcome(0.0, 9.0, 20.0, None)])).all()
+
+
+SMALL = PAPER.axes[0].model_copy(
+    update={"limits": PAPER.axes[0].limits.model_copy(update={"command_um": 20.0, "drive_min_v": -6.0})}
+)
+
+
+def test_the_papers_amplitudes_fit_the_papers_limits() -> None:
+    for experiment in EXPERIMENTS.values():
+        assert experiment.fitted(experiment.options(), setting()) == experiment.options()
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_what_nobody_set_follows_the_limits(name: str) -> None:
+    """Of every reference: volts within both sides of the drive, micrometres within the command's limit."""
+    experiment, stage = EXPERIMENTS[name], Setting(RATE_HZ, SMALL, virgin=False)
+    for run in experiment.runs(experiment.fitted(experiment.options(), stage), stage):
+        for segment, reference in zip(run.timeline.segments, run.timeline.references, strict=True):
+            value = reference.get("value", reference.get("offset", 0.0))
+            ends = (value - reference.get("amplitude", 0.0), value + reference.get("amplitude", 0.0))
+            lowest, highest = (-6.0, 10.0) if segment.mode == "raw" else (-20.0, 20.0)
+            assert lowest <= min(ends) <= max(ends) <= highest, (segment.label, reference)
+
+
+def test_what_somebody_set_beyond_the_limits_is_refused() -> None:
+    steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, virgin=True)
+    with pytest.raises(ConfigError, match=r"steps.levels_um: 15 µm; axis 'x' allows 14.29 µm here"):
+        steps.fitted(steps.options(levels_um=(0.0, -15.0)), stage)
+    kept = steps.options(levels_um=(0.0, -14.0))
+    assert steps.fitted(kept, stage) == kept
+
+
+def test_an_amplifier_of_one_side_is_told_what_cannot_be_done() -> None:
+    limits = PAPER.axes[0].limits.model_copy(update={"drive_min_v": 0.0})
+    axis = PAPER.axes[0].model_copy(update={"limits": limits})
+    can = [one.name for one in EXPERIMENTS.values() if one.unsuitable(PAPER, axis, rig=True) is None]
+    assert can == ["step-response"]
+    assert "drive_min_v: 0 V" in str(EXPERIMENTS["steps"].unsuitable(PAPER, axis, rig=True))
+
+
+def test_what_was_clipped_is_not_judged(tmp_path: Path) -> None:
+    """A sine of 40 µm where 20 µm are allowed: the recording is there, a verdict is not."""
+    experiment = EXPERIMENTS["compensation"]
+    options = experiment.options(amplitude_um=40.0, frequency_hz=5.0)
+    (run,) = experiment.runs(options, Setting(RATE_HZ, PAPER.axes[0], virgin=True))
+    text = derived(PAPER, "x", experiment.name, options.model_dump(mode="json"), run, 1).text
+    problems = []
+    for name, limit in (("clipped", "command_um = 20.0"), ("free", "command_um = 42.0")):
+        (path,) = record(tmp_path / f"{name}.mcap", text.replace("command_um = 42.0", limit), run.timeline.ticks)
+        (section,) = report(take([path])).content["experiments"]
+        problems.append(section["problem"])
+    assert problems[1] is None
+    assert "the command was clipped in" in problems[0]
+    assert "not judged" in problems[0]
