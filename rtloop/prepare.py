@@ -217,6 +217,7 @@ def _generators(
         )
         if values is not None:
             generators["kind"][i] = values[0]
+            generators["volts"][i] = configuration.loop.mode == "raw"
             generators["parameters"][i, : len(values) - 1] = values[1:]
     return generators
 

@@ -118,13 +118,14 @@ def _numbers(text: str) -> npt.NDArray[np.float64]:
     return np.array(numbers)
 
 
-def reach(values: Sequence[float], samples: npt.NDArray[np.float64]) -> float:
-    """Largest magnitude that a generator can come to; 0 for an input, of which it is not known beforehand."""
+def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Lowest and highest value that a generator can come to; (0, 0) for an input, of which it is not known before."""
     kind = Generator(int(values[0]))
     if kind is Generator.INPUT:
-        return 0.0
+        return 0.0, 0.0
     if kind is Generator.TABLE:
-        return float(np.max(np.abs(samples)))
+        return float(np.min(samples)), float(np.max(samples))
     if kind is Generator.HOLD:
-        return abs(values[1])
-    return abs(values[1]) + abs(values[5 if kind is Generator.CHIRP else 3])
+        return values[1], values[1]
+    offset, amplitude = values[5 if kind is Generator.CHIRP else 3], abs(values[1])
+    return offset - amplitude, offset + amplitude

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import IO, Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -11,14 +13,20 @@ from rich.table import Table
 from drivers.errors import DriverError
 from drivers.registry import driver_class, kinds
 from rtloop import signals
+from rtloop.config import Configuration
+from rtloop.errors import RtloopError
+from rtloop.law.options import AxisOptions
 from rtloop.prepare import Prepared
 from rtloop.progress import StatusLine
 from rtloop.recording.load import load
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
-from rtloop.steps import PAPER_CLAIM, step_metrics
+from rtloop.specifications import load_specification
+from rtloop.steps import step_metrics
 
 BAR = " ▁▂▃▄▅▆▇█"
+STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
+"""Of a specification, in the order of the table."""
 LONGEST_STEP_ANALYSIS_TICKS = 6_000_000
 
 
@@ -124,22 +132,39 @@ def bars(histogram: list[dict[str, Any]]) -> str:
 
 
 def _print_steps(prepared: Prepared, recording: str) -> None:
-    console = Console(highlight=False)
+    """Step metrics where references were micrometres, beside what each axis's own specification asks for."""
+    console, loaded = Console(highlight=False), load(recording)
     table = _table("steps", "overshoot %", "settling ms (5 %)", "static error %")
-    loaded = load(recording)
-    for name in prepared.plan.axes:
-        metrics = step_metrics(
-            loaded[f"{name}_reference_um"], loaded[f"{name}_position_um"], prepared.plan.pacing.rate_hz
-        )
+    driven = np.isin(loaded["mode"], (Mode.FEEDFORWARD, Mode.CLOSED_LOOP))
+    for axis in prepared.configuration.axes:
+        name, rate_hz = axis.name, prepared.plan.pacing.rate_hz
+        metrics = step_metrics(loaded[f"{name}_reference_um"][driven], loaded[f"{name}_position_um"][driven], rate_hz)
         if metrics is None:
             continue
         table.add_row(f"{name}: median of {metrics.steps}", f"{metrics.overshoot_percent:.2f}",
                       f"{metrics.settling_time_ms:.2f}", f"{metrics.static_error_percent:.3f}")  # fmt: skip
         table.add_row(f"{name}: worst", f"{metrics.overshoot_percent_worst:.2f}",
                       f"{metrics.settling_time_ms_worst:.2f}", f"{metrics.static_error_percent_worst:.3f}")  # fmt: skip
+        for label, values in _asked(prepared.configuration, axis):
+            table.add_row(label, *values)
     if table.row_count:
-        table.add_row("the paper's claim", *PAPER_CLAIM.values())
         console.print(table)
+
+
+def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[str, list[str]]]:
+    """What the specification that an axis names asks of a step, and what it says that was claimed."""
+    if axis.specification is None:
+        return
+    name = escape(axis.specification)
+    try:
+        asked = load_specification(configuration.folder / axis.specification).design.specification
+    except RtloopError as error:
+        yield f"  [red]{escape(str(error))}[/]", []
+        return
+    limits = [getattr(asked, key) for key in STEP_QUANTITIES]
+    yield f"  {name} asks", ["–" if limit is None else f"≤ {limit:g}" for limit in limits]
+    if asked.claims:
+        yield f"  {name} claims", [escape(asked.claims.get(key, "–")) for key in STEP_QUANTITIES]
 
 
 def print_drivers() -> None:

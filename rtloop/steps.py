@@ -11,8 +11,6 @@ import numpy.typing as npt
 SETTLING_BAND = 0.05
 MAX_STEPS = 10_000
 SMALLEST_DWELL_TICKS = 20
-PAPER_CLAIM = {"overshoot_percent": "0", "settling_time_ms": "< 2", "static_error_percent": "negligible (≤ 0.1)"}
-"""Rakotondrabe, Aljanaideh and Al Janaideh, section IV, Fig 10-b and specification a)."""
 
 
 @dataclass(frozen=True)

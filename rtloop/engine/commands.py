@@ -29,7 +29,8 @@ from rtloop.engine.ring import ONE, claim, publish
 from rtloop.law.filters import fill_prefilter_anew
 from rtloop.law.law import counts_fit, reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS
-from rtloop.law.reference import GENERATOR_PARAMETERS
+from rtloop.law.reference import GENERATOR_PARAMETERS, Generator
+from rtloop.signals import Mode
 
 COMMANDS_PER_TICK = 4
 HEAD, TAIL, STOP_WORD = int(Word.COMMANDS_HEAD), int(Word.COMMANDS_TAIL), int(Word.STOP)
@@ -37,6 +38,8 @@ SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, LOAD_LAW, REFUSED = (
     int(kind) for kind in (Kind.SET_MODE, Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.STOP, Kind.LOAD_LAW, Kind.REFUSED)
 )
 COEFFICIENT_BYTES = COEFFICIENTS.itemsize
+OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
+HOLD = int(Generator.HOLD)
 GONE = np.uint64(0)
 """Mark of a command that was taken or withdrawn."""
 
@@ -112,7 +115,10 @@ def _apply(loop, command):
             values = (float(command.kind), command.values[0])
             publish_event(loop, REFUSED, command.axis, command.origin, command.identity, values)
             return
-        set_mode(axes_of(loop), state, np.int64(command.values[0]), loop.tick == 0, command.values[1] == 0.0)
+        mode = np.int64(command.values[0])
+        if mode != OFF:
+            _change_units(loop, mode, command.values[2] != 0.0)
+        set_mode(axes_of(loop), state, mode, loop.tick == 0, command.values[1] == 0.0)
     elif command.kind == SET_REFERENCE:
         _set_reference(loop, command)
     elif command.kind == RESET_TRIP:
@@ -138,13 +144,30 @@ def _apply(loop, command):
 
 
 @guarded
+def _change_units(loop, mode, held):
+    """References are volts, or micrometres, from here on; if `held`, one of the other unit gives way to what is."""
+    generators, axes, volts = generators_of(loop), axes_of(loop), 1 if mode == RAW else 0
+    for a in range(loop.axis_count):
+        if held and generators[a].volts != volts:
+            in_force = axes[a].drive_v
+            if mode == FEEDFORWARD:
+                in_force = axes[a].applied_command_um
+            elif mode == CLOSED_LOOP:
+                in_force = axes[a].position_um
+            generators[a].kind, generators[a].parameters[0] = HOLD, in_force
+            generators[a].start_tick = generators[a].held_until = loop.tick
+        generators[a].volts = volts
+
+
+@guarded
 def _set_reference(loop, command):
-    generators = generators_of(loop)
+    generators, volts = generators_of(loop), 1 if state_of(loop).mode == RAW else 0
     for a in range(loop.axis_count):
         if command.axis < 0 or command.axis == a:
             generators[a].kind = np.int64(command.values[0])
             generators[a].start_tick = loop.tick
             generators[a].held_until = loop.tick
+            generators[a].volts = volts
             for i in range(GENERATOR_PARAMETERS):
                 generators[a].parameters[i] = command.values[1 + i]
 

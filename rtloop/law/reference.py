@@ -41,6 +41,8 @@ GENERATOR = np.dtype(
         # a sample of HOLD or TABLE and the tick up to which it holds, so that most ticks divide nothing
         ("held", np.float64),
         ("held_until", np.int64),
+        # 1 for volts, of mode raw; else µm
+        ("volts", np.int64),
     ],
     align=True,
 )

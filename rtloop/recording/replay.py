@@ -66,6 +66,7 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray
     found = np.concatenate([np.zeros(0, MESSAGE), *parts])
     if recording.header["law"].get("revision", 1) < FILLING_REVISION:
         found["values"][np.isin(found["kind"], FILLING), 1] = 1.0  # as it was: the pre-filter keeps its memory
+    found["values"][found["kind"] == Kind.SET_MODE, 2] = 0.0  # what was held is among the recorded references
     return found
 
 

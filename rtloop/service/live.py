@@ -13,15 +13,17 @@ from pydantic import TypeAdapter, ValidationError
 from rtloop.config import Configuration, describe
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
+from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError
 from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 from rtloop.prepare import Prepared
-from rtloop.references import TableOfSamples, generator_values, reach
+from rtloop.references import TableOfSamples, extent, generator_values
 from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused, Taken
+from rtloop.signals import MODE, Mode
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels")
 """Parts of a configuration that only a restart can change."""
@@ -180,12 +182,24 @@ class LiveLaw:
 
     def _play(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> int:
         """Have a generator take over; its table's samples go where the loop finds them. Raises ConfigError, Refused."""
-        limit = self.prepared.configuration.axes[number].limits.command_um
-        if not (most := reach(values, samples)) <= limit:
+        limits = self.prepared.configuration.axes[number].limits
+        lowest, highest = extent(values, samples)
+        if self._in_raw_mode():
+            if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
+                allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v), and mode raw takes volts"
+                raise _unsuitable(f"reference: {lowest:g} V … {highest:g} V, beyond the axis's {allowed}")
+        elif not (most := max(-lowest, highest)) <= limits.command_um:
+            limit = limits.command_um
             raise _unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
         if samples.size:
             return self._submit_table(number, values, samples)
         return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
+
+    def _in_raw_mode(self) -> bool:
+        ring = self._block.ring("ticks")
+        rows = np.empty((1, ring.slots.shape[1]))
+        copied, _, _ = drain(ring, np.uint64(max(int(ring.head[0]) - 1, 0)), rows)
+        return copied == 1 and rows[0, MODE] == Mode.RAW
 
     def _submit_table(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> int:
         """Play `samples` from the one of the axis's two places in the shared table that does not play now."""

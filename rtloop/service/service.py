@@ -131,13 +131,16 @@ class Service:
         return self.set_mode(self.configuration.loop.mode)
 
     def set_mode(self, mode: str) -> int:
-        """Change the mode bumplessly; returns the tick. Raises Refused."""
+        """Change the mode bumplessly; returns the tick. Raises Refused.
+
+        A reference in micrometres is no reference in volts: into mode raw, and out of it, what is in force is held.
+        """
         wanted = Mode[mode.upper()]
         if wanted is not Mode.OFF and self.state is State.TRIPPED:
             raise Refused(f"mode {mode}: tripped; reset first")
         if wanted is not Mode.OFF and not self.armed:
             raise Refused(f"mode {mode}: not armed")
-        return self.desk.submit(Kind.SET_MODE, values=[float(wanted)])
+        return self.desk.submit(Kind.SET_MODE, values=[float(wanted), 0.0, 1.0])
 
     def stop(self) -> int:
         """Ramp the outputs to safe and stay there; returns the tick. Raises Refused."""
@@ -146,7 +149,9 @@ class Service:
         return tick
 
     def reset(self) -> int:
-        """Forget latched trips and faults; outputs stay off. Raises Refused."""
+        """Forget latched trips and faults; outputs stay off. Raises Refused where there is nothing to forget."""
+        if self.state is not State.TRIPPED:
+            raise Refused(f"reset: nothing is tripped; the service is {self.state}")
         tick = self.desk.submit(Kind.RESET_TRIP)
         self.faults.clear()
         self.armed = not self.configuration.service.arm

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import unix_connect
 
 import rtloop
+from rtloop.cli import main
 from tests.faults.account import account, runs_in
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -74,6 +76,41 @@ def test_modes_and_references(running: Bench):
     assert running.client.get("/status")["mode"] == "feedforward"
 
 
+def test_a_healthy_loop_is_not_reset(running: Bench):
+    code, said = answer(running, "POST", "/reset")
+    assert (code, "nothing is tripped; the service is running" in said["error"]) == (409, True)
+    assert running.client.get("/status")["mode"] == "closed_loop"
+
+
+def test_into_raw_mode_and_out_of_it_what_is_in_force_is_held(running: Bench):
+    """20 µm are not taken for 20 V, nor 3 V for 3 µm; as the recording has it."""
+    running.client.post("/setpoint", {"axis": "x", "value": 20.0})
+    settled = running.ticks + 4000
+    wait_for(lambda: running.ticks > settled, "20 µm")
+    raw_tick = running.client.post("/mode", {"mode": "raw"})["tick"]
+    for volts, code in ((10.5, 422), (-10.5, 422), (6.0, 200)):
+        code_, said = answer(running, "POST", "/setpoint", {"axis": "x", "value": volts})
+        assert code_ == code
+        assert code == 200 or "mode raw takes volts" in said["error"]
+    settled = running.ticks + 4000
+    wait_for(lambda: running.ticks > settled, "6 V")
+    closed_tick = running.client.post("/mode", {"mode": "closed_loop"})["tick"]
+    wait_for(lambda: running.ticks > closed_tick + 4000, "the loop closed")
+    running.client.post("/stop")
+    recorded(running, "set_mode", closed_tick)
+    recording = rtloop.load(next((running.folder / "recordings").glob("*.mcap.part")))
+    first = int(recording["tick"][0])
+    reference, position, drive = recording.read("x_reference_um", "x_position_um", "x_drive_v")
+    raw, closed = raw_tick - first, closed_tick - first
+    assert reference[raw - 1] == 20.0
+    assert reference[raw] == drive[raw - 1]
+    assert np.ptp(drive[raw - 1 : raw + 3]) < 1e-9
+    assert reference[closed] == position[closed - 1]
+    held = position[closed + 2000 : closed + 4000]
+    assert abs(held.mean() - reference[closed]) < 0.1
+    assert reference[closed] > 15.0  # µm, where 6 V have brought it
+
+
 def test_a_waveform_plays_once(running: Bench):
     samples = (15.0 + 5.0 * np.sin(np.linspace(0.0, 2 * np.pi, 500))).tolist()
     tick = running.client.post("/waveform", {"axis": "x", "samples": samples, "hold_ticks": 2})["tick"]
@@ -95,6 +132,14 @@ def test_setpoints_are_streamed(running: Bench):
     assert ticks == sorted(set(ticks))
     assert running.client.get("/status")["axes"]["x"]["reference_um"] == 12.0
     assert "Traceback" not in running.log()
+
+
+@pytest.mark.parametrize(("typed", "code"), [("-5", 0), ("-.5e1", 0), ("-50", 1), ("--nonsense", 2)])
+def test_a_negative_number_is_no_option(running: Bench, typed: str, code: int):
+    done = CliRunner().invoke(main, ["ctl", "--socket", str(running.client.path), "setpoint", "x", typed])
+    assert done.exit_code == code, done.output
+    if code == 0:
+        assert running.client.get("/status")["axes"]["x"]["reference_um"] == -5.0
 
 
 def test_watch_tells_the_newest_signals(bench: Bench):

@@ -138,7 +138,6 @@ def test_more_silent_clients_than_there_are_connections(bench: Bench):
         assert open_files < MAX_CONNECTIONS + 3 * BACKLOG  # one lot is just taken, another just closed
         assert bench.client.get("/status")["state"] == "stopped"
         bench.client.post("/stop")
-        bench.client.post("/reset")
 
 
 def test_the_socket_is_for_owner_and_group(bench: Bench):
