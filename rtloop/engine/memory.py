@@ -33,7 +33,7 @@ MIN_RING_TICKS = 4096
 EVENT_SLOTS = 4096
 SNAPSHOT_SLOTS = 64
 COMMAND_SLOTS = 256
-FAULT_BYTES = 1024
+FAULT_BYTES = 960
 URGENT_SLOTS = 16
 """Of the command queue, for what makes the outputs safe: no flood of other commands fills them."""
 

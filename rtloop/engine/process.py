@@ -158,7 +158,9 @@ def _fault(driver: Driver, loop: Any) -> str:
 
 
 def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+    """What was raised, on one line, and without what a terminal would obey."""
+    words = " ".join(str(error).split())
+    return f"{type(error).__name__}: {''.join(letter if letter.isprintable() else '?' for letter in words)}"
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
 from rtloop.law.reference import Generator
-from rtloop.recording.events import FINAL, GAP, RECORDING_FAILED, RECORDING_RESUMED, Event, known
+from rtloop.recording.events import FINAL, GAP, RECORDER, RECORDING_FAILED, RECORDING_RESUMED, Event, known
 from rtloop.recording.format import FORMAT
 from rtloop.signals import Mode
 
@@ -103,6 +103,7 @@ class _Totals(_Checked):
     events_lost: Tick
     result: Text
     complete: bool
+    driver_error: Text | None = None
     gaps: list[Any] = []
 
 
@@ -155,6 +156,8 @@ def event_from(payload: bytes, axes: Sequence[str]) -> Event:
     if event["axis"] is not None and event["axis"] not in axes:
         raise Malformed(f"axis: {_shown(event['axis'])}; null or one of {', '.join(axes)} is allowed")
     if (model := _OF_RECORDER.get(kind)) is not None:
+        if event["who"] != RECORDER:
+            raise Malformed(f"who: {_shown(event['who'])}; only the {RECORDER} says {kind}")
         _require(model, what, "what.")
         return event
     for key, names in (("kind", Kind), ("who", Origin)):

@@ -110,6 +110,7 @@ EVENTS = [
     ("set_mode", lambda event: event.update(tick=10**400), "tick"),
     ("set_mode", lambda event: event.update(axis="y"), "axis.*'y'.*x"),
     ("set_mode", lambda event: event.update(who="[/red]"), "who"),
+    ("finished", lambda event: event.update(who=""), "who"),
     ("set_mode", forbidden("values", [7.0, *[0.0] * 11]), "7 for the mode"),
     ("set_mode", forbidden("values", [3.0]), "values"),
     ("set_mode", forbidden("identity", None), "identity"),

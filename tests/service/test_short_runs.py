@@ -24,7 +24,7 @@ from tests.service.test_run import ROOT, start
 
 NOT_THERE = 66
 TRIPPING = ("position_um = 60.0", "position_um = 0.001")
-FAILING = ("    def read(self):\n", '    def read(self):\n        raise OSError("cable [off]")\n')
+FAILING = ("    def read(self):\n", '    def read(self):\n        raise OSError("cable [off]\\n\\x1b[31m")\n')
 SECOND = (FAILING[0], f"{FAILING[0]}        if self.drive_v:\n            raise OSError('cable [off]')\n")
 
 
@@ -91,7 +91,7 @@ def test_a_run_of_a_tick_or_two(tmp_path: Path, change: tuple[str, str] | None, 
     if change is None:
         assert (done.returncode, final["driver_error"]) == (0, None), done.stderr
     else:
-        said = f"driver 'lag': read failed at tick {ticks - 1}: OSError: cable [off]"
+        said = f"driver 'lag': read failed at tick {ticks - 1}: OSError: cable [off]" + " ?[31m" * (change is FAILING)
         assert done.returncode != 0
         assert f"rtloop: {said}" in done.stderr
         assert (final["driver_error"], summary["driver_error"]) == (said, said)
