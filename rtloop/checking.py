@@ -11,11 +11,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rtloop.cautions import cautions
 from rtloop.config import load
 from rtloop.design.loop import LoopAnalysis, Tolerance, resonance_shift_tolerated
 from rtloop.design.verify import Verification
 from rtloop.design.verify_text import answer
 from rtloop.designing import verified
+from rtloop.errors import ConfigError
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import AxisCheck, Prepared, prepare
 
@@ -32,25 +34,32 @@ ROWS = (
 )
 
 
-def check_configuration(config: Path, as_json: bool) -> int:
-    """Check and print; raises ConfigError where the configuration cannot run."""
+def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
+    """Check and print; raises ConfigError where the configuration cannot run, or if `strict` where it should not."""
     prepared = prepare(load(config))
+    warnings = [*prepared.warnings, *cautions(prepared)]
+    if strict and warnings:
+        raise ConfigError(str(config), warnings)
     shifts = {check.name: _shifts(check, prepared) for check in prepared.checks}
     judged = {axis.name: _judged(prepared, axis) for axis in prepared.configuration.axes}
     if as_json:
-        click.echo(json.dumps(_report(prepared, shifts, judged)))
+        click.echo(json.dumps(_report(prepared, warnings, shifts, judged)))
         return 0
     console = Console(highlight=False)
     plan, facts = prepared.plan, prepared.facts
+    axes = "1 axis" if len(plan.axes) == 1 else f"{len(plan.axes)} axes"
     console.print(
-        f"[bold]{escape(plan.name)}[/]: {len(plan.axes)} axis at {plan.pacing.rate_hz:g} Hz, "
+        f"[bold]{escape(plan.name)}[/]: {axes} at {plan.pacing.rate_hz:g} Hz, "
         f"mode {plan.mode.name.lower()}, driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
     )
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
         limits, interlocks = axis.limits, axis.interlocks
+        sides = f"±{limits.drive_v:g}"
+        if limits.lowest_v != -limits.drive_v:
+            sides = f"{limits.lowest_v:g} … {limits.drive_v:g}"
         slew = "no running slew limit" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
         console.print(
-            f"\n[bold]axis {axis.name}[/]: drive ±{limits.drive_v:g} V, command ±{limits.command_um:g} µm, {slew}, "
+            f"\n[bold]axis {axis.name}[/]: drive {sides} V, command ±{limits.command_um:g} µm, {slew}, "
             f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{interlocks.position_um:g} µm "
             f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
         )
@@ -58,7 +67,7 @@ def check_configuration(config: Path, as_json: bool) -> int:
         found = judged[axis.name]
         if found is not None:
             console.print(f"{escape(str(axis.specification))}: {answer(found)}; `rtloop design verify` shows it all")
-    for warning in prepared.warnings:
+    for warning in warnings:
         click.echo(f"warning: {warning}", err=True)
     return 0
 
@@ -108,7 +117,10 @@ def _tolerance(tolerance: Tolerance) -> str:
 
 
 def _report(
-    prepared: Prepared, shifts: dict[str, dict[str, Tolerance]], judged: dict[str, Verification | None]
+    prepared: Prepared,
+    warnings: list[str],
+    shifts: dict[str, dict[str, Tolerance]],
+    judged: dict[str, Verification | None],
 ) -> dict[str, Any]:
     plan = prepared.plan
     return {
@@ -117,7 +129,7 @@ def _report(
         "mode": plan.mode.name.lower(),
         "driver": plan.driver_kind,
         "columns": list(plan.columns),
-        "warnings": list(prepared.warnings),
+        "warnings": warnings,
         "axes": [
             {
                 "name": check.name,

@@ -89,6 +89,9 @@ def print_summary(summary: dict[str, Any]) -> None:
         table.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
     else:
         table.add_row("clock", "virtual", "unpaced: nothing was timed")
+    if any(summary["ticks_limited"].values()):
+        counts = ", ".join(f"{name} {count:,}" for name, count in summary["ticks_limited"].items() if count)
+        table.add_row("limited", "", f"ticks by what: {counts}")
     if len(summary["parts"]) > 1:
         table.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
     for problem in summary["problems"]:

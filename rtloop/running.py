@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.cautions import cautions
 from rtloop.config import load
 from rtloop.errors import LoopFault, OutputError, RtloopError
 from rtloop.prepare import Prepared, prepare
@@ -28,7 +29,8 @@ def run_configuration(
     """Run, record, report; returns the exit code."""
     with Processes() as processes:
         prepared = prepare(load(config), duration_s=duration_s, paced=paced)
-        for warning in (*prepared.warnings, *_cache_warnings()):
+        warnings = [*prepared.warnings, *cautions(prepared)]
+        for warning in (*warnings, *_cache_warnings()):
             click.echo(f"warning: {warning}", err=True)
         path = recording_path(prepared, out)
         recover_leftovers(path.parent)
@@ -39,7 +41,7 @@ def run_configuration(
         with RunView(prepared, sys.stderr) as view:
             result = supervisor.run(view.show)
         interruption.attend(None)
-    summary = run_summary(prepared, result)
+    summary = run_summary(warnings, result)
     summary["startup_s"] = supervisor.startup_s
     if as_json:
         click.echo(json.dumps(summary))
@@ -67,7 +69,7 @@ def _cache_warnings() -> list[str]:
     return [f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is made anew when that is gone"]
 
 
-def run_summary(prepared: Prepared, result: RunResult) -> dict[str, Any]:
+def run_summary(warnings: list[str], result: RunResult) -> dict[str, Any]:
     """The recording's summary with what the run adds to it."""
     summary = summarise(result.recordings) if result.recordings else {}
     summary["recording"] = str(result.recordings[0]) if result.recordings else None
@@ -76,7 +78,7 @@ def run_summary(prepared: Prepared, result: RunResult) -> dict[str, Any]:
     summary["outcome"] = result.outcome
     summary["error"] = result.error
     summary["recorder"] = result.recorder
-    summary["warnings"] = list(prepared.warnings)
+    summary["warnings"] = warnings
     summary.setdefault("trips", [])
     return summary
 

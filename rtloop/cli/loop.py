@@ -43,13 +43,14 @@ def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None,
 
 @click.command()
 @CONFIG
+@click.option("--strict", is_flag=True, help="Warnings are faults.")
 @JSON
 @fails_clearly
-def check(config: Path, as_json: bool) -> int:
+def check(config: Path, strict: bool, as_json: bool) -> int:
     """Validate CONFIG and show what would run: law, C(z) against C(s), margins, limits. Touches no hardware."""
     from rtloop.checking import check_configuration
 
-    return check_configuration(config, as_json)
+    return check_configuration(config, strict, as_json)
 
 
 @click.command()

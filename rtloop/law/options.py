@@ -253,6 +253,15 @@ ReferenceOptions = Annotated[
 ]
 
 
+class MarginOptions(Options):
+    """Below, or above, these `rtloop check` warns."""
+
+    gain: float = Field(default=1.5, ge=1)
+    phase_deg: float = Field(default=30.0, ge=0, le=180)
+    sensitivity: float = Field(default=3.0, gt=1)
+    """Largest |S|."""
+
+
 class AxisOptions(Options):
     """One axis of the law."""
 
@@ -262,6 +271,7 @@ class AxisOptions(Options):
     model: ModelOptions | None = None
     specification: str | None = None
     """File, relative to the configuration's, with what the loop is asked to do; `rtloop design verify` judges it."""
+    margins: MarginOptions = MarginOptions()
     prefilter: PrefilterOptions = PrefilterOptions()
     limits: LimitsOptions = LimitsOptions()
     interlocks: InterlockOptions = InterlockOptions()

@@ -17,6 +17,7 @@ from rtloop.signals import Flag, Mode
 
 MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED)
+LIMITED = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
 BATCH_ROWS = 1 << 18
 """More than any chunk holds."""
 
@@ -48,6 +49,7 @@ class Totals:
 
     def __init__(self, axes: list[str]) -> None:
         self.ticks, self.overruns, self.periods_missed = 0, 0, 0
+        self.limited = dict.fromkeys(LIMITED, 0)
         self.first: tuple[float, float] | None = None
         self.last = (0.0, 0.0)
         self.histograms = {name: Histogram() for name in MEASURED}
@@ -59,7 +61,10 @@ class Totals:
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
         self.last = float(column["tick"][-1]), float(column["deadline_ns"][-1])
         self.periods_missed += int(column["periods_missed"].sum())
-        self.overruns += int(np.count_nonzero(column["flags"].astype(np.int64) & Flag.OVERRUN))
+        flags = column["flags"].astype(np.int64)
+        self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
+        for name, flag in LIMITED.items():
+            self.limited[name] += int(np.count_nonzero(flags & flag))
         for name, histogram in self.histograms.items():
             histogram.add(column[name])
         closed = column["mode"] == Mode.CLOSED_LOOP
@@ -114,6 +119,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
         "duration_s": totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
         "paced": header["paced"],
         "overruns": totals.overruns,
+        "ticks_limited": totals.limited,
         "lateness_us": reports["lateness_us"],
         "lateness_histogram": totals.histograms["lateness_us"].classes(),
         "exec_us": reports["exec_us"],

@@ -12,7 +12,7 @@ from drivers.base import Channel
 from hil.compiled import jit
 from rtloop.law.options import ReferenceOptions
 from rtloop.law.reference import GENERATOR, reference_sample
-from rtloop.references import TableOfSamples, generator_values
+from rtloop.references import TableOfSamples, extent, generator_values
 
 RATE_HZ, START = 10_000.0, 137
 INPUTS = (Channel("adc0"), Channel("joystick"))
@@ -156,3 +156,17 @@ def test_references_that_cannot_be(tmp_path, options, message):
     np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)
     with pytest.raises(ValueError, match=message):
         generate(options, folder=tmp_path)
+
+
+@pytest.mark.parametrize("options", [
+    {"kind": "hold", "value": -3.0},
+    {"kind": "steps", "levels": [1.0, -4.0, 2.0], "dwell_s": 0.5},
+    {"kind": "sine", "amplitude": -2.0, "frequency_hz": 5.0, "offset": 7.0, "phase_deg": 30.0},
+    {"kind": "triangle", "amplitude": 2.0, "frequency_hz": 5.0, "offset": -7.0},
+    {"kind": "chirp", "amplitude": 2.0, "start_hz": 3.0, "end_hz": 9.0, "duration_s": 2.0, "offset": 6.0},
+], ids=lambda options: options["kind"])  # fmt: skip
+def test_how_far_each_kind_comes_is_known_beforehand(options: dict) -> None:
+    table = TableOfSamples()
+    values = generator_values(TypeAdapter(ReferenceOptions).validate_python(options), RATE_HZ, INPUTS, Path(), table)
+    made = generate(options)
+    assert extent(values, table.samples) == pytest.approx((made.min(), made.max()), abs=1e-3)

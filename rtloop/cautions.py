@@ -1,0 +1,96 @@
+"""What runs, but hardly as it was meant: a warning line each, with the key, the value and what would be sound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from hil.options import RigOptions
+from rtloop.config import ChannelOptions, Configuration
+from rtloop.design.plays import loading_curve
+from rtloop.identifying import actuator_model
+from rtloop.law.options import AxisOptions, ReferenceOptions
+from rtloop.prepare import AxisCheck, Prepared
+from rtloop.references import TableOfSamples, extent, generator_values
+
+SAME_SCALE = 0.01
+"""Scales that differ by more than this part are different."""
+
+
+def cautions(prepared: Prepared) -> list[str]:
+    """Warnings about every axis of a configuration that can run."""
+    configuration, found = prepared.configuration, []
+    for axis, check in zip(configuration.axes, prepared.checks, strict=True):
+        channel = configuration.channels[axis.name]
+        lines = (
+            *_margins(axis, check),
+            *_references(prepared, axis),
+            *_reach(axis, channel),
+            *_sensor(configuration, axis, channel),
+        )
+        found += [f"axis.{axis.name}.{line}" for line in lines]
+    return found
+
+
+def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
+    loop, asked = check.running, axis.margins
+    if loop is None or not loop.stable:
+        return  # there is no margin, and preparing it has said so
+    if loop.gain_margin < asked.gain:
+        yield f"controller: gain margin {loop.gain_margin:.3g}, below margins.gain = {asked.gain:g}"
+    if loop.phase_margin_deg < asked.phase_deg:
+        yield f"controller: phase margin {loop.phase_margin_deg:.3g}°, below margins.phase_deg = {asked.phase_deg:g}"
+    if loop.max_sensitivity > asked.sensitivity:
+        yield f"controller: max |S| {loop.max_sensitivity:.3g}, above margins.sensitivity = {asked.sensitivity:g}"
+
+
+def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
+    """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
+    limits, mode = axis.limits, prepared.configuration.loop.mode
+    asked: list[tuple[str, str, ReferenceOptions]] = [("reference", mode, axis.reference)]
+    for entry in sorted(prepared.configuration.schedule, key=lambda entry: entry.at_tick):
+        mode = entry.mode or mode
+        if entry.reference is not None and entry.axis in (None, axis.name):
+            asked.append((f"reference from tick {entry.at_tick} on", mode, entry.reference))
+    for where, mode, reference in asked:
+        lowest, highest = _extent(prepared, reference)
+        if mode == "raw" and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
+            allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
+            yield f"{where}: {lowest:g} V … {highest:g} V, beyond the drive's limits, {allowed}"
+        if mode in ("feedforward", "closed_loop") and max(-lowest, highest) > limits.command_um:
+            yield f"{where}: reaches {max(-lowest, highest):g} µm, beyond limits.command_um = {limits.command_um:g}"
+
+
+def _extent(prepared: Prepared, reference: ReferenceOptions) -> tuple[float, float]:
+    table, configuration = TableOfSamples(), prepared.configuration
+    rate_hz, folder = configuration.loop.rate_hz, configuration.folder
+    values = generator_values(reference, rate_hz, prepared.facts.inputs, folder, table)
+    return extent(values, table.samples)
+
+
+def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
+    """Limits that nothing can come to."""
+    limits, interlocks = axis.limits, axis.interlocks
+    model = actuator_model(axis.feedforward)
+    reach_um = float(np.max(np.abs(loading_curve(model, np.array([limits.drive_v, -limits.lowest_v])))))
+    if limits.command_um > reach_um:
+        yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
+    ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
+    seen_um = float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
+    if interlocks.position_um > seen_um:
+        yield f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {seen_um:.4g} µm"
+
+
+def _sensor(configuration: Configuration, axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
+    """A scale that the simulated sensor contradicts; of a real one nobody knows."""
+    options: Any = configuration.driver_options
+    if not isinstance(options, RigOptions):
+        return
+    there = options.plants.get(axis.name, options.plant).sensor.um_per_v
+    where = f"um_per_v: {channel.um_per_v:g} µm/V in driver.channels.{axis.name}"
+    if channel.um_per_v < 0 < there:
+        yield f"{where}, of the other sign than the simulated sensor's {there:g}: the feedback is positive"
+    elif abs(channel.um_per_v / there - 1) > SAME_SCALE:
+        yield f"{where}, but the simulated sensor has {there:g}"

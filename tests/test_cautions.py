@@ -1,0 +1,79 @@
+"""What `check` warns of, each provoked on a configuration that is silent without; and `--strict`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cautions import cautions
+from rtloop.cli import main
+from rtloop.config import parse
+from rtloop.prepare import prepare
+from tests.paper_configuration import PAPER, RATE, TEXT
+
+RAW = (RATE, f'{RATE}mode = "raw"\n')
+LIMITS, INTERLOCKS = "command_um = 42.0", "[axis.interlocks]"
+SCHEDULE = '\n[[schedule]]\nat_tick = 500\nreference = { kind = "hold", value = -43.0 }\n'
+
+PROVOKED = [
+    ((("gain = 0.016", "gain = 0.030"),), "controller: gain margin 1.37, below margins.gain = 1.5"),
+    (((INTERLOCKS, f"[axis.margins]\nphase_deg = 80.0\n{INTERLOCKS}"),), "controller: phase margin 73.1°, below"),
+    (((INTERLOCKS, f"[axis.margins]\nsensitivity = 1.2\n{INTERLOCKS}"),), "controller: max |S| 1.65, above"),
+    (((LIMITS, "command_um = 19.0"),), "reference: reaches 20 µm, beyond limits.command_um = 19"),
+    (((LIMITS, "command_um = 44.0"),), "limits.command_um: 44 µm; the drive's limits end at 43.02 µm"),
+    (((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"), RAW), "reference: -20 V … 20 V, beyond the drive's limits"),
+    ((("position_um = 60.0", "position_um = 120.0"),), "interlocks.position_um: 120 µm; the sensor's range"),
+    ((("um_per_v = 10.0", "um_per_v = -10.0"),), "of the other sign than the simulated sensor's 10: the feedback is"),
+    ((("um_per_v = 10.0", "um_per_v = 20.0"),), "20 µm/V in driver.channels.x, but the simulated sensor has 10"),
+]
+
+
+def changed(*changes: tuple[str, str]) -> str:
+    text = TEXT
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
+
+
+def found(text: str) -> list[str]:
+    return cautions(prepare(parse(text, "paper", PAPER.parent, "paper.toml")))
+
+
+def test_the_papers_configuration_gives_no_cause() -> None:
+    assert found(TEXT) == []
+
+
+@pytest.mark.parametrize(("changes", "said"), PROVOKED, ids=[said[:30] for _, said in PROVOKED])
+def test_each_is_said_in_a_line(changes: tuple[tuple[str, str], ...], said: str) -> None:
+    lines = found(changed(*changes))
+    assert any(line.startswith("axis.x.") and said in line for line in lines), lines
+
+
+def test_a_reference_of_the_schedule_counts() -> None:
+    (line,) = found(TEXT + SCHEDULE)
+    assert line == "axis.x.reference from tick 500 on: reaches 43 µm, beyond limits.command_um = 42"
+
+
+def test_strict_makes_faults_of_them(tmp_path: Path) -> None:
+    config = tmp_path / "stage.toml"
+    config.write_text(changed((LIMITS, "command_um = 19.0")).replace('specification = "paper-spec.toml"', ""))
+    loose = CliRunner().invoke(main, ["check", str(config), "--json"])
+    assert loose.exit_code == 0
+    assert any("command_um = 19" in line for line in json.loads(loose.stdout)["warnings"])
+    strict = CliRunner().invoke(main, ["check", str(config), "--strict"])
+    assert strict.exit_code == 78
+    assert "command_um = 19" in strict.stderr
+
+
+def test_an_amplifier_of_one_side_is_shown_as_one(tmp_path: Path) -> None:
+    config = tmp_path / "stage.toml"
+    text = changed((LIMITS, f"{LIMITS}\ndrive_min_v = 0.0")).replace('specification = "paper-spec.toml"', "")
+    config.write_text(text)
+    shown = CliRunner().invoke(main, ["check", str(config)])
+    assert "drive 0 … 10 V" in shown.stdout
+    assert "paper: 1 axis at 10000 Hz" not in shown.stdout
+    assert "stage: 1 axis at 10000 Hz" in shown.stdout
