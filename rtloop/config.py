@@ -272,4 +272,7 @@ def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -
     for entry in sections.schedule:
         if entry.axis is not None and entry.axis not in names:
             faults.append(f"schedule.axis: {entry.axis!r} is not an axis; there are {', '.join(names)}")
+    for i, entry in enumerate(sections.schedule):
+        if entry in sections.schedule[:i]:
+            faults.append(f"schedule, at_tick {entry.at_tick}: the same entry twice; once is enough")
     return faults

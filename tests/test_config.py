@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from typing import get_args
 
 import pytest
+from pydantic import BaseModel
 
-from rtloop.config import InputFileError, load, parse
+from hil.options import RigOptions
+from rtloop.config import ChannelOptions, InputFileError, LoopOptions, RecordingOptions, load, parse
 from rtloop.errors import ConfigError
+from rtloop.law.options import AxisOptions
+from rtloop.service.options import ServiceOptions
 from rtloop.signals import Mode
 from tests.paper_configuration import CONTROLLER, PAPER, RATE, REFERENCE, TEXT, UNSTABLE, built, entry, faults
 
@@ -135,3 +141,27 @@ def test_axes_and_channels_that_do_not_belong_together():
     ]
     again = '[[axis]]\nname = "x"\nfeedforward = { thresholds_v = [0.0], weights_um_per_v = [1.0] }\n'
     assert faults(more=again) == ["axis.x: named twice"]
+
+
+def test_an_entry_of_the_schedule_stands_there_once():
+    (found,) = faults(more=2 * entry('at_tick = 7\nmode = "off"'))
+    assert found == "schedule, at_tick 7: the same entry twice; once is enough"
+
+
+def models_in(annotation: object) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+        for field in annotation.model_fields.values():
+            yield from models_in(field.annotation)
+    for part in get_args(annotation):
+        yield from models_in(part)
+
+
+@pytest.mark.parametrize(
+    "section", [LoopOptions, ChannelOptions, RigOptions, AxisOptions, RecordingOptions, ServiceOptions]
+)
+def test_every_key_is_in_the_papers_configuration(section: type[BaseModel]) -> None:
+    """As its first lines promise; wherever it stands there."""
+    for model in models_in(section):
+        there = [name for name in model.model_fields if re.search(rf"(?<![a-z_]){name}(?![a-z_])", TEXT)]
+        assert there == list(model.model_fields), model.__name__

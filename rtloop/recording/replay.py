@@ -17,7 +17,7 @@ from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.layout import layout_description, split_snapshot
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.events import GAP, RECOVERED, json_value, message_of
+from rtloop.recording.events import GAP, RECOVERED, Event, json_value, message_of
 from rtloop.recording.load import Recording
 from rtloop.recording.reader import Snapshot
 from rtloop.recording.rerun import Law, Rerun, Rows, Tape
@@ -30,6 +30,7 @@ FEW_PERIODS, RATE_TOLERANCE = 50, 0.05
 FILLING_REVISION, FILLING = 2, (Kind.SET_MODE, Kind.LOAD_LAW)
 """Since this revision of the law these commands begin with a pre-filter filled anew."""
 LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
+OBEYED = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW)}
 Progress = Callable[[int], None]
 
 
@@ -70,6 +71,21 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray
     return found
 
 
+def misplaced_command(events: Sequence[Event]) -> int | None:
+    """Tick of the first command that stands in the file for the second time, or behind one of a later tick."""
+    last_tick, seen = 0, set()
+    for event in events:
+        if event["kind"] not in OBEYED:
+            continue
+        what = event["what"]
+        key = (event["tick"], event["kind"], event["axis"], what["identity"], *map(float, what["values"]))
+        if key in seen or event["tick"] < last_tick:
+            return int(event["tick"])
+        seen.add(key)
+        last_tick = event["tick"]
+    return None
+
+
 def consecutive(rows: Rows) -> list[Rows]:
     """The rows, split where ticks are missing."""
     ticks = rows[:, signals.TICK]
@@ -88,6 +104,8 @@ class _Replay:
         self._found = 0
         gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
         self._gaps = sorted(gaps, key=lambda gap: gap["first_tick"])
+        if (tick := misplaced_command(recording.events)) is not None:
+            self._report.pass_over(tick, None, "a command stands there twice, or behind a later one")
 
     def run(self) -> ReplayReport:
         """Replay all blocks, up to the first difference."""
