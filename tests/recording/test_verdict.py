@@ -113,6 +113,16 @@ def test_a_chunk_replaced_by_a_copy_of_another(base: Base, path: Path):
         assert any("order" in problem for problem in json.loads(result.stdout)["problems"])
 
 
+def test_commands_that_stand_there_twice(base: Base, path: Path):
+    """They change nothing, twice obeyed; and yet this is not the recording of what happened."""
+    events = next(i for i, chunk in enumerate(base.chunks) if chunk.messages and "reset_trip" in str(chunk.messages))
+    chunks = list(base.chunks)
+    chunks.insert(events, base.chunks[events])
+    path.write_bytes(packed(base._replace(chunks=chunks)))
+    report = refused(path)
+    assert "a command stands there twice" in report.not_verified[0]["why"]
+
+
 @pytest.mark.parametrize("kept", [slice(0, -1), slice(1, None), slice(0, None, 2)], ids=["end", "start", "middle"])
 def test_chunks_that_are_gone(kept: slice, base: Base, path: Path):
     gone = set(tick_chunks(base)) - set(tick_chunks(base)[kept])
