@@ -99,7 +99,10 @@ def print_summary(summary: dict[str, Any]) -> None:
     if summary["driver_error"]:
         table.add_row("[red]driver[/]", "", escape(summary["driver_error"]))
     for trip in summary["trips"]:
-        table.add_row("[red]trip[/]", f"tick {trip['tick']}", ", ".join(trip["causes"]))
+        reason = escape(trip["reason"] or "")
+        table.add_row(
+            "[red]trip[/]", f"tick {trip['tick']}", "; ".join(filter(None, [", ".join(trip["causes"]), reason]))
+        )
     console.print(table)
     if summary["lateness_us"] is not None:
         _print_timing(console, summary)

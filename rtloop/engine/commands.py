@@ -201,7 +201,7 @@ def _load_law(loop, axis, another, fitting):
 
 @seldom
 def publish_event(loop, kind, axis, origin, identity, values):
-    """An event of this tick with two values."""
+    """An event of this tick with its first values."""
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
     event.tick = loop.tick
@@ -211,7 +211,7 @@ def publish_event(loop, kind, axis, origin, identity, values):
     event.identity = identity
     for i in range(MESSAGE_VALUES):
         event.values[i] = 0.0
-    event.values[0] = values[0]
-    event.values[1] = values[1]
+    for i in range(len(values)):
+        event.values[i] = values[i]
     publish(ring, position)
     loop.events += 1

@@ -32,6 +32,7 @@ from rtloop.engine.context import (
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
+from rtloop.engine.trips import publish_trip
 from rtloop.law.law import counts_fit, evaluate, set_mode, update
 from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
 from rtloop.law.reference import reference_sample
@@ -244,7 +245,7 @@ def _report(loop, status, written, missed):
     """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
     new_trip = state_of(loop).new_trip
     if new_trip != 0:
-        publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, (float(new_trip), 0.0))
+        publish_trip(loop, new_trip)
     if loop.failed == 0 and (status < 0 or written < 0):
         loop.failed = WRITE_FAILED if written < 0 else READ_FAILED
         failing, verb = (written, 1.0) if written < 0 else (status, 0.0)

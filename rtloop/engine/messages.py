@@ -41,7 +41,8 @@ class Kind(IntEnum):
     REFUSED = 100
     """values[0]: kind of the command; values[1]: its first value."""
     TRIPPED = 101
-    """values[0]: the new causes as Flag bits; values[1]: drive in V of the axis named."""
+    """values[0]: the new causes as Flag bits. Of the axis named, 0 where none is to blame: values[3] the cause found
+    first, values[1] what was beyond its limit, values[2] (µm, V or µs; a count of ticks or swings)."""
     PARKED = 102
     """All outputs are at their safe values."""
     DRIVER_FAILED = 103

@@ -126,6 +126,7 @@ class _Message(_Checked):
     identity: Number
     mode: Name | None = None
     causes: list[Name] = []
+    reason: Text | None = None
 
 
 def header_from(payload: bytes) -> dict[str, Any]:

@@ -20,6 +20,13 @@ GAP, FINISHED, ROTATED, RECOVERED = "gap", "finished", "rotated", "recovered"
 RECORDING_FAILED, RECORDING_RESUMED = "recording_failed", "recording_resumed"
 """Kinds that the recorder itself writes; `who` is RECORDER."""
 RECORDER = "recorder"
+UNITS = {
+    **dict.fromkeys(("position", "tracking"), " µm"),
+    **dict.fromkeys(("non_finite", "sensor_range", "enable"), " V"),
+    **dict.fromkeys(("stale", "late"), " µs"),
+    **{"frozen": " ticks", "oscillation": " swings"},
+}
+"""Of what trips, by its cause."""
 FINAL = (FINISHED, ROTATED, RECOVERED)
 """One of these ends a file; its `what` holds the totals."""
 
@@ -32,7 +39,7 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
     if kind == Kind.SET_MODE:
         meaning = {"mode": _name(Mode, values[0])}
     elif kind == Kind.TRIPPED:
-        meaning = {"causes": trip_causes(values[0])}
+        meaning = {"causes": trip_causes(values[0]), "reason": trip_reason(message, axes)}
     return {
         "tick": int(message["tick"]),
         "time_ns": time_ns,
@@ -41,6 +48,17 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
         "axis": axes[axis] if 0 <= axis < len(axes) else None,
         "what": {**meaning, "values": [json_value(value) for value in values], "identity": int(message["identity"])},
     }
+
+
+def trip_reason(message: np.void, axes: Sequence[str]) -> str | None:
+    """Axis, value and limit of a TRIPPED message in words; None where no axis is to blame."""
+    _, value, limit, bit = (float(one) for one in message["values"][:4])
+    axis, causes = int(message["axis"]), trip_causes(bit)
+    if not causes or not 0 <= axis < len(axes):
+        return None
+    unit = UNITS.get(causes[0], "")
+    beside = "" if causes == ["non_finite"] else f", its limit {limit:g}{unit}"
+    return f"{axes[axis]}: {causes[0]} {value:.6g}{unit}{beside}"
 
 
 def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:

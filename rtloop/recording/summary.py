@@ -132,7 +132,9 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
         "host": header.get("host"),
         "axes": [axis.report() for axis in totals.axes],
         "trips": [
-            {"tick": event["tick"], "causes": event["what"]["causes"]} for event in events if event["kind"] == "tripped"
+            {"tick": event["tick"], "causes": event["what"]["causes"], "reason": event["what"].get("reason")}
+            for event in events
+            if event["kind"] == "tripped"
         ],
         "events": len(events),
         "size_bytes": size_bytes,

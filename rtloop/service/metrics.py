@@ -35,7 +35,11 @@ def metrics_text(service: Service) -> str:
         lateness = Gauge("rtloop_lateness_us", "Lateness over the last ticks", ["quantile"], registry=registry)
         for quantile, value in measured["lateness_us"].items():
             lateness.labels(quantile).set(value)
-    axes = newest_signals(service).get("axes", {})
+    newest = newest_signals(service)
+    trip = Gauge("rtloop_trip", "1 for each cause of the trip in force", ["cause"], registry=registry)
+    for cause in newest.get("trip", ()):
+        trip.labels(cause).set(1)
+    axes = newest.get("axes", {})
     signal = Gauge("rtloop_signal", "Newest value of a signal", ["axis", "signal"], registry=registry)
     for axis, values in axes.items():
         for name, value in values.items():

@@ -226,10 +226,11 @@ class Service:
             if state is not said:
                 row = supervisor.latest()
                 causes = [] if row is None else signals.trip_causes(row[signals.FLAGS])
-                level = logging.ERROR if state is State.TRIPPED else logging.INFO
-                log.log(
-                    level, "%s%s", state, f": {', '.join([*causes, *self.faults])}" if state is State.TRIPPED else ""
-                )
+                if state is State.TRIPPED:
+                    reason = supervisor.trip_reason if causes else None
+                    log.error("%s: %s", state, ", ".join([*causes, *self.faults, *([reason] if reason else [])]))
+                else:
+                    log.info("%s", state)
                 said = state
             time.sleep(POLL_S)
         for note in result.notes:

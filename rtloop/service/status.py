@@ -64,7 +64,8 @@ def newest_signals(service: Service) -> dict[str, Any]:
     return {
         "tick": int(row[signals.TICK]),
         "mode": Mode(int(row[signals.MODE])).name.lower(),
-        "trip": signals.trip_causes(row[signals.FLAGS]),
+        "trip": (causes := signals.trip_causes(row[signals.FLAGS])),
+        "trip_reason": supervisor.trip_reason if causes else None,
         "axes": axes,
     }
 

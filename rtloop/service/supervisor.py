@@ -19,9 +19,11 @@ import numpy as np
 
 from drivers.errors import DriverError
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
+from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
 from rtloop.prepare import Prepared
+from rtloop.recording.events import trip_reason
 from rtloop.service.child import Child
 from rtloop.service.header import recording_header
 from rtloop.service.parking import park
@@ -127,6 +129,15 @@ class Supervisor:
         rows = np.empty((count, ring.slots.shape[1]))
         copied, _, _ = drain(ring, np.uint64(max(self.ticks - count, 0)), rows)
         return rows[:copied]
+
+    @property
+    def trip_reason(self) -> str | None:
+        """Axis, value and limit of the newest trip, as far as an axis is to blame."""
+        ring = self.block.ring("events")
+        events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
+        copied, _, _ = drain(ring, np.uint64(max(int(ring.head[0]) - events.size, 0)), events)
+        trips = [event for event in events[:copied] if event["kind"] == Kind.TRIPPED]
+        return trip_reason(trips[-1], self.prepared.plan.axes) if trips else None
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
         """Start, watch and end everything. Raises RtloopError for what prevented the run.
