@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from drivers.base import ABI_VERSION, Channel, Driver, Facts, Pointers
+from drivers.registry import kinds
 
 _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
 _UNTOUCHED = -123456.789
@@ -89,6 +90,17 @@ class DriverContract:
         assert driver.facts == facts, "the facts changed from one look at them to the next"
         assert self.outputs(driver) == before, "the facts cannot be read without touching the hardware"
 
+    def test_a_configuration_can_name_it(self) -> None:
+        """By `kind`, which its entry point says as well; with options that are of its `options_model`."""
+        driver = self.driver()
+        place = f"{type(driver).__module__}:{type(driver).__qualname__}"
+        names = [kind for kind, where in kinds().items() if where == place]
+        kind, model = getattr(driver, "kind", None), driver.options_model
+        assert isinstance(kind, str), f"kind is {kind!r}; the name that a configuration gives is needed"
+        assert not names or kind in names, f"kind is {kind!r}; its entry point calls it {', '.join(names)}"
+        given = type(driver.options)
+        assert given is model, f"its options are of {given.__name__}; options_model is {model.__name__}"
+
     def test_wiring_names_channels(self) -> None:
         """Every axis has an input and an output that are there."""
         driver = self.driver()
@@ -143,7 +155,7 @@ class DriverContract:
             for _ in range(3):
                 calls.write([channel.safe_v for channel in driver.facts.outputs])
                 status, values = calls.read()
-                assert status >= 0, f"read returned {status}"
+                assert status >= 0, f"read returned {status}{_raised(driver)}"
                 inputs = driver.facts.inputs
                 for channel, value in zip(inputs, values[: len(inputs)], strict=True):
                     inside = channel.minimum_v <= value <= channel.maximum_v
@@ -158,7 +170,7 @@ class DriverContract:
             for share in (0.0, 0.25, 0.5, 1.0):
                 volts = [_between(channel, share) for channel in driver.facts.outputs]
                 status = calls.write(volts)
-                assert status >= 0, f"write({volts}) returned {status}"
+                assert status >= 0, f"write({volts}) returned {status}{_raised(driver)}"
                 self._require_outputs(driver, volts, f"write({volts})")
 
     def test_nothing_outside_the_range_gets_through(self) -> None:
@@ -189,14 +201,21 @@ class DriverContract:
             calls.write([_between(channel, 0.75) for channel in driver.facts.outputs])
             driver.close()
             calls = Calls(driver.open(), driver.facts)
-            assert calls.read()[0] >= 0, "read failed after close and open"
-            assert calls.write([channel.safe_v for channel in driver.facts.outputs]) >= 0, "write failed after open"
+            assert calls.read()[0] >= 0, f"read failed after close and open{_raised(driver)}"
+            status = calls.write([channel.safe_v for channel in driver.facts.outputs])
+            assert status >= 0, f"write failed after close and open{_raised(driver)}"
 
     def _require_outputs(self, driver: Driver, wanted: Sequence[float], after: str) -> None:
         found = self.outputs(driver)
         if found is not None:
             far = max(abs(a - b) for a, b in zip(found, wanted, strict=True))
             assert far <= self.tolerance_v, f"after {after} the outputs are {list(found)}; {list(wanted)} is needed"
+
+
+def _raised(driver: Driver) -> str:
+    """What `read` or `write` raised, if the driver kept it."""
+    error = getattr(driver, "error", None)
+    return "" if error is None else f": {type(error).__name__}: {error}"
 
 
 def _between(channel: Channel, share: float) -> float:

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from drivers.base import ABI_VERSION, Channel, Facts, Pointers, Wiring
 from drivers.errors import DriverError
+from hil.options import Options
 from tests.drivers.bench_driver import LoopBack
 
 
@@ -26,6 +27,24 @@ class ChangesItsFacts(LoopBack):
     def facts(self) -> Facts:
         self.looks += 1
         return replace(super().facts, max_rate_hz=1000.0 + self.looks)
+
+
+class CalledOtherwiseThanItsEntryPoint(LoopBack):
+    """What is registered there is called `sim`."""
+
+    __module__, __qualname__ = "drivers.sim", "SimDriver"
+
+
+class WithoutAName(LoopBack):
+    kind = None  # type: ignore[assignment]
+
+
+class ForgetsItsOptionsModel(LoopBack):
+    """Its options are of a model of its own, and `options_model` is the base class's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.options = type("CardOptions", (Options,), {})()
 
 
 class InfiniteRange(LoopBack):

@@ -33,7 +33,7 @@ def passed(folder: Path, test: str) -> str:
 
 
 def test_in_plain_python(folder):
-    assert re.match(r"11 passed", passed(folder, "test_mycard.py"))
+    assert re.match(r"12 passed", passed(folder, "test_mycard.py"))
 
 
 def test_as_native_functions(folder):
@@ -49,7 +49,7 @@ def test_as_native_functions(folder):
     )
     test = test.replace("return list(vendor.volts)", 'return list(driver.card.at) if hasattr(driver, "card") else None')
     (folder / "test_native.py").write_text(test)
-    assert re.match(r"11 passed", passed(folder, "test_native.py"))
+    assert re.match(r"12 passed", passed(folder, "test_native.py"))
 
 
 def test_a_broken_copy_is_red(folder):

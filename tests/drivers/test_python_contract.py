@@ -15,7 +15,14 @@ from drivers.contract import Calls
 from drivers.errors import DriverError
 from rtloop.engine.plan import require_facts
 from tests.drivers.bench_driver import LoopBack, LoopBackContract
-from tests.drivers.mutants import MUTANTS, ForgetsAnInput, Native
+from tests.drivers.mutants import (
+    MUTANTS,
+    DeafAfterClose,
+    ForgetsAnInput,
+    MuteAfterClose,
+    Native,
+    RefusesTheEndOfItsRange,
+)
 
 
 class TestLoopBack(LoopBackContract):
@@ -53,6 +60,17 @@ def test_every_promise_is_broken_by_a_mutant():
     promises = {node.lineno: ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Assert)}
     broken = {line for mutant in MUTANTS for _, line in broken_promises(mutant)}
     assert [text for line, text in promises.items() if line not in broken] == []
+
+
+@pytest.mark.parametrize("mutant", [DeafAfterClose, MuteAfterClose, RefusesTheEndOfItsRange])
+def test_what_a_driver_raised_is_in_the_red_test(mutant):
+    suite = type("Suite", (LoopBackContract,), {"kind": mutant})
+    said = {DeafAfterClose: "OSError: no answer", MuteAfterClose: "OSError: no answer"}.get(
+        mutant, "ValueError: too much"
+    )
+    test = suite().test_write_accepts_the_whole_range if "too" in said else suite().test_open_after_close
+    with pytest.raises(AssertionError, match=said):
+        test()
 
 
 def test_an_exception_in_read_is_a_failed_driver_and_is_kept():
