@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from pathlib import Path
 
 import click
@@ -32,7 +32,7 @@ def serve_board(config: Path) -> int:
     axes = _axes_by_output(configuration)
     stopped = _stop_signals()
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
-    click.echo(f"board at {options.file}: {len(axes)} channels at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
+    click.echo(f"board at {options.file}: {_channels(axes)} at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
     try:
         ready = lambda: Notifier().send(READY=1)
         samples = serve(Path(options.file), options, axes, rate_hz, stopped, ready)
@@ -58,7 +58,7 @@ def serve_node(config: Path) -> int:
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def ready() -> None:
-        click.echo(f"node on {options.place}: {len(axes)} channels; Ctrl-C ends it", err=True)
+        click.echo(f"node on {options.place}: {_channels(axes)}; Ctrl-C ends it", err=True)
         Notifier().send(READY=1)
 
     try:
@@ -85,3 +85,7 @@ def _stop_signals() -> Callable[[], bool]:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     return lambda: stopped
+
+
+def _channels(axes: Sized) -> str:
+    return "1 channel" if len(axes) == 1 else f"{len(axes)} channels"

@@ -91,7 +91,11 @@ def print_resimulation(report: dict[str, Any]) -> None:
 def print_recovery(report: dict[str, Any]) -> None:
     """What is in the recovered file, and what is missing."""
     console = _console()
-    console.print(f"{_name(report['output'])}: {report['ticks']:,} ticks recovered from {_name(report['recording'])}")
+    original, whole = _name(report["recording"]), report["complete"] and not report["gaps"] and not report["problems"]
+    if whole:
+        console.print(f"{original} is whole, there was nothing to recover; {_name(report['output'])} is a copy")
+        return
+    console.print(f"{_name(report['output'])}: {report['ticks']:,} ticks recovered from {original}")
     for first, count in report["gaps"]:
         console.print(f"missing: {count:,} ticks from tick {first} on")
     _print_problems(console, report["problems"])

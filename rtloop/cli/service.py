@@ -68,10 +68,13 @@ def _client(context: click.Context) -> Any:
         folders = client_folders()
         pattern = "*" if name is None else glob.escape(name)
         found = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
-        if len(found) != 1:
-            there = ", ".join(item.stem for item in found) or "none that may be reached"
-            where = ", ".join(str(folder) for folder in folders)
-            raise UnavailableError(f"{where}: services: {there}; --name or --socket says which")
+        where = " or ".join(str(folder) for folder in folders)
+        if not found:
+            meant = "no service" if name is None else f"no service {name!r}"
+            raise UnavailableError(f"{meant} has a control socket in {where}; `rtloop serve CONFIG` starts one")
+        if len(found) > 1:
+            there = ", ".join(item.stem for item in found)
+            raise UnavailableError(f"several services have a control socket in {where}: {there}; --name says which")
         path = found[0]
     return Client(path)
 

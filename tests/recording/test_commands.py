@@ -139,6 +139,12 @@ def test_recover(path: Path, tmp_path: Path):
     assert all(index.message_index_offsets for index in summary.chunk_indexes)
 
 
+def test_a_whole_recording_is_not_recovered(path: Path, tmp_path: Path):
+    done = run("recover", path, "--out", tmp_path / "copy.mcap")
+    assert (done.exit_code, "is whole, there was nothing to recover" in " ".join(done.stdout.split())) == (0, True)
+    assert "recovered from" not in done.stdout
+
+
 @pytest.mark.parametrize("to", ["csv", "parquet", "npz"])
 def test_export(to: str, path: Path, tmp_path: Path):
     copy = Path(shutil.copy(path, tmp_path))

@@ -1,0 +1,26 @@
+"""Which service `rtloop ctl` talks to, and what it says where that is none, or not the only one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli import main
+
+CASES = [
+    ([], [], "no service has a control socket in {folder}; `rtloop serve CONFIG` starts one"),
+    (["y"], ["--name", "x"], "no service 'x' has a control socket in {folder}; `rtloop serve CONFIG` starts one"),
+    (["x", "y"], [], "several services have a control socket in {folder}: x, y; --name says which"),
+]
+
+
+@pytest.mark.parametrize(("there", "options", "said"), CASES)
+def test_what_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: list[str], options: list[str], said: str):
+    for name in there:
+        (tmp_path / f"{name}.sock").touch()
+    monkeypatch.setattr("rtloop.service.paths.client_folders", lambda: [tmp_path])
+    done = CliRunner().invoke(main, ["ctl", *options, "status"])
+    assert done.exit_code == 69
+    assert done.stderr == f"rtloop: {said.format(folder=tmp_path)}\n"
