@@ -16,12 +16,13 @@ from drivers.base import Driver
 from drivers.errors import DriverError
 from hil.board import LSB_V
 from rtloop.config import load
+from rtloop.engine.memory import SharedBlock
 from rtloop.engine.ramp import ramp
 from rtloop.prepare import prepare
 from rtloop.service.parking import park
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
-from tests.faults.fault import Fault, Measured
+from tests.faults.fault import Fault, Measured, NotPossible
 from tests.faults.processes import KILLED_SAFE_MS
 from tests.faults.requests import is_refused
 from tests.full_pipe import fill
@@ -30,6 +31,7 @@ DEATHS, SEED = 200, 14
 FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 WITHOUT_RESTART = (("[recording]", "[service]\nrestarts = 0\n[recording]"),)
 PATIENT = (("[recording]", "[service]\nstall_ms = 60000.0\n[recording]"),)
+FORGED_V, STRANGER = 9.9, 65534
 TAPS = (128, 3, 64, 1, 17, 5)
 
 
@@ -48,6 +50,29 @@ def parked_again(bench: Bench) -> Measured:
     bench.start_service()
     bench.await_drive()
     return Measured(took_ms)
+
+
+def forged_block(bench: Bench) -> Measured:
+    """The service and its loop die, and somebody else's block lies where theirs did: it is not believed."""
+    if os.geteuid() != 0:
+        raise NotPossible("only root can give a file to another user")
+    service, loop = bench.pid("service"), bench.pid("rt")
+    bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
+    assert bench.service is not None
+    bench.service.wait()
+    (path,) = (bench.folder / "run").glob("*.block")
+    before_v = bench.seen().last_v
+    with path.open("r+b") as file:
+        SharedBlock(file.fileno())["last_drive_v"][0] = FORGED_V
+    os.chown(path, STRANGER, STRANGER)
+    assert bench.rtloop("park", bench.config).wait(60.0) != 0, "the block of another user was believed"
+    assert bench.seen().last_v == before_v, "an output moved"
+    path.unlink()
+    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    took_ms = bench.await_safe(60_000.0)
+    bench.start_service()
+    bench.await_drive()
+    return Measured(took_ms, note=f"refused while it was there, at {before_v:.2f} V")
 
 
 def parked_by_the_service_and_after_it(bench: Bench) -> Measured:
@@ -173,6 +198,7 @@ def fork(work: Callable[[], object]) -> int:
 
 FAULTS = (
     Fault("parked three times", "the first ramps, the others move nothing", parked_again),
+    Fault("block of another user", "not believed, no output moves; parked without it", forged_block),
     Fault("loop SIGKILL, no restart", "service parks and ends; parking again moves nothing",
           parked_by_the_service_and_after_it, changes=WITHOUT_RESTART),
     Fault("loop SIGKILL, then SIGTERM", "parked; parking again moves nothing", ended_while_it_parks),

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import socket
 import threading
+import time
 from pathlib import Path
 
 from rtloop.errors import RtloopError
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured
+from tests.service.hostile import EXPENSIVE, hostile
+from tests.service.http import exchange
 
 RELOADS, CLIENTS, REQUESTS = 100, 8, 60
 AT_ONCE_MS, BUILT_MS = 60.0, 2000.0
 """From a signal; from a request, whose coefficients must be built and verified first."""
+SILENT, BODIES, SEED, STOPPED_MS = 600, 200, 14, 2000.0
 BAD = (
     b"",
     b"nonsense\r\n\r\n",
@@ -88,6 +94,37 @@ def send_raw(path: Path, data: bytes) -> None:
             return
 
 
+def hostile_clients(bench: Bench) -> Measured:
+    """Connections that say nothing, bodies of every wrong kind, a controller that takes minutes; and then, stop."""
+    with contextlib.ExitStack() as stack:
+        bench.strike()
+        for _ in range(SILENT):
+            client = stack.enter_context(socket.socket(socket.AF_UNIX))
+            client.settimeout(1.0)
+            with contextlib.suppress(OSError):
+                client.connect(str(bench.client.path))
+        expensive = [(path, json.dumps(body).encode()) for path, body in EXPENSIVE.items()]
+        asked = [*expensive, *hostile(SEED, BODIES)]
+
+        def ask(number: int) -> None:
+            for path, body in asked[number::CLIENTS]:
+                with contextlib.suppress(OSError, ValueError, IndexError):
+                    exchange(bench.client.path, "POST", path, body)
+
+        threads = [threading.Thread(target=ask, args=(number,)) for number in range(CLIENTS)]
+        for thread in threads:
+            thread.start()
+        threading.Event().wait(1.0)
+        began_s = time.monotonic()
+        bench.strike(lambda: bench.client.post("/stop"))
+        answered_ms = 1e3 * (time.monotonic() - began_s)
+        bench.await_safe(STOPPED_MS)
+        took_ms = max((bench.seen().moved_ns - bench.struck_ns) / 1e6, 0.0)  # a hostile one may have stopped it before
+        for thread in threads:
+            thread.join()
+    return Measured(took_ms, note=f"/stop answered after {answered_ms:.0f} ms")
+
+
 def second_instance(bench: Bench) -> Measured:
     """Once under the same name, once under another on the same board: both are refused."""
     other = bench.folder / "other.toml"
@@ -143,6 +180,7 @@ def stopped_under_drive(bench: Bench) -> Measured:
 FAULTS = (
     Fault("reload storm", "good ones taken, bad ones refused", reload_storm),
     Fault("API flood and nonsense", "answered or refused; the loop goes on", flood),
+    Fault("silent connections, hostile bodies", "stop is answered, and obeyed", hostile_clients),
     Fault("two instances", "the second is refused, twice", second_instance),
     Fault("operator trips and resets", "refused until the reset", trip_and_reset),
     Fault("SIGTERM under drive", "ramp, whole recording, exit 0", stopped_under_drive),
