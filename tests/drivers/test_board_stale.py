@@ -20,6 +20,7 @@ import rtloop
 from hil import board
 from rtloop.config import parse
 from rtloop.errors import ConfigError
+from rtloop.recording.replay import replay
 from tests.faults.account import account
 from tests.faults.bench import Bench
 from tests.faults.configuration import ROOT, on_a_board
@@ -118,9 +119,7 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     with capsys.disabled():
         print(f"\nboard at 50 kHz: samples {np.median(ages_us):.1f} µs old, the oldest {ages_us.max():.0f} µs; "
               f"its own clock at most {int(memory.words[board.LONGEST_LATE_NS]) / 1e3:.0f} µs late")  # fmt: skip
-    replayed = subprocess.run([*rtloop_command, "replay", summary["recording"], "--json"], env=environment,
-                              capture_output=True, text=True, timeout=250, check=False)  # fmt: skip
-    assert json.loads(replayed.stdout)["identical"] is True
+    assert replay(rtloop.load(summary["recording"])).identical
 
 
 def memory_of(path: Path) -> board.BoardMemory:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
+from rtloop.recording.replay import replay
 from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -90,7 +91,5 @@ def test_a_plain_python_driver_closes_the_loop_at_10_khz(tmp_path: Path) -> None
     recording = rtloop.load(summary["recording"])
     settled = recording["x_position_um"][999::1000]
     assert np.allclose(settled, np.resize([10.0, -10.0], settled.size), atol=0.01)
-    again = [sys.executable, "-m", "rtloop", "replay", summary["recording"], "--json"]
-    verdict = json.loads(subprocess.run(again, env=environment, capture_output=True, text=True, check=False).stdout)
-    assert verdict["identical"] is True
-    assert verdict["ticks"] == 20_000
+    verdict = replay(recording)
+    assert (verdict.identical, verdict.ticks) == (True, 20_000)
