@@ -82,8 +82,8 @@ def test_a_drive_that_stands_still_shows_nothing():
 
 @pytest.fixture
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The command on a board of its own, with at most two rates; its result and the board."""
-    monkeypatch.setattr("rtloop.selftest.RUNGS", 2)
+    """The command on a board of its own, with one rate; its result and the board."""
+    monkeypatch.setattr("rtloop.selftest.RUNGS", 1)
 
     def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
         device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import rtloop
+from rtloop.recording.replay import replay
+from tests.recording.real_loop import record, rows_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "deploy" / "paper.toml"
@@ -78,17 +80,18 @@ def test_a_paced_run_accounts_for_every_tick(tmp_path: Path) -> None:
 
 
 def test_two_unpaced_runs_are_equal_in_bytes_and_another_seed_is_not(tmp_path: Path) -> None:
-    other = tmp_path / "other.toml"
-    other.write_text(PAPER.read_text().replace("seed = 1 ", "seed = 2 "))
     records = []
-    for config in (PAPER, PAPER, other):
-        code, summary, _ = run(config, "--duration", "1", "--unpaced", "--out", tmp_path)
+    for _ in range(2):
+        code, summary, _ = run(PAPER, "--duration", "1", "--unpaced", "--out", tmp_path)
         assert code == 0
         assert summary["lateness_us"] is None
-        recording = rtloop.load(summary["recording"])
-        records.append(np.concatenate([block for block in recording.blocks()]).tobytes())
-    assert records[0] == records[1]
-    assert records[0] != records[2]
+        records.append(rows_of([Path(summary["recording"])]).tobytes())
+    text = PAPER.read_text()
+    for seed in (1, 2):
+        files = record(tmp_path / f"{seed}.mcap", text.replace("seed = 1 ", f"seed = {seed} "), 10_000)
+        records.append(rows_of(files).tobytes())
+    assert records[0] == records[1] == records[2]
+    assert records[0] != records[3]
 
 
 def test_a_name_may_hold_what_patterns_and_markup_are_made_of(tmp_path: Path) -> None:
@@ -146,10 +149,8 @@ def test_a_killed_recorder_is_replaced_and_nothing_is_lost(tmp_path: Path) -> No
     assert (summary["complete"], summary["ticks_lost"]) == (True, 0)
     recording = rtloop.load(summary["recordings"])
     assert np.array_equal(recording["tick"], np.arange(60_000))
-    again = [sys.executable, "-m", "rtloop", "replay", *summary["recordings"], "--json"]
-    verdict = json.loads(subprocess.run(again, env=ENVIRONMENT, capture_output=True, text=True, check=False).stdout)
-    assert verdict["identical"] is True
-    assert verdict["ticks"] == 60_000
+    verdict = replay(recording)
+    assert (verdict.identical, verdict.ticks) == (True, 60_000)
 
 
 def test_a_loop_without_its_supervisor_parks_and_ends(tmp_path: Path) -> None:
