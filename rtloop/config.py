@@ -222,7 +222,8 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
     path = [prefix] if prefix else []
     node = raw
     for part in detail["loc"]:
-        known = (isinstance(node, dict) and part in node) or (isinstance(node, list) and isinstance(part, int))
+        listed = isinstance(node, list) and isinstance(part, int) and part < len(node)
+        known = listed or (isinstance(node, dict) and part in node)
         if known and isinstance(node, dict | list):
             node = node[part]  # type: ignore[index]
             name = node.get("name") if isinstance(part, int) and isinstance(node, dict) else None

@@ -143,6 +143,14 @@ def test_axes_and_channels_that_do_not_belong_together():
     assert faults(more=again) == ["axis.x: named twice"]
 
 
+@pytest.mark.parametrize(
+    ("poles", "where"), [("[[]]", "0.0"), ("[[[]]]", "0.0"), ("[[-1.0]]", "0.1"), ("[[0.0, 1.0], []]", "1.0")]
+)
+def test_a_root_that_lacks_a_part(poles: str, where: str):
+    found = faults((CONTROLLER, f'[axis.controller]\nform = "zpk"\ngain = 60.0\npoles = {poles}\n\n'))
+    assert any(fault.startswith(f"axis.x.controller.poles.{where}: ") for fault in found), found
+
+
 def test_an_entry_of_the_schedule_stands_there_once():
     (found,) = faults(more=2 * entry('at_tick = 7\nmode = "off"'))
     assert found == "schedule, at_tick 7: the same entry twice; once is enough"
