@@ -92,7 +92,12 @@ def guarded(function: Callable[..., Any]) -> Any:
 
 
 def seldom(function: Callable[..., Any]) -> Any:
-    """A kernel for what most ticks do not do: called, not to crowd its callers, and with indices checked."""
+    """A kernel for what most ticks do not do: called, so that it does not crowd its callers."""
+    return numba.njit(cache=True, error_model="numpy")(function)
+
+
+def seldom_guarded(function: Callable[..., Any]) -> Any:
+    """As `seldom`, with checked indices; not for what the law calls, which would be slower for an error to pass on."""
     return numba.njit(cache=True, error_model="numpy", boundscheck=True)(function)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.atomics import exchanged, load_acquire, store_release
-from hil.compiled import guarded, jit, seldom
+from hil.compiled import guarded, jit, seldom, seldom_guarded
 from rtloop.engine.context import (
     axes_of,
     coefficients_of,
@@ -86,7 +86,7 @@ def apply_commands(loop):
         _apply_queue(loop)
 
 
-@seldom
+@seldom_guarded
 def _apply_schedule(loop):
     schedule = messages(loop.schedule, loop.schedule_count)
     while loop.scheduled < loop.schedule_count and schedule[loop.scheduled].tick <= loop.tick:
@@ -94,7 +94,7 @@ def _apply_schedule(loop):
         loop.scheduled += 1
 
 
-@seldom
+@seldom_guarded
 def _apply_queue(loop):
     words, queue = words_of(loop), messages(loop.commands, loop.command_count)
     marks = unsigned(loop.commands_marks, loop.command_count)
