@@ -10,10 +10,13 @@ import numpy as np
 from hil.options import RigOptions
 from rtloop.config import ChannelOptions, Configuration
 from rtloop.design.plays import loading_curve
+from rtloop.engine.messages import ALL_AXES, Kind
 from rtloop.identifying import actuator_model
-from rtloop.law.options import AxisOptions, ReferenceOptions
+from rtloop.law.options import AxisOptions
+from rtloop.law.reference import Generator
 from rtloop.prepare import AxisCheck, Prepared
-from rtloop.references import TableOfSamples, extent, generator_values
+from rtloop.references import extent
+from rtloop.signals import Mode
 
 SAME_SCALE = 0.01
 """Scales that differ by more than this part are different."""
@@ -48,26 +51,23 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
     """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
-    limits, mode = axis.limits, prepared.configuration.loop.mode
-    asked: list[tuple[str, str, ReferenceOptions]] = [("reference", mode, axis.reference)]
-    for entry in sorted(prepared.configuration.schedule, key=lambda entry: entry.at_tick):
-        mode = entry.mode or mode
-        if entry.reference is not None and entry.axis in (None, axis.name):
-            asked.append((f"reference from tick {entry.at_tick} on", mode, entry.reference))
-    for where, mode, reference in asked:
-        lowest, highest = _extent(prepared, reference)
-        if mode == "raw" and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
+    limits, plan = axis.limits, prepared.plan
+    number, mode = plan.axes.index(axis.name), plan.mode
+    generator = plan.generators[number]
+    asked = [("reference", mode, [float(generator["kind"]), *generator["parameters"].tolist()])]
+    for command in plan.schedule:
+        if command["kind"] == Kind.SET_MODE:
+            mode = Mode(int(command["values"][0]))
+        elif command["kind"] == Kind.SET_REFERENCE and command["axis"] in (ALL_AXES, number):
+            asked.append((f"reference from tick {command['tick']} on", mode, command["values"].tolist()))
+    for where, mode, values in asked:
+        first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
+        lowest, highest = extent(values, plan.table[first : first + count])
+        if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{where}: {lowest:g} V … {highest:g} V, beyond the drive's limits, {allowed}"
-        if mode in ("feedforward", "closed_loop") and max(-lowest, highest) > limits.command_um:
+        if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP) and max(-lowest, highest) > limits.command_um:
             yield f"{where}: reaches {max(-lowest, highest):g} µm, beyond limits.command_um = {limits.command_um:g}"
-
-
-def _extent(prepared: Prepared, reference: ReferenceOptions) -> tuple[float, float]:
-    table, configuration = TableOfSamples(), prepared.configuration
-    rate_hz, folder = configuration.loop.rate_hz, configuration.folder
-    values = generator_values(reference, rate_hz, prepared.facts.inputs, folder, table)
-    return extent(values, table.samples)
 
 
 def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
