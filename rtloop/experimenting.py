@@ -16,12 +16,14 @@ import click
 from drivers.errors import DriverError
 from hil.options import RigOptions
 from rtloop.config import Configuration, load
+from rtloop.design.specification import SpecificationOptions
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
 from rtloop.experiments.page import page
-from rtloop.experiments.procedure import Experiment, Run, Setting
+from rtloop.experiments.procedure import Experiment, Run
 from rtloop.experiments.registry import chosen, parameters
 from rtloop.experiments.report import Report, report, take
+from rtloop.experiments.setting import Setting
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import Prepared, prepare
 from rtloop.progress import StatusLine
@@ -30,6 +32,7 @@ from rtloop.report_experiments import Progress, print_report
 from rtloop.running import recording_path, recover_leftovers
 from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.specifications import load_specification
 
 
 class Planned(NamedTuple):
@@ -58,7 +61,7 @@ def run_experiments(
         click.echo(f"warning: {warning}", err=True)
     about = _axis(base, axis)
     skipped = _unsuitable(experiments, prepared, about)
-    setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real)
+    setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real, asked=_asked(base, about))
     planned = [
         one
         for experiment in experiments
@@ -119,13 +122,20 @@ def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: Axi
 
 
 def _planned(experiment: Experiment, options: Any, base: Configuration, setting: Setting) -> list[Planned]:
-    runs = experiment.runs(options, setting)
     options = experiment.fitted(options, setting)
-    values = options.model_dump(mode="json")
+    runs = experiment.runs(options, setting)
+    values, asked = options.model_dump(mode="json"), setting.asked.model_dump(mode="json", exclude_defaults=True)
     return [
-        Planned(experiment, run, derived(base, setting.axis.name, experiment.name, values, run, len(runs)))
+        Planned(experiment, run, derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked))
         for run in runs
     ]
+
+
+def _asked(base: Configuration, axis: AxisOptions) -> SpecificationOptions:
+    """What the specification that the axis names asks of its loop; nothing where it names none."""
+    if axis.specification is None:
+        return SpecificationOptions()
+    return load_specification(base.folder / axis.specification).design.specification
 
 
 def _record_all(

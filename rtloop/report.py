@@ -170,7 +170,7 @@ def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[st
     limits = [getattr(asked, key) for key in STEP_QUANTITIES]
     yield f"  {name} asks", ["–" if limit is None else f"≤ {limit:g}" for limit in limits]
     if asked.claims:
-        yield f"  {name} claims", [escape(asked.claims.get(key, "–")) for key in STEP_QUANTITIES]
+        yield f"  {name} claims", [escape(asked.claimed(key)) or "–" for key in STEP_QUANTITIES]
 
 
 def print_drivers() -> None:

@@ -8,7 +8,7 @@ from typing import IO, Any
 
 from rich.markup import escape
 
-from rtloop.experiments.page import mark, number
+from rtloop.experiments.page import HEADINGS, compared, compared_cell, number
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.progress import StatusLine
 from rtloop.terminal import console, table
@@ -47,11 +47,12 @@ def print_list() -> None:
     """Every experiment with its parameters."""
     shown = console()
     for experiment in EXPERIMENTS.values():
-        shown.print(f"[bold]{experiment.name}[/]  {experiment.title} ({experiment.figure})")
+        shown.print(f"[bold]{experiment.name}[/]  {experiment.title}")
         shown.print(f"  {experiment.about}")
         for name, field in experiment.options.model_fields.items():
             value = list(field.default) if isinstance(field.default, tuple) else field.default
-            shown.print(f"  --set {experiment.name}.{name}={value}", style="dim", markup=False)
+            text = "…  (follows the axis)" if value is None else value
+            shown.print(f"  --set {experiment.name}.{name}={text}", style="dim", markup=False)
 
 
 def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
@@ -59,17 +60,19 @@ def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None
     shown = console()
     shown.width = max(shown.width, WIDTH)
     for section in content["experiments"]:
-        shown.print(f"[bold]{section['title']}[/] ({section['figure']})")
+        shown.print(f"[bold]{section['title']}[/]")
         if section["problem"]:
             shown.print(f"  [red]{escape(section['problem'])}[/]")
             continue
-        rows = table("", "the paper says", "its model gives", "this run gave", "verdict")
-        rows.columns[4].justify = "left"
+        keys = compared(section["rows"])
+        rows = table("", *(HEADINGS[key] for key in keys), "this run gave", "verdict")
+        rows.columns[-1].justify = "left"
         for row in section["rows"]:
-            model, run = ("–" if row[key] is None else number(row[key]) for key in ("model", "run"))
             unit = "" if row["unit"] == "1" else f" {row['unit']}"
-            verdict = f"[{COLOURS[mark(row)]}]{escape(row['verdict'])}[/]"
-            rows.add_row(f"  {row['quantity']}", escape(row["paper"]), model, run + unit, verdict)
+            run = "–" if row["run"] is None else number(row["run"]) + unit
+            beside = (escape(compared_cell(row, key)) for key in keys)
+            verdict = f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]"
+            rows.add_row(f"  {row['quantity']}", *beside, run, verdict)
         shown.print(rows)
     for name, reason in skipped.items():
         shown.print(f"[bold]{name}[/] skipped: {escape(reason)}")

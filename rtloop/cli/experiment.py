@@ -1,4 +1,4 @@
-"""Commands that run the paper's experiments, and report what came of them."""
+"""Commands that run experiments, and report what came of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OUT = click.option("--out", type=OUTPUT, help="Folder for recordings and report 
 
 @click.group()
 def experiment() -> None:
-    """The paper's experiments on any driver, and one report of them."""
+    """Characterise the stage, judge the loop: experiments on any driver, and one report of them."""
 
 
 @experiment.command(name="list")
@@ -58,7 +58,7 @@ def run(
     return run_experiments(names, config, settings, axis, paced, out, as_json)
 
 
-@experiment.command()
+@experiment.command(name="all")
 @CONFIG
 @SET
 @AXIS
@@ -66,10 +66,10 @@ def run(
 @OUT
 @JSON
 @fails_clearly
-def paper(
+def run_all(
     config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None, as_json: bool
 ) -> int:
-    """Run all experiments on the rig or the hardware of CONFIG: every figure of the paper with its verdicts."""
+    """Run every experiment that the rig or the hardware of CONFIG allows."""
     from rtloop.experimenting import run_experiments
     from rtloop.experiments.registry import EXPERIMENTS
 
@@ -88,4 +88,5 @@ def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     return report_recordings(runs, out, as_json)
 
 
+experiment.add_command(run_all, "paper")
 COMMANDS = (experiment,)

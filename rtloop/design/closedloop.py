@@ -108,13 +108,23 @@ def discrete_loop(controller: DiscreteController, plant: Transfer, delay_ticks: 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """
     _check(plant)
-    if delay_ticks < 0:
-        raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
     period_s = controller.period_s
-    sampled = held(plant, period_s)
+    sampled = sampled_plant(plant, period_s, delay_ticks)
     images = np.concatenate([controller.zeros, controller.poles])
     roots = np.concatenate([_rates(images, period_s), plant.poles])
-    return Loop(controller.system, _delayed(sampled, delay_ticks), controller.dc_gain * plant.dc_gain, roots, period_s)
+    return Loop(controller.system, sampled, controller.dc_gain * plant.dc_gain, roots, period_s)
+
+
+def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
+    """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
+    if delay_ticks < 0:
+        raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
+    found = held(plant, period_s)
+    for _ in range(delay_ticks):
+        n = found.b.size
+        a = np.block([[found.a, found.b[:, None]], [np.zeros((1, n + 1))]])
+        found = System(a, np.eye(n + 1)[-1], np.append(found.c, 0.0), 0.0)
+    return found
 
 
 def _rates(images: Complex, period_s: float) -> Complex:
@@ -134,12 +144,3 @@ def _check(plant: Transfer) -> None:
             f"plant: {plant.zeros.size} zeros and {plant.order} poles give it direct feedthrough; "
             "a plant with fewer zeros than poles is allowed"
         )
-
-
-def _delayed(plant: System, ticks: int) -> System:
-    """The plant behind a chain of `ticks` samples."""
-    for _ in range(ticks):
-        n = plant.b.size
-        a = np.block([[plant.a, plant.b[:, None]], [np.zeros((1, n + 1))]])
-        plant = System(a, np.eye(n + 1)[-1], np.append(plant.c, 0.0), 0.0)
-    return plant

@@ -7,9 +7,9 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from hil.options import Options
 from rtloop.design.transfer import Transfer
@@ -33,6 +33,29 @@ class CommandOptions(Options):
     command_um: float = Field(gt=0)
 
 
+def _claim(value: object) -> object:
+    """A claim may be its words alone."""
+    return {"says": value} if isinstance(value, str) else value
+
+
+class ClaimOptions(Options):
+    """What a source says of a quantity: its words, and the values that bear them out."""
+
+    says: str
+    at_least: float | None = None
+    at_most: float | None = None
+
+    @property
+    def is_number(self) -> bool:
+        """A value can contradict it."""
+        return self.at_least is not None or self.at_most is not None
+
+    def borne_out(self, value: float) -> bool:
+        """Whether `value` is as claimed."""
+        above = self.at_least is None or value >= self.at_least
+        return above and (self.at_most is None or value <= self.at_most)
+
+
 class SpecificationOptions(Options):
     """Everything may be left out; what is there is judged."""
 
@@ -45,15 +68,20 @@ class SpecificationOptions(Options):
     """|S| stays below 1/√2 up to here."""
     disturbance: DisturbanceOptions | None = None
     command: CommandOptions | None = None
-    claims: dict[str, str] = Field(default_factory=dict)
-    """What the source of the controller says of it, by the name of a quantity: printed beside what was computed."""
+    claims: dict[str, Annotated[ClaimOptions, BeforeValidator(_claim)]] = Field(default_factory=dict)
+    """What a source says of actuator and controller, by the name of a quantity: printed beside what was found."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        unknown = sorted(set(self.claims) - set(QUANTITIES))
+        unknown = sorted(set(self.claims) - set(QUANTITIES) - set(MEASURED))
         if unknown:
-            raise ValueError(f"claims: {', '.join(unknown)} is not known; allowed are {', '.join(QUANTITIES)}")
+            allowed = ", ".join((*QUANTITIES, *MEASURED))
+            raise ValueError(f"claims: {', '.join(unknown)} is not known; allowed are {allowed}")
         return self
+
+    def claimed(self, name: str) -> str:
+        """The words of a claim; none where nothing is claimed."""
+        return self.claims[name].says if name in self.claims else ""
 
 
 QUANTITIES = {
@@ -76,6 +104,26 @@ QUANTITIES = {
     "gamma": ("‖F_l(P, C)‖∞", ""),
 }
 """Label and unit of everything that is computed of a loop."""
+
+MEASURED = (
+    "hysteresis_percent",
+    "hysteresis_um",
+    "range_um",
+    "hysteresis_fit",
+    "open_overshoot_percent",
+    "resonance_hz",
+    "open_fit",
+    "residual_percent",
+    "residual_um",
+    "slope",
+    "omega_um",
+    "tracking",
+    "open_low_db",
+    "closed_low_db",
+    "closed_high_db",
+    "disturbance_left_nm",
+)
+"""What experiments find besides; docs/experiments.md says of each what it is."""
 
 
 class SensorOptions(Options):

@@ -107,7 +107,7 @@ def verify(
         columns[0]["gamma"] = gamma
     required = limits(asked)
     rows = tuple(
-        Row(name, required.get(name), columns[0].get(name), columns[1].get(name), asked.claims.get(name, ""))
+        Row(name, required.get(name), columns[0].get(name), columns[1].get(name), asked.claimed(name))
         for name in QUANTITIES
         if any(name in column for column in columns)
     )

@@ -1,4 +1,4 @@
-"""Figs 3 and 4: the hysteresis under slow sines, and the model of the configuration driven as the actuator was."""
+"""The hysteresis under slow sines, and the model of the configuration driven as the actuator was."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from pydantic import Field
 from hil.options import Options
 from rtloop.design.loop_shape import LoopShape, loop_shape
 from rtloop.design.plays import model_output
-from rtloop.experiments import paper
-from rtloop.experiments.procedure import Experiment, Run, Setting, Timeline, hold, sine
+from rtloop.experiments.procedure import Experiment, Run, Timeline, hold, sine
+from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import thinned
-from rtloop.experiments.verdict import Analysis, Row, Table
+from rtloop.experiments.verdict import Analysis, Table
 
 REST_S = 0.1
+NEAR_PERCENT, NEAR_PART, FIT_PERCENT = 0.2, 0.005, 0.5
+"""How near the model a run is expected to be: of h/H, of h and H as a part of H, of the largest difference."""
 
 
 class CharacteriseOptions(Options):
     """Amplitudes are parts of the drive limit."""
 
     frequency_hz: float = Field(default=0.1, gt=0)
-    """The paper's, slow enough for no lag and fast enough for no creep."""
+    """Slow enough for no lag, fast enough for no creep."""
     cycles: float = Field(default=2.0, ge=1.5)
     """Of each loop."""
 
@@ -65,21 +67,20 @@ def analyse(recordings: Sequence[Taken], _: CharacteriseOptions) -> Analysis:
     error -= error.mean()
     curves["error"] = thinned(np.arange(drive.size) / taken.rate_hz, error)
     major, modelled = shapes["major"]
-    fit_percent = 100 * float(np.abs(error).max()) / major.width
+    half, minor = shapes["half"], shapes["minor"]
+    fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, NEAR_PART * modelled.width
     rows = [
-        Row("h/H, whole range", "%", major.percent, paper.SAID_LOOP, paper.LOOP_PERCENT, 0.2),
-        Row("h, whole range", "µm", major.height, paper.SAID_HEIGHT, paper.LOOP_HEIGHT_UM * taken.static_gain, 0.2),
-        Row("H, whole range", "µm", major.width, paper.SAID_RANGE, paper.LOOP_RANGE_UM * taken.static_gain, 0.5),
-        Row("h/H, half the range", "%", shapes["half"][0].percent, model=paper.LOOP_PERCENT_HALF, tolerance=0.2),
-        Row("h/H, minor loop", "%", shapes["minor"][0].percent, model=paper.LOOP_PERCENT_MINOR, tolerance=0.2),
-        Row("h/H of the model for the recorded drive", "%", modelled.percent, model=paper.LOOP_PERCENT, tolerance=0.02),
-        Row("largest difference to the model", "% of H", fit_percent, paper.SAID_FIT, 0.0, 0.5),
+        taken.row("hysteresis_percent", "h/H, whole range", "%", major.percent, modelled.percent, NEAR_PERCENT),
+        taken.row("hysteresis_um", "h, whole range", "µm", major.height, modelled.height, near_um),
+        taken.row("range_um", "H, whole range", "µm", major.width, modelled.width, near_um),
+        taken.row("", "h/H, half the range", "%", half[0].percent, half[1].percent, NEAR_PERCENT),
+        taken.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, NEAR_PERCENT),
+        taken.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_PERCENT),
     ]
     notes = ["The model is that of [axis.feedforward] times D(0), driven with the recorded voltage."]
     if taken.truth == "residual":
-        notes.append("The simulated actuator is not the model of eq (4): its weights p0 and p6 differ, so that the "
-                     "3.75 % of Fig 7 remain after compensation. Its own loop has h/H = 17.27 %, at half the range "
-                     "12.15 %, which no compensator was told.")  # fmt: skip
+        notes.append("The simulated actuator (truth = \"residual\") is on purpose not the one that the model is of, "
+                     "so that some hysteresis remains after compensation: no compensator was told.")  # fmt: skip
     return Analysis(rows, curves, (_table(shapes),), notes)
 
 
@@ -96,12 +97,12 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.other)):
         drive, position, _ = curves[label]
         loops.plot(drive, position, color=color, label={"half": "half the range"}.get(label, f"{label} loop"))
-    ink.label(loops, "drive u / V", "position x / µm", "Fig 3: hysteresis at 0.1 Hz")
+    ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines")
     ink.legend(loops)
     drive, position, model = curves["major"]
     compared.plot(drive, position, color=ink.measured, linewidth=3.0, alpha=0.55, label="measured")
     compared.plot(drive, model, color=ink.model, linewidth=1.0, label="model, same drive")
-    ink.label(compared, "drive u / V", "position x / µm", "Fig 4: measured and model")
+    ink.label(compared, "drive u / V", "position x / µm", "measured and model")
     ink.legend(compared)
     error.plot(*curves["error"], color=ink.error, linewidth=0.9)
     error.margins(x=0)
@@ -111,8 +112,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
 EXPERIMENT = Experiment(
     "characterise",
     "Hysteresis under slow sines, and its model",
-    "Figs 3 and 4",
-    "The actuator is driven without any controller at 0.1 Hz: half the drive, all of it, a minor loop.",
+    "The actuator is driven slowly, without any controller: half the drive, all of it, a minor loop.",
     CharacteriseOptions,
     runs,
     analyse,

@@ -19,9 +19,13 @@ MARK = "rtloop experiment "
 
 
 def derived(
-    base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, runs: int
-) -> Configuration:
-    """`base`, doing what `run`, one of `runs`, asks of `axis`, every other axis at rest. Raises ConfigError."""
+    base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, runs: int,
+    asked: dict[str, Any],
+) -> Configuration:  # fmt: skip
+    """`base`, doing what `run`, one of `runs`, asks of `axis`, every other axis at rest; `asked` is its specification.
+
+    Raises ConfigError.
+    """
     raw = tomllib.loads(base.text)
     first, timeline = run.timeline.segments[0], run.timeline
     raw["loop"]["mode"] = first.mode
@@ -38,6 +42,7 @@ def derived(
         "may_trip": run.may_trip,
         "ticks": timeline.ticks,
         "parameters": parameters,
+        "asked": asked,
         "segments": timeline.segments,
     }
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))

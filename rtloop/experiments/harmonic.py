@@ -1,4 +1,4 @@
-"""Fig 12: stepped sines from 1 kHz down to 0.01 Hz, for the drive alone, with feedforward, in closed loop.
+"""Stepped sines from high frequencies down to 0.01 Hz, for the drive alone, with feedforward, in closed loop.
 
 From high to low, whole cycles each: a frequency starts on the branch of the loop where the one before has ended, so
 that the slow ones need no cycle to settle. The amplitude is part of the answer, since a small one does not leave the
@@ -17,12 +17,15 @@ from pydantic import Field
 from hil.linear import Real
 from hil.options import Numbers, Options
 from rtloop.config import ModeName
-from rtloop.experiments import paper
-from rtloop.experiments.lockin import response
-from rtloop.experiments.procedure import CLOSED_PEAK, Experiment, Run, Setting, hold, sine
+from rtloop.design.plays import model_output
+from rtloop.experiments.lockin import response, tone
+from rtloop.experiments.procedure import Experiment, Run, hold, sine
+from rtloop.experiments.promised import REFERENCE_HZ, Promised
+from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
-from rtloop.experiments.verdict import Analysis, Row, Said, Table
+from rtloop.experiments.verdict import Analysis, Table
+from rtloop.law.hysteresis import PlayModel
 
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}
@@ -30,24 +33,37 @@ NAMES = {"raw": "drive alone", "feedforward": "feedforward", "closed_loop": "fee
 LEAST_S, REST_S = 0.25, 0.1
 LEAST_CYCLE = 0.1
 """A frequency of which less would pass in `settle_s` is measured from its first cycle on."""
-LOW_HZ, BEYOND_HZ = 1.0, 300.0
+LOW_HZ, HIGH_PART = 1.0, 0.5
 LEAST_COHERENCE = 0.5
-NEAR_HZ = (530.0, 660.0)
+TICKS_OF_A_CYCLE = 2000
+NEAR, NEAR_PEAK, NEAR_LOW_DB = 0.04, 0.004, 0.2
+"""How near the model a run is expected to be: parts of bandwidth and resonance, dB of what the hysteresis takes off."""
 AMPLITUDE_UM = 2.0
-"""More than that would swing in closed loop, at some hundred Hz, as far as the oscillation interlock of
-deploy/paper.toml allows; it cannot know that the ringing is meant."""
-WIDE = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0, 170.0, 200.0, 250.0,
-        300.0, 350.0, 400.0, 450.0, 500.0, 540.0, 560.0, 575.0, 650.0, 700.0, 800.0, 900.0, 1000.0)  # fmt: skip
-NEAR_RESONANCE = (585.0, 590.0, 593.0, 595.0, 596.0, 598.0, 601.0, 606.0, 612.0, 620.0)
+"""Smaller where it would swing as far as the oscillation interlock allows, which cannot know that it is meant."""
+SLOW_HZ = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 140.0, 170.0, 200.0)
+FAST_HZ = (250.0, 300.0, 350.0, 400.0, 450.0, 500.0, 540.0, 560.0, 575.0, 585.0, 590.0, 593.0, 595.0, 596.0, 598.0,
+           601.0, 606.0, 612.0, 620.0, 650.0, 700.0, 800.0, 900.0, 1000.0)  # fmt: skip
+"""For a resonance at REFERENCE_HZ; moved with it."""
+FASTEST_PART = 0.4
+"""Of the rate."""
+
+
+def frequencies(setting: Setting) -> tuple[float, ...]:
+    """From 0.01 Hz to beyond the resonance of the axis's model, dense about it."""
+    resonance_hz = setting.model and setting.model.resonance_hz
+    scale = (resonance_hz or REFERENCE_HZ) / REFERENCE_HZ
+    moved = FAST_HZ if abs(scale - 1) < 0.001 else [float(f"{scale * hz:.4g}") for hz in FAST_HZ]
+    return tuple(sorted({hz for hz in (*SLOW_HZ, *moved) if hz <= FASTEST_PART * setting.rate_hz}))
 
 
 class HarmonicOptions(Options):
     """The excitation; with `drive alone` it is the drive that would move so far at the model's mean gain."""
 
     amplitude_um: float = Field(default=AMPLITUDE_UM, gt=0)
-    frequencies_hz: Numbers = Field(default=tuple(sorted((*WIDE, *NEAR_RESONANCE))), min_length=1)
+    frequencies_hz: Numbers | None = Field(default=None, min_length=1)
+    """By default up to beyond the resonance of the axis's model, and dense about it."""
     settle_s: float = Field(default=0.3, ge=0)
-    """Before each measurement; the resonance dies away by 27 1/s."""
+    """Before each measurement."""
 
 
 def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
@@ -56,7 +72,7 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
     for mode in MODES:
         timeline.add("rest", mode, hold(0.0), REST_S)
         amplitude = options.amplitude_um / (setting.um_per_v if mode == "raw" else 1.0)
-        for hz in sorted(options.frequencies_hz, reverse=True):
+        for hz in sorted(options.frequencies_hz or frequencies(setting), reverse=True):
             measured_s = math.ceil(max(LEAST_S * hz, 1.0)) / hz
             settle_s = math.ceil(options.settle_s * hz - LEAST_CYCLE) / hz
             timeline.add(
@@ -71,22 +87,24 @@ def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
     (taken,) = recordings
     found = {mode: _sweep(taken, mode) for mode in MODES}
     raw, feedforward, closed = (found[mode] for mode in MODES)
-    as_modelled = options.amplitude_um == AMPLITUDE_UM
-    high = closed[closed[:, 0] >= BEYOND_HZ]
-    peak = raw[raw[:, 1].argmax()] if raw[-1, 0] > BEYOND_HZ else np.full(4, np.nan)
+    model = Promised(taken.model, raw[:, 0], taken.rate_hz)
+    peak = raw[raw[:, 1].argmax()] if raw[-1, 0] > model.resonance_hz else np.full(4, np.nan)
+    beyond_hz = HIGH_PART * model.resonance_hz
+    high = closed[closed[:, 0] >= beyond_hz]
     low = [_low(one) for one in (raw, feedforward)]
+    shifts_db = _hysteresis_db(taken, options.amplitude_um)
     rows = [
-        Row("frequency of the peak without control", "Hz", peak[0], paper.SAID_RESONANCE, paper.PEAK_HZ, 2.0),
-        Row("height of the peak over low frequencies", "dB", peak[1] - low[0], model=paper.PEAK_DB, tolerance=0.5),
-        Row("drive alone at low frequencies", "dB", low[0], Said("decays, from hysteresis", (-np.inf, -0.5)),
-            paper.RAW_DB if as_modelled else None, 0.2),
-        Row("feedforward at low frequencies", "dB", low[1], model=paper.FEEDFORWARD_DB if as_modelled else None,
-            tolerance=0.2),
-        Row("closed loop at the lowest frequency", "dB", float(closed[0, 1]), Said("cancelled out", (-0.1, 0.1)),
-            paper.CLOSED_DB, 0.02),
-        Row("closed loop, −3 dB", "Hz", bandwidth(closed), model=paper.BANDWIDTH_HZ, tolerance=5.0),
-        Row("closed loop, largest beyond 300 Hz", "dB", float(high[:, 1].max()) if len(high) else np.nan,
-            paper.SAID_REMOVED, paper.HIGH_PEAK_DB, 0.5),
+        taken.row("resonance_hz", "frequency of the peak without control", "Hz", peak[0], model.peak_hz,
+                  max(NEAR_PEAK * (model.peak_hz or 0.0), _spacing(raw[:, 0], peak[0]))),
+        taken.row("", "height of the peak over low frequencies", "dB", peak[1] - low[0], model.peak_db, 0.5),
+        taken.row("open_low_db", "drive alone at low frequencies", "dB", low[0], shifts_db[0], NEAR_LOW_DB),
+        taken.row("", "feedforward at low frequencies", "dB", low[1], shifts_db[1], NEAR_LOW_DB),
+        taken.row("closed_low_db", "closed loop at the lowest frequency", "dB", float(closed[0, 1]),
+                  model.closed_low_db, 0.02),
+        taken.row("", "closed loop, −3 dB", "Hz", bandwidth(closed), model.bandwidth_hz,
+                  NEAR * (model.bandwidth_hz or 0.0)),
+        taken.row("closed_high_db", f"closed loop, largest beyond {beyond_hz:.3g} Hz", "dB",
+                  float(high[:, 1].max()) if len(high) else np.nan, model.closed_db_beyond(beyond_hz), 0.5),
     ]  # fmt: skip
     table = [[f"{hz:g}", *(f"{value:.{digits}f}" for mode in MODES for value, digits in
               zip(found[mode][number, 1:], (3, 2, 4), strict=True))]
@@ -96,19 +114,41 @@ def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
     notes = [
         f"Amplitude {options.amplitude_um:g} µm. Drive alone: position per volt, relative to {_gain(taken):.4g} "
         "µm/V, the model's mean gain over the whole drive. A small amplitude does not leave the dead band of the "
-        "hysteresis: what drive and feedforward reach at low frequencies depends on it (by eq (4) −7.7 dB and −1.9 dB "
-        "at 1 µm, −1.1 dB and 0.0 dB at 20 µm).",
-        "In closed loop, beyond some hundred Hz, the command is smaller than the dead band, which takes more off than "
+        "hysteresis: what drive and feedforward reach at low frequencies depends on it. The model's figures for both "
+        "are those of [axis.feedforward] at this amplitude.",
+        "In closed loop, at high frequencies, the command is smaller than the dead band, which takes more off than "
         "the linear model does.",
         "γ² is the part of the power of input and output that is at the excitation's frequency. Harmonics of the "
-        "hysteresis lower it, most where one of them meets the resonance (120 Hz and 200 Hz), and so does noise: in "
-        "closed loop the controller's notch leaves next to no command at 595 Hz. Points below 0.5 are not drawn.",
-        "The models are D(s) of eq (5) held over each tick, and T(s) of eqs (5) and (20); D is shifted by the "
-        "low-frequency magnitude of eq (4) at this amplitude where that is 2 µm.",
+        "hysteresis lower it, most where one of them meets the resonance, and so does noise: where the controller has "
+        f"a notch it leaves next to no command. Points below {LEAST_COHERENCE:g} are not drawn.",
+        "The models are [axis.model] held over each tick, shifted by the hysteresis at this amplitude, and the loop of "
+        "[axis.controller] and [axis.model] as it runs.",
     ]
-    shifts_db = (paper.RAW_DB, paper.FEEDFORWARD_DB) if as_modelled else ()
-    curves = {"found": found, "shifts_db": shifts_db, "rate_hz": taken.rate_hz}
+    curves = {"found": found, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
+              "claimed": taken.asked.claims.get("resonance_hz")}  # fmt: skip
     return Analysis(rows, curves, (Table("Every frequency", headings, table),), notes)
+
+
+def _hysteresis_db(taken: Taken, amplitude_um: float) -> tuple[float | None, float | None]:
+    feedforward = taken.axis_options.feedforward
+    if taken.model is None or feedforward.dead_band != "none":
+        return None, None
+    gain_db = 20 * math.log10(abs(taken.static_gain))
+    raw, behind_inverse = hysteresis_db(taken.actuator_model, feedforward.models()[1], _gain(taken), amplitude_um)
+    return raw + gain_db, behind_inverse + gain_db
+
+
+def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
+    """Fundamental for a sine of this amplitude in dB: of a drive, over `um_per_v`, and of a command, over 1."""
+    wave = amplitude_um * np.sin(2 * np.pi * np.arange(3 * TICKS_OF_A_CYCLE) / TICKS_OF_A_CYCLE)
+    drives = wave / um_per_v, model_output(inverse, wave)
+    found = [model_output(actuator, drive)[-TICKS_OF_A_CYCLE:] for drive in drives]
+    raw, behind_inverse = (abs(tone(one, 1.0, TICKS_OF_A_CYCLE).amplitude) / amplitude_um for one in found)
+    return _db(raw), _db(behind_inverse)
+
+
+def _db(ratio: float) -> float:
+    return 20 * math.log10(ratio) if ratio > 0 else -math.inf
 
 
 def _sweep(taken: Taken, mode: str) -> Real:
@@ -135,6 +175,14 @@ def _low(found: Real) -> float:
     return float(np.median(found[inside, 1]))
 
 
+def _spacing(hz: Real, at_hz: float) -> float:
+    """Distance from a measured frequency to its further neighbour."""
+    if not np.isfinite(at_hz):
+        return 0.0
+    near = np.sort(np.abs(hz - at_hz))[:3]
+    return float(near[-1])
+
+
 def bandwidth(found: Real) -> float:
     """Where the magnitude first falls 3 dB below that of the lowest frequency, between points on a line; else NaN."""
     below = np.flatnonzero(found[:, 1] < found[0, 1] - 20 * np.log10(np.sqrt(2)))
@@ -153,10 +201,10 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
         _draw_column(column, curves, ink)
     (magnitude, near), (phase, _), (coherence, near_coherence) = panels
     magnitude.set_xscale("log")
-    near.set_xlim(*NEAR_HZ)
+    near.set_xlim(*curves["near_hz"])
     magnitude.set_ylim(bottom=-30)
     coherence.set_ylim(-0.05, 1.1)
-    ink.label(magnitude, "", "magnitude / dB", "Fig 12: harmonic response")
+    ink.label(magnitude, "", "magnitude / dB", "harmonic response")
     ink.label(near, "", "", "near the resonance")
     ink.label(phase, "", "phase / °")
     ink.label(coherence, "frequency / Hz", "γ²")
@@ -173,16 +221,12 @@ def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Ink) -> None:
         magnitude.plot(hz, decibels * trusted, "o-", label=NAMES[mode], **style)
         phase.plot(hz, unwrapped(degrees, trusted), "o-", **style)
         coherence.plot(hz, part, "o-", **style)
-    highest = max(found[-1, 0] for found in curves["found"].values())
-    hz = np.union1d(np.geomspace(0.01, max(highest, 10.0), 2000), np.linspace(*NEAR_HZ, 500))
-    held = 20 * np.log10(np.sinc(hz / curves["rate_hz"]))
-    for number, shift_db in enumerate(curves["shifts_db"]):
-        model = 20 * np.log10(np.abs(paper.dynamics(hz) / paper.dynamics(np.zeros(1)))) + shift_db + held
-        label = "D(s) of eq (5), eq (4) at this amplitude" if number == 0 else None
-        magnitude.plot(hz, model, color=ink.model, linewidth=0.8, linestyle="--", label=label)
-    closed = 20 * np.log10(np.abs(1 - paper.sensitivity(hz)))
-    magnitude.plot(hz, closed, color=ink.model, linewidth=0.8, label="T(s) of eqs (5) and (20)")
-    magnitude.axvline(400.0, color=ink.paper, linewidth=1.0, linestyle=":", label="400 Hz, the paper's resonance")
+    for label, dashed, hz, decibels in curves["modelled"]:
+        magnitude.plot(hz, decibels, color=ink.model, linewidth=0.8, linestyle="--" if dashed else "-", label=label)
+    claim = curves["claimed"]
+    if claim is not None and claim.at_least is not None and claim.at_most is not None:
+        label = f"resonance as claimed: {claim.says}"
+        magnitude.axvspan(claim.at_least, claim.at_most, color=ink.asked, alpha=0.25, linewidth=0, label=label)
 
 
 def unwrapped(degrees: Real, trusted: Real) -> Real:
@@ -195,12 +239,12 @@ def unwrapped(degrees: Real, trusted: Real) -> Real:
 EXPERIMENT = Experiment(
     "harmonic",
     "Harmonic response",
-    "Fig 12",
-    "Stepped sines from 0.01 Hz to 1 kHz: the drive alone, with feedforward, with feedforward and feedback.",
+    "Stepped sines from 0.01 Hz to beyond the resonance: the drive alone, with feedforward, with feedback as well.",
     HarmonicOptions,
     runs,
     analyse,
     draw,
-    commanded={"amplitude_um": CLOSED_PEAK},
+    defaults={"frequencies_hz": frequencies},
+    largest={"amplitude_um": lambda setting: setting.largest_swept_um},
     size=(11.0, 8.0),
 )

@@ -10,14 +10,14 @@ from importlib.resources import files as package_files
 from typing import Any
 from urllib.parse import quote
 
-HEADINGS = ("quantity", "the paper says", "the paper's model gives", "this run gave", "verdict")
+HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
 
 
 def page(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
          skipped: Mapping[str, str]) -> str:  # fmt: skip
     """The page; `links` are the recordings' paths relative to it, `skipped` reasons by experiment."""
     style = package_files("rtloop.experiments").joinpath("page.css").read_text(encoding="utf-8")
-    title = f"{content['name']}: the paper's experiments"
+    title = f"{content['name']}: experiments"
     sections = [_section(section, pictures.get(section["name"], {}), links) for section in content["experiments"]]
     left_out = "".join(f"<li>{escape(name)}: {escape(reason)}</li>" for name, reason in skipped.items())
     return (
@@ -47,27 +47,29 @@ def _summary(content: Mapping[str, Any]) -> str:
     """Counts of verdicts, as an index of the page."""
     lines = []
     for section in content["experiments"]:
-        verdicts = [mark(row) for row in section["rows"]]
+        verdicts = [row["mark"] for row in section["rows"]]
         counts = "".join(f'<td class="{kind}">{verdicts.count(kind) or ""}</td>' for kind in ("good", "mixed", "bad"))
         if section["problem"]:
             counts = f'<td class="bad" colspan="3">{escape(section["problem"])}</td>'
         link = f'<a href="#{section["name"]}">{escape(section["title"])}</a>'
-        lines.append(f"<tr><td>{link}</td><td>{escape(section['figure'])}</td>{counts}</tr>\n")
-    head = "<th>experiment</th><th>in the paper</th><th>agrees</th><th>paper or model only</th><th>neither</th>"
+        lines.append(f"<tr><td>{link}</td>{counts}</tr>\n")
+    head = "<th>experiment</th><th>agrees</th><th>differs from claim or model</th><th>misses what is asked</th>"
     return f'<table class="index"><tr>{head}</tr>\n{"".join(lines)}</table>\n'
 
 
-def mark(row: Mapping[str, Any]) -> str:
-    """good: paper and model agree with the run as far as they say anything; mixed: one of them; bad: none; or empty."""
-    answers = [answer for answer in (row["as_the_paper"], row["as_the_model"]) if answer is not None]
-    if row["run"] is None or not answers:
-        return ""
-    return "good" if all(answers) else "mixed" if any(answers) else "bad"
+def compared(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What these rows are compared with: keys of HEADINGS of which any of them has something."""
+    return [key for key in HEADINGS if any(row[key] is not None for row in rows)]
+
+
+def compared_cell(row: Mapping[str, Any], key: str) -> str:
+    """A row's cell in such a column."""
+    value = row[key]
+    return "–" if value is None else f"{number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
 
 
 def _section(section: Mapping[str, Any], drawn: Mapping[str, bytes], links: Mapping[str, str]) -> str:
-    body = [f'<section id="{section["name"]}"><h2>{escape(section["title"])} <small>{escape(section["figure"])}</small>'
-            f"</h2>\n<p>{escape(section['about'])}</p>\n"]  # fmt: skip
+    body = [f'<section id="{section["name"]}"><h2>{escape(section["title"])}</h2>\n<p>{escape(section["about"])}</p>\n']
     if section["problem"]:
         body.append(f'<p class="bad">{escape(section["problem"])}</p>\n')
     if drawn:
@@ -91,17 +93,18 @@ def _picture(title: str, drawn: Mapping[str, bytes]) -> str:
 
 
 def _verdicts(rows: Sequence[Mapping[str, Any]]) -> str:
-    head = "".join(f"<th>{heading}</th>" for heading in HEADINGS)
-    return f"<table><tr>{head}</tr>\n{''.join(map(_verdict, rows))}</table>\n"
+    keys = compared(rows)
+    head = "".join(f"<th>{text}</th>" for text in ("quantity", *map(HEADINGS.get, keys), "this run gave", "verdict"))
+    return f"<table><tr>{head}</tr>\n{''.join(_verdict(row, keys) for row in rows)}</table>\n"
 
 
-def _verdict(row: Mapping[str, Any]) -> str:
+def _verdict(row: Mapping[str, Any], keys: Sequence[str]) -> str:
     unit = "" if row["unit"] == "1" else f" {row['unit']}"
-    model = "–" if row["model"] is None else f"{number(row['model'])} <small>± {row['tolerance']:.2g}</small>"
     run = "–" if row["run"] is None else f"<b>{number(row['run'])}</b>{escape(unit)}"
+    beside = "".join(f"<td>{escape(compared_cell(row, key))}</td>" for key in keys)
     return (
-        f"<tr><td>{escape(row['quantity'])}</td><td>{escape(row['paper'])}</td><td>{model}</td><td>{run}</td>"
-        f'<td class="{mark(row)}">{escape(row["verdict"])}</td></tr>\n'
+        f"<tr><td>{escape(row['quantity'])}</td>{beside}<td>{run}</td>"
+        f'<td class="{row["mark"]}">{escape(row["verdict"])}</td></tr>\n'
     )
 
 

@@ -11,20 +11,17 @@ import numpy as np
 
 from hil.options import Options
 from rtloop.config import Configuration, ModeName
-from rtloop.design.plays import loading_curve
 from rtloop.errors import ConfigError
-from rtloop.identifying import actuator_model
 from rtloop.law.options import AxisOptions
 
 if TYPE_CHECKING:
+    from rtloop.experiments.setting import Setting
     from rtloop.experiments.taken import Taken
     from rtloop.experiments.verdict import Analysis
 
 Reference = Mapping[str, Any]
 DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
 """Of 10 V each cycle is 0.1 V smaller, so that the rest differs from a virgin one by about as little."""
-CLOSED_PEAK = 1.4
-"""Of the command in closed loop, per step of the reference: the paper's, at 10 kHz; others are checked afterwards."""
 
 
 class Segment(NamedTuple):
@@ -90,41 +87,6 @@ def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: 
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What an experiment may know of the configuration that it is derived from."""
-
-    rate_hz: float
-    axis: AxisOptions
-    virgin: bool
-    """The actuator begins without memory, as a rig does that exists only while it is called."""
-
-    def timeline(self) -> Timeline:
-        """One to be filled; an actuator that may have a memory is depolarised first."""
-        timeline = Timeline(self.rate_hz)
-        if not self.virgin:
-            timeline.depolarise(self.reach_v)
-        return timeline
-
-    @property
-    def reach_v(self) -> float:
-        """How far the drive may go to both sides."""
-        return min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
-
-    @property
-    def reach_um(self) -> float:
-        """How far the command may go to both sides: by its own limit, the drive's, and where the position trips."""
-        static_gain = self.axis.model.transfer().dc_gain if self.axis.model else 1.0
-        trips_um = self.axis.interlocks.position_um / max(abs(static_gain), 1e-9)
-        return min(self.axis.limits.command_um, abs(self.um_per_v) * self.reach_v, trips_um)
-
-    @property
-    def um_per_v(self) -> float:
-        """Static gain of the axis's hysteresis model over its whole range."""
-        largest_v = self.axis.limits.drive_v
-        return float(loading_curve(actuator_model(self.axis.feedforward), largest_v) / largest_v)
-
-
-@dataclass(frozen=True)
 class Run:
     """One recording: what the loop does, and what is another rig than the configuration's."""
 
@@ -142,14 +104,15 @@ class Experiment:
 
     name: str
     title: str
-    figure: str
     about: str
     options: type[Options]
     runs: Callable[[Any, Setting], list[Run]]
     analyse: Callable[[Sequence[Taken], Any], Analysis]
     draw: Callable[[Any, Mapping[str, Any], Any], None]
-    commanded: Mapping[str, float] = field(default_factory=dict)
-    """Options in µm, and how many times as much the command may have to be at its peak."""
+    defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
+    """Of the options that are None where nobody sets them."""
+    largest: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)
+    """How far an option may go to either side."""
     both_ways: bool = True
     """It drives to both sides of 0 V."""
     needs_controller: bool = True
@@ -168,20 +131,25 @@ class Experiment:
         return None
 
     def fitted(self, options: Options, setting: Setting) -> Options:
-        """The options, with what nobody set made as small as the axis's limits demand.
+        """The options, with what nobody set made to suit the axis, and as small as its limits demand.
 
         Raises ConfigError for what somebody set and the limits forbid.
         """
-        smaller: dict[str, Any] = {}
-        for key, peak in self.commanded.items():
-            value = getattr(options, key)
-            asked_um, most_um = float(np.max(np.abs(value))), setting.reach_um / peak
-            if asked_um <= most_um:
+        made = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
+        faults = []
+        for key, largest in self.largest.items():
+            value = made.get(key, getattr(options, key))
+            asked, most = float(np.max(np.abs(value))), largest(setting)
+            if asked <= most:
                 continue
             if key in options.model_fields_set:
-                allowed = f"axis {setting.axis.name!r} allows {most_um:.4g} µm here, by its limits and interlocks"
-                raise ConfigError("parameters of the experiments", [f"{self.name}.{key}: {asked_um:g} µm; {allowed}"])
-            step_um = 10.0 ** (math.floor(math.log10(most_um)) - 1)
-            scale = math.floor(most_um / step_um) * step_um / asked_um
-            smaller[key] = tuple(scale * one for one in value) if isinstance(value, tuple) else scale * value
-        return options.model_copy(update=smaller)
+                unit = " µm" if key.endswith("_um") else ""
+                allowed = f"axis {setting.axis.name!r} allows {most:.4g}{unit} here, by its limits and interlocks"
+                faults.append(f"{self.name}.{key}: {asked:g}{unit}; {allowed}")
+                continue
+            step = 10.0 ** (math.floor(math.log10(most)) - 1)
+            scale = math.floor(most / step) * step / asked
+            made[key] = tuple(scale * one for one in value) if isinstance(value, tuple) else scale * value
+        if faults:
+            raise ConfigError("parameters of the experiments", faults)
+        return options.model_copy(update=made)

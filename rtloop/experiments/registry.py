@@ -1,4 +1,4 @@
-"""The experiments by name, in the paper's order, and the parameters that a user sets for them."""
+"""The experiments by name, in the order of a report, and the parameters that a user sets for them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT 
 
 
 def chosen(names: Sequence[str]) -> list[Experiment]:
-    """The named ones, in the paper's order. Raises ConfigError for an unknown name."""
+    """The named ones, in the order of a report. Raises ConfigError for an unknown name."""
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
         known = ", ".join(EXPERIMENTS)

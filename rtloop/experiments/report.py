@@ -41,7 +41,7 @@ def take(paths: Sequence[Path]) -> list[Taken]:
 
 
 def report(takings: Sequence[Taken], say: Say = lambda _: None) -> Report:
-    """Analyse what there is, in the paper's order. Raises RecordingError where two recordings are of the same run."""
+    """Analyse what there is, in their order. Raises RecordingError where two recordings are of the same run."""
     sections, drawn = [], {}
     _require_distinct(takings)
     for name, experiment in EXPERIMENTS.items():
@@ -85,7 +85,6 @@ def _section(experiment: Experiment, takings: Sequence[Taken]) -> tuple[dict[str
     section = {
         "name": experiment.name,
         "title": experiment.title,
-        "figure": experiment.figure,
         "about": experiment.about,
         "parameters": takings[0].parameters,
         "recordings": [path.name for taken in takings for path in taken.paths],

@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import Field
 
 from hil.options import Numbers, Options
-from rtloop.experiments import paper
-from rtloop.experiments.procedure import CLOSED_PEAK, Experiment, Run, Setting, hold
+from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import envelope
-from rtloop.experiments.verdict import Analysis, Row, Table
+from rtloop.experiments.verdict import Analysis, Table
 
 REST_S = 0.1
 RINGS_UM = 0.5
@@ -74,38 +74,48 @@ def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis
         shift = step.values["shift_percent"]
         outcomes.append(Outcome(shift, float(np.ptp(last)), float(np.abs(position).max()), trip))
         traces.append((shift, position, outcomes[-1].words))
-    low, high = stable_range(outcomes)
-    table = [[f"{one.shift_percent:+g}", "stable" if _predicted(one.shift_percent) else "unstable", one.words,
+    model = ordered[0].model
+    tolerated = model.tolerated if model else None
+    predicted = {one: model.stable_at(one) for one in options.shifts_percent} if model and tolerated else None
+    table = [[f"{one.shift_percent:+g}", _words(predicted, one.shift_percent), one.words,
               f"{one.swing_um:.3f}", f"{one.largest_um:.2f}"] for one in outcomes]  # fmt: skip
-    shifts = [one.shift_percent for one in outcomes]
-    rows = [
-        Row("lowest tested shift that settles", "%", low, model=paper.STABLE_SHIFT_PERCENT[0],
-            tolerance=low - max((shift for shift in shifts if shift < low), default=low)),
-        Row("highest tested shift that settles", "%", high, model=paper.STABLE_SHIFT_PERCENT[1],
-            tolerance=min((shift for shift in shifts if shift > high), default=high) - high),
-    ]  # fmt: skip
-    notes = ["The paper does not discuss it. The model's range is that of C(z), tustin prewarped at 595.5 Hz, with "
-             "D(s) behind a hold at 10 kHz: −5.65 … +1.80 %. In continuous time it is −3.9 … +2.4 %. The tolerance "
-             "is the distance to the next shift that was tried.",
+    rows = []
+    modelled = (None, None) if predicted is None else range_about_zero(predicted)
+    for which, run, said in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
+        near = to_next(run, options.shifts_percent, down=which == "lowest")
+        rows.append(ordered[0].row("", f"{which} tested shift that settles", "%", run, said, near))
+    by_it = f": by it {tolerated[0]:.2f} … {tolerated[1]:+.2f} % are tolerated" if tolerated else ""
+    notes = ["The model's are those of the tested shifts with which the loop of [axis.controller] and [axis.model] is "
+             f"stable as it runs{by_it}. The tolerance is the distance to the next shift that was tried.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
              "ringing that leaves the dead band grows, until the interlocks of the configuration trip."]  # fmt: skip
-    headings = ("shift / %", "model at 10 kHz", "run", "last fifth, peak to peak / µm", "largest |x| / µm")
+    headings = ("shift / %", "model", "run", "last fifth, peak to peak / µm", "largest |x| / µm")
     curves = {"traces": traces, "outcomes": outcomes, "rate_hz": ordered[0].rate_hz}
     return Analysis(rows, curves, (Table("Every shift", headings, table),), notes)
 
 
 def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
     """Lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
-    settled = {one.shift_percent for one in outcomes if one.settles}
-    bad = [one.shift_percent for one in outcomes if not one.settles]
+    return range_about_zero({one.shift_percent: one.settles for one in outcomes})
+
+
+def range_about_zero(good: Mapping[float, bool]) -> tuple[float, float]:
+    """Ends of the good shifts with no bad one between them and 0; NaN where none is."""
+    settled, bad = ([s for s, answer in good.items() if answer is wanted] for wanted in (True, False))
     above, below = min((s for s in bad if s >= 0), default=np.inf), max((s for s in bad if s <= 0), default=-np.inf)
     inside = [s for s in settled if below < s < above]
     return (min(inside), max(inside)) if inside else (np.nan, np.nan)
 
 
-def _predicted(shift_percent: float) -> bool:
-    return paper.STABLE_SHIFT_PERCENT[0] < shift_percent < paper.STABLE_SHIFT_PERCENT[1]
+def to_next(shift: float, shifts: Sequence[float], down: bool) -> float:
+    """Distance to the next shift beyond; 0 where none was tried."""
+    beyond = [abs(one - shift) for one in shifts if (one < shift if down else one > shift)]
+    return min(beyond, default=0.0)
+
+
+def _words(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
+    return "–" if predicted is None else "stable" if predicted[shift_percent] else "unstable"
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
@@ -115,7 +125,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     rows = -(-len(traces) // columns)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
     for number, (panel, (shift, position, words)) in enumerate(zip(panels, traces, strict=False)):
-        color = ink.measured if words == "settles" else ink.paper if words.startswith("goes") else ink.error
+        color = ink.measured if words == "settles" else ink.asked if words.startswith("goes") else ink.error
         panel.plot(*envelope(position, curves["rate_hz"], 600), color=color, linewidth=0.8)
         label = f"{shift:+g} %" if shift else "0 %"
         ink.label(
@@ -131,13 +141,12 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
 EXPERIMENT = Experiment(
     "robustness",
     "A resonance that is not where the model has it",
-    "not in the paper",
     "The same step in closed loop on simulated rigs whose resonance is shifted.",
     RobustnessOptions,
     runs,
     analyse,
     draw,
-    commanded={"step_um": CLOSED_PEAK},
+    largest={"step_um": lambda setting: setting.largest_step_um},
     needs_rig=True,
     size=(11.0, 5.0),
 )

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 
 from hil.linear import Real
+from rtloop.design.judgement import limits
 from rtloop.design.measured import UnsuitableData
+from rtloop.design.specification import SpecificationOptions
 from rtloop.experiments.derive import about
+from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
+from rtloop.experiments.verdict import Row
 from rtloop.identifying import actuator_model
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import AxisOptions
@@ -36,6 +40,7 @@ class Taken:
         self.parameters: dict[str, Any] = said["parameters"]
         self.ticks_planned: int = said["ticks"]
         self.segments = [Segment(*values) for values in said["segments"]]
+        self.asked = SpecificationOptions.model_validate(said.get("asked", {}))
         self._may_trip: bool = said["may_trip"]
 
     @property
@@ -63,11 +68,21 @@ class Taken:
         """The forward hysteresis model as it was identified, its dead band included."""
         return actuator_model(self.axis_options.feedforward)
 
+    @cached_property
+    def model(self) -> LinearModel | None:
+        """What [axis.model] and [axis.controller] promise; None without a model."""
+        return linear_model(self.axis_options, self.rate_hz)
+
     @property
     def static_gain(self) -> float:
         """D(0) of the axis's model; 1 where it has none."""
-        model = self.axis_options.model
-        return model.transfer().dc_gain if model else 1.0
+        return self.model.static_gain if self.model else 1.0
+
+    def row(
+        self, name: str, quantity: str, unit: str, run: float, model: float | None = None, tolerance: float = 0.0
+    ) -> Row:
+        """A quantity with what the axis's specification asks and claims of it, by its `name` there."""
+        return Row(quantity, unit, run, model, tolerance, limits(self.asked).get(name), self.asked.claims.get(name))
 
     @property
     def trip(self) -> dict[str, Any] | None:
@@ -104,6 +119,10 @@ class Taken:
     def labelled(self, *labels: str) -> list[Segment]:
         """The segments of these labels, in order."""
         return [segment for segment in self.segments if segment.label in labels]
+
+    def shortest(self, label: str) -> float:
+        """Duration in s of the shortest segment of a label."""
+        return min(segment.ticks for segment in self.labelled(label)) / self.rate_hz
 
     def tail(self, segment: Segment, ticks: int) -> slice:
         """The last ticks of a segment."""

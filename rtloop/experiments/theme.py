@@ -24,7 +24,7 @@ class Ink:
     error: str
     drive: str
     other: str
-    paper: str
+    asked: str
 
     def label(self, panel: Any, x: str, y: str, title: str = "") -> None:
         """Axes and title of a panel."""

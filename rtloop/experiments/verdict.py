@@ -1,81 +1,95 @@
-"""What an analysis hands on: quantities beside what the paper says and what its model gives, tables, curves, notes."""
+"""What an analysis hands on: quantities beside what is asked, claimed and modelled, tables, curves, notes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
-Range = tuple[float, float]
-
-
-class Said(NamedTuple):
-    """What the paper says of a quantity: its words, and the values that they allow (None: no number is given)."""
-
-    text: str
-    allowed: Range | None = None
-
-
-NOTHING = Said("–")
+from rtloop.design.judgement import Limit
+from rtloop.design.specification import ClaimOptions
 
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity. `model` is what the paper's printed model gives, which a run may miss by `tolerance`."""
+    """One quantity as a run gave it.
+
+    `limit` and `claim` are of the specification that the axis names. `model` is what the configuration's own models
+    give, which a run may miss by `tolerance`.
+    """
 
     quantity: str
     unit: str
     run: float
-    said: Said = NOTHING
     model: float | None = None
     tolerance: float = 0.0
+    limit: Limit | None = None
+    claim: ClaimOptions | None = None
 
     @property
-    def as_the_paper(self) -> bool | None:
-        """Whether the run bears the paper out; None where it gives no number."""
-        if self.said.allowed is None or not math.isfinite(self.run):
+    def met(self) -> bool | None:
+        """Whether what is asked is met; None where nothing is, or nothing was found."""
+        return None if self.limit is None or not math.isfinite(self.run) else bool(self.limit.met(self.run))
+
+    @property
+    def as_claimed(self) -> bool | None:
+        """Whether the claim is borne out; None where there is none, or none with a number."""
+        if self.claim is None or not self.claim.is_number or not math.isfinite(self.run):
             return None
-        return self.said.allowed[0] <= self.run <= self.said.allowed[1]
+        return bool(self.claim.borne_out(self.run))
 
     @property
     def as_the_model(self) -> bool | None:
-        """Whether the run is as the paper's model; None where there is no such number."""
-        if self.model is None or not math.isfinite(self.run):
+        """Whether the run is as the model; None where that says nothing."""
+        if self.model is None or not math.isfinite(self.run) or not math.isfinite(self.model):
             return None
-        return abs(self.run - self.model) <= self.tolerance
+        return bool(abs(self.run - self.model) <= self.tolerance)
+
+    @property
+    def asked(self) -> str:
+        """The limit in words."""
+        if self.limit is None:
+            return ""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{'≤' if self.limit.at_most else '≥'} {self.limit.value:.5g}{unit}"
 
     @property
     def verdict(self) -> str:
-        """Both answers in words; a difference is named."""
+        """The answers in words; a difference is named."""
         if not math.isfinite(self.run):
             return "not to be had from this run"
-        off = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit}".strip()
-        words = {
-            (True, True): "as the paper says, and its model",
-            (True, False): f"as the paper says; its model is off ({off})",
-            (True, None): "as the paper says",
-            (False, True): "not as the paper says, but as its own model",
-            (False, False): f"not as the paper says, nor as its model ({off})",
-            (False, None): "not as the paper says",
-            (None, True): "as the paper's model",
-            (None, False): f"not as the paper's model ({off})",
-            (None, None): "",
-        }
-        return words[self.as_the_paper, self.as_the_model]
+        off = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
+        answers = (
+            (self.met, "meets what is asked", "MISSES what is asked"),
+            (self.as_claimed, "as claimed", "not as claimed"),
+            (self.as_the_model, "as the model", f"off the model by {off}"),
+        )
+        return ", ".join(yes if answer else no for answer, yes, no in answers if answer is not None)
+
+    @property
+    def mark(self) -> str:
+        """good: every answer is yes; bad: what is asked is missed; mixed: another is no; empty where none is given."""
+        answers = [answer for answer in (self.met, self.as_claimed, self.as_the_model) if answer is not None]
+        if not answers:
+            return ""
+        return "bad" if self.met is False else "good" if all(answers) else "mixed"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "quantity": self.quantity,
             "unit": self.unit,
-            "paper": self.said.text,
+            "asked": self.asked or None,
+            "claimed": self.claim.says if self.claim else None,
             "model": self.model,
             "tolerance": self.tolerance if self.model is not None else None,
             "run": self.run,
-            "as_the_paper": self.as_the_paper,
+            "met": self.met,
+            "as_claimed": self.as_claimed,
             "as_the_model": self.as_the_model,
             "verdict": self.verdict,
+            "mark": self.mark,
         }
 
 
@@ -97,8 +111,3 @@ class Analysis:
     """For the picture."""
     tables: Sequence[Table] = ()
     notes: Sequence[str] = field(default_factory=list)
-
-
-def about(value: float, part: float = 0.05) -> Range:
-    """What "about `value`" allows."""
-    return value - abs(part * value), value + abs(part * value)

@@ -7,9 +7,14 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
-from rtloop.config import load
+from rtloop.config import Configuration, load
 from rtloop.design.measured import UnsuitableData
+from rtloop.experiments.derive import derived
+from rtloop.experiments.registry import EXPERIMENTS
+from rtloop.experiments.report import report, take
+from rtloop.experiments.setting import Setting
 from rtloop.prepare import prepare
+from rtloop.specifications import load_specification
 from tests.design.modal_rigs import modal_rig
 from tests.recording.real_loop import record
 from tests.soak.chain import LIMITS, designed_for, run, verdict
@@ -52,6 +57,32 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path) -> None:
     assert axis.interlocks.oscillation_swings > 0
     trips, _ = run(out, prepare(load(out)).checks[0].running)
     assert trips == []
+    _experiments_speak_of_the_stage_alone(load(out), tmp_path)
+
+
+def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> None:
+    """What they find is beside the stage's specification and its own models, and what nobody set fits its limits."""
+    asked = load_specification(DEPLOY / "own-stage-spec.toml").design.specification
+    stage = Setting(made.loop.rate_hz, made.axes[0], virgin=True, asked=asked)
+    values = asked.model_dump(mode="json", exclude_defaults=True)
+    files = []
+    for name in ("step-response", "compensation", "steps", "sines", "disturbance"):
+        experiment = EXPERIMENTS[name]
+        options = experiment.fitted(experiment.options(), stage)
+        runs = experiment.runs(options, stage)
+        for number, one in enumerate(runs):
+            text = derived(made, "x", name, options.model_dump(mode="json"), one, len(runs), values).text
+            files += record(folder / f"{name}-{number}.mcap", text, one.timeline.ticks)
+    content = report(take(files)).content
+    assert not any(word in json.dumps(content, ensure_ascii=False).lower() for word in ("paper", "eq (", "fig "))
+    rows = {row["quantity"]: row for section in content["experiments"] for row in section["rows"]}
+    assert {section["problem"] for section in content["experiments"]} == {None}
+    assert rows["settling time to 5 %, median"]["asked"] == "≤ 6 ms"
+    assert rows["settling time to 5 %, median"]["met"]
+    assert rows["what is left at 2.9 Hz"]["met"]
+    assert rows["what is left at 50 Hz"]["met"] is None  # asked up to 5 Hz
+    for quantity in ("frequency of the ringing", "overshoot", "final position", "what is left at 1 Hz"):
+        assert rows[quantity]["as_the_model"], rows[quantity]
 
 
 def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:

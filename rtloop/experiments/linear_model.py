@@ -1,0 +1,152 @@
+"""What the configuration promises of an axis: [axis.model] behind hold and delay, and the loop that C(z) makes of it.
+
+    P(z)   plant, held and delayed        L = C P,   S = 1/(1 + L),   T = L S,   F the pre-filter: x = T F x_d
+
+Linear throughout: what the hysteresis leaves is not in it, and is part of what an experiment finds.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.linear import Complex, Real
+from rtloop.design.closedloop import Loop, discrete_loop, sampled_plant
+from rtloop.design.discretise import DiscreteController, discretise
+from rtloop.design.loop import lightest_pair, resonance_shift_tolerated, with_resonance_shifted
+from rtloop.design.step import step_metrics
+from rtloop.law.options import AxisOptions, ModelOptions, PrefilterOptions
+
+GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
+
+
+class LinearModel:
+    """Of an axis that has a model; `loop` is None without a controller, and where it is unstable on the model."""
+
+    def __init__(self, axis: AxisOptions, model: ModelOptions, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+        self.dynamics = model.transfer()
+        self._delay_ticks = model.delay_ticks
+        self._prefilter = axis.prefilter
+        self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
+        self._controller: DiscreteController | None = None
+        self.loop: Loop | None = None
+        if (options := axis.controller) is not None:
+            self._controller = discretise(options.transfer(), 1 / rate_hz, options.method, options.prewarp_hz)
+            loop = discrete_loop(self._controller, self.dynamics, model.delay_ticks)
+            self.loop = loop if loop.is_stable else None
+
+    @property
+    def static_gain(self) -> float:
+        """D(0)."""
+        return self.dynamics.dc_gain
+
+    @cached_property
+    def resonance_hz(self) -> float | None:
+        """Of the most lightly damped pair of poles; None where there is no pair."""
+        return abs(lightest_pair(self.dynamics)) / (2 * np.pi) if np.any(self.dynamics.poles.imag > 0) else None
+
+    @cached_property
+    def decay_per_s(self) -> float:
+        """How fast the resonance dies away; 0 where there is none."""
+        return -lightest_pair(self.dynamics).real if self.resonance_hz else 0.0
+
+    def plant(self, hz: npt.ArrayLike) -> Complex:
+        """P, from a command without hysteresis to the position, at frequencies (k,) in Hz."""
+        return self._plant.response(np.exp(2j * np.pi * np.atleast_1d(hz) / self.rate_hz))
+
+    def tracking(self, hz: npt.ArrayLike) -> Complex | None:
+        """T·F at frequencies (k,) in Hz."""
+        if self.loop is None:
+            return None
+        opened = self.loop.open(hz)
+        return opened / (1 + opened) * _prefilter(self._prefilter, np.atleast_1d(hz) / self.rate_hz)
+
+    def rejection(self, hz: npt.ArrayLike) -> Complex | None:
+        """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz."""
+        return None if self.loop is None else self.plant(hz) / (1 + self.loop.open(hz))
+
+    def open_answer(self, command: Real) -> Real:
+        """Position (n,) at each tick for a command (n,), from rest and without a controller."""
+        return simulated(*self._plant, command)[0]
+
+    def closed_answer(self, filtered_reference: Real) -> tuple[Real, Real] | None:
+        """Position and command (n,) at each tick for a reference (n,) behind the pre-filter, from rest."""
+        if self.loop is None:
+            return None
+        position, command = simulated(*self.loop.matrices, filtered_reference)
+        return position, command
+
+    def left_of(self, disturbance: Real) -> Real | None:
+        """Position (n,) that the loop at rest leaves of a disturbance (n,) before the dynamics: d − T d, d = D Ω."""
+        moved = simulated(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
+        answer = self.closed_answer(moved)
+        return None if answer is None else moved - answer[0]
+
+    @cached_property
+    def step_peak(self) -> float | None:
+        """Largest command per height of a step of the reference."""
+        return None if self.loop is None else step_metrics(self.loop, ()).peak_command
+
+    @cached_property
+    def sine_peak(self) -> float | None:
+        """Largest command per amplitude of a sine of the reference, at any frequency."""
+        return None if self.loop is None else float(self.loop.command_sensitivity(self.loop.frequencies).max())
+
+    @cached_property
+    def tracking_peak(self) -> float | None:
+        """Largest position per amplitude of a sine of the reference, at any frequency."""
+        tracking = None if self.loop is None else self.tracking(self.loop.frequencies)
+        return None if tracking is None else float(np.abs(tracking).max())
+
+    @cached_property
+    def open_peak(self) -> float:
+        """Largest |P| over D(0), at any frequency."""
+        near = [self.resonance_hz] if self.resonance_hz else []
+        hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), near])
+        return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))
+
+    @cached_property
+    def open_overshoot(self) -> float:
+        """Largest position after a step of the command, over the final one."""
+        ticks = round(min(20 / max(self.decay_per_s, 20.0), 1.0) * self.rate_hz)
+        return float(np.max(self.open_answer(np.ones(ticks)) / self.static_gain))
+
+    def stable_at(self, shift_percent: float) -> bool:
+        """Whether the loop is stable with the plant's resonance shifted."""
+        if self._controller is None:
+            return False
+        shifted = with_resonance_shifted(self.dynamics, shift_percent)
+        return discrete_loop(self._controller, shifted, self._delay_ticks).is_stable
+
+    @cached_property
+    def tolerated(self) -> tuple[float, float] | None:
+        """Shifts of the resonance in percent, down and up, between which the loop is stable."""
+        if self._controller is None or not self.resonance_hz:
+            return None
+        found = resonance_shift_tolerated(self._controller, self.dynamics, self._delay_ticks)
+        return -found.down_percent, found.up_percent
+
+
+def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:
+    """None for an axis without a model."""
+    return None if axis.model is None else LinearModel(axis, axis.model, rate_hz)
+
+
+def simulated(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
+    """Outputs (outputs, n) of a discrete system from rest for an input (n,)."""
+    states = np.zeros((values.size + 1, b.size))
+    for k, value in enumerate(values.tolist()):
+        states[k + 1] = a @ states[k] + b * value
+    return np.atleast_2d(c) @ states[:-1].T + np.outer(d, values)
+
+
+def _prefilter(options: PrefilterOptions, turns_per_tick: Real) -> Complex:
+    """F at frequencies (k,): taps, then the sections [b0, b1, b2, a1, a2]."""
+    back = np.exp(-2j * np.pi * turns_per_tick)
+    found = np.polyval(options.taps[::-1], back) if options.taps else np.ones_like(back)
+    for b0, b1, b2, a1, a2 in options.sections:
+        found = found * (b0 + b1 * back + b2 * back**2) / (1 + a1 * back + a2 * back**2)
+    return np.asarray(found, dtype=complex)

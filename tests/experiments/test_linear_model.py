@@ -1,0 +1,143 @@
+"""What the configuration's models promise, against scipy's simulation of the same loop written down by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from rtloop.config import load
+from rtloop.experiments.harmonic import hysteresis_db
+from rtloop.experiments.linear_model import LinearModel, linear_model
+from rtloop.experiments.promised import Promised
+from rtloop.identifying import actuator_model
+from rtloop.law.options import AxisOptions
+
+RATE_HZ = 10_000.0
+OMEGA, ZETA, KI = 2 * np.pi * 300.0, 0.02, 60.0
+DELAY_TICKS, TAPS = 2, (0.25, 0.5, 0.25)
+AXIS = AxisOptions.model_validate(
+    {
+        "name": "x",
+        "feedforward": {"thresholds_v": [0.0], "weights_um_per_v": [2.0]},
+        "controller": {"form": "transfer_function", "numerator": [KI], "denominator": [1.0, 0.0], "method": "tustin"},
+        "model": {
+            "form": "transfer_function", "numerator": [OMEGA**2], "denominator": [1.0, 2 * ZETA * OMEGA, OMEGA**2],
+            "delay_ticks": DELAY_TICKS,
+        },
+        "prefilter": {"taps": list(TAPS)},
+    }
+)  # fmt: skip
+STEP = np.ones(4000)
+
+
+def plant() -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator in z⁻¹ of the held plant behind its delay."""
+    b, a, _ = signal.cont2discrete(([OMEGA**2], [1.0, 2 * ZETA * OMEGA, OMEGA**2]), 1 / RATE_HZ, "zoh")
+    return np.concatenate([np.zeros(DELAY_TICKS), b.ravel()]), np.concatenate([a, np.zeros(DELAY_TICKS)])
+
+
+def loop() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """T, and S, as numerator and denominator in z⁻¹: L = C·P, C = K T/2 (1 + z⁻¹)/(1 − z⁻¹)."""
+    b, a = plant()
+    above, below = np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), b), np.convolve([1.0, -1.0], a)
+    closed = above + below
+    return above, closed, below, closed
+
+
+@pytest.fixture(scope="module")
+def model() -> LinearModel:
+    found = linear_model(AXIS, RATE_HZ)
+    assert found is not None
+    return found
+
+
+def test_answers_to_a_step(model: LinearModel) -> None:
+    above, closed, _below, _ = loop()
+    opened = signal.lfilter(*plant(), STEP)
+    np.testing.assert_allclose(model.open_answer(STEP), opened, atol=1e-9)
+    assert model.open_overshoot == pytest.approx(opened.max(), abs=1e-9)
+    answer = model.closed_answer(STEP)
+    assert answer is not None
+    position = signal.lfilter(above, closed, STEP)
+    np.testing.assert_allclose(answer[0], position, atol=1e-9)
+    command = signal.lfilter(np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), plant()[1]), closed, STEP)
+    np.testing.assert_allclose(answer[1], command, atol=1e-9)
+
+
+def test_what_is_left_of_a_disturbance(model: LinearModel) -> None:
+    b, a, _ = signal.cont2discrete(([OMEGA**2], [1.0, 2 * ZETA * OMEGA, OMEGA**2]), 1 / RATE_HZ, "zoh")
+    moved = signal.lfilter(b.ravel(), a, STEP)
+    _, _, below, closed = loop()
+    left = model.left_of(STEP)
+    assert left is not None
+    np.testing.assert_allclose(left, signal.lfilter(below, closed, moved), atol=1e-9)
+
+
+def test_responses(model: LinearModel) -> None:
+    hz = np.array([0.1, 20.0, 299.0, 2000.0])
+    back = np.exp(-2j * np.pi * hz / RATE_HZ)
+    above, closed, below, _ = (np.polyval(one[::-1], back) for one in loop())
+    numerator, denominator = (np.polyval(one[::-1], back) for one in plant())
+    np.testing.assert_allclose(model.plant(hz), numerator / denominator, rtol=1e-9)
+    filtered = TAPS[0] + TAPS[1] * back + TAPS[2] * back**2
+    tracking, rejection = model.tracking(hz), model.rejection(hz)
+    assert tracking is not None
+    assert rejection is not None
+    np.testing.assert_allclose(tracking, above / closed * filtered, rtol=1e-9)
+    np.testing.assert_allclose(rejection, below / closed * numerator / denominator, rtol=1e-9)
+
+
+def test_resonance_and_peaks(model: LinearModel) -> None:
+    assert model.resonance_hz == pytest.approx(300.0)
+    assert model.decay_per_s == pytest.approx(ZETA * OMEGA)
+    assert model.open_peak == pytest.approx(1 / (2 * ZETA), rel=0.01)
+    tolerated = model.tolerated
+    assert tolerated is not None
+    for shift in (tolerated[0] + 0.1, tolerated[0] - 0.1):
+        omega = OMEGA * (1 + shift / 100)
+        b, a, _ = signal.cont2discrete(([omega**2], [1.0, 2 * ZETA * omega, omega**2]), 1 / RATE_HZ, "zoh")
+        padded = np.concatenate([np.zeros(DELAY_TICKS), b.ravel()]), np.concatenate([a, np.zeros(DELAY_TICKS)])
+        closed = np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), padded[0]) + np.convolve([1.0, -1.0], padded[1])
+        assert bool(np.abs(np.roots(closed)).max() < 1) is bool(shift > tolerated[0])
+
+
+def test_a_harmonic_response_is_promised(model: LinearModel) -> None:
+    measured = np.array([0.1, 1.0, 10.0, 250.0, 299.0, 300.0, 1000.0])
+    promised = Promised(model, measured, RATE_HZ)
+    assert promised.peak_hz == pytest.approx(300.0, abs=0.5)
+    assert promised.peak_db == pytest.approx(20 * np.log10(1 / (2 * ZETA)), abs=0.1)
+    assert promised.bandwidth_hz == pytest.approx(KI / (2 * np.pi), rel=0.05)  # I-control of a stiff plant
+    nothing = Promised(None, measured, RATE_HZ)
+    assert (nothing.peak_hz, nothing.peak_db, nothing.bandwidth_hz, nothing.closed_low_db) == (None,) * 4
+    assert nothing.curves((None, None)) == []
+
+
+def test_without_controller_or_stability_nothing_is_promised_of_the_loop() -> None:
+    bare = linear_model(AXIS.model_copy(update={"controller": None}), RATE_HZ)
+    assert bare is not None
+    assert (bare.loop, bare.tracking(1.0), bare.rejection(1.0), bare.closed_answer(STEP), bare.step_peak) == (None,) * 5
+    assert AXIS.controller is not None
+    wild = AXIS.controller.model_copy(update={"numerator": (1000 * KI,), "allow_unstable": True})
+    unstable = linear_model(AXIS.model_copy(update={"controller": wild}), RATE_HZ)
+    assert unstable is not None
+    assert unstable.loop is None
+    assert linear_model(AXIS.model_copy(update={"model": None}), RATE_HZ) is None
+
+
+def test_the_papers_printed_equations() -> None:
+    """Recomputed by scripts of numpy and scipy that share no code with rtloop: plays sample by sample, D(s), C(s)."""
+    axis = load(Path(__file__).resolve().parents[2] / "deploy" / "paper.toml").axes[0]
+    found = linear_model(axis, RATE_HZ)
+    assert found is not None
+    assert found.resonance_hz == pytest.approx(595.50, abs=0.01)
+    assert found.step_peak == pytest.approx(1.396, abs=0.001)
+    tracking = found.tracking(0.01)
+    assert tracking is not None
+    assert 20 * np.log10(abs(tracking[0])) == pytest.approx(-0.0145, abs=1e-4)
+    actuator, inverse = actuator_model(axis.feedforward), axis.feedforward.models()[1]
+    raw, behind_inverse = hysteresis_db(actuator, inverse, 4.30185, 2.0)
+    at_rest_db = 20 * np.log10(1.01086)
+    assert (raw + at_rest_db, behind_inverse + at_rest_db) == pytest.approx((-5.213, -0.746), abs=0.002)
