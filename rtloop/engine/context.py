@@ -51,7 +51,10 @@ _COUNTERS = (
     "failed_tick",
     "failed_status",
     "refused",
-    "next_late_event",
+    "late_until",
+    "late_ticks",
+    "late_periods",
+    "late_largest",
     "next_snapshot",
 )
 

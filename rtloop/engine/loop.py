@@ -56,7 +56,8 @@ TRIP_LAW = float(Flag.TRIP_LAW)
 OVERRUN, WRITE_FAILED_FLAG, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.WRITE_FAILED), int(Flag.TRIP_HEARTBEAT)
 LOOP_ORIGIN, SUPERVISOR = int(Origin.LOOP), int(Origin.SUPERVISOR)
 STOP_KIND = int(Kind.STOP)
-TRIPPED, DRIVER_FAILED, PERIODS_MISSED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED), int(Kind.PERIODS_MISSED)
+TRIPPED, DRIVER_FAILED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED)
+PERIODS_MISSED, LATENESS_OVER = int(Kind.PERIODS_MISSED), int(Kind.LATENESS_OVER)
 DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
 COEFFICIENT_BYTES, STATE_BYTES, LOOP_STATE_BYTES = COEFFICIENTS.itemsize, STATE.itemsize, LOOP_STATE.itemsize
 US_PER_NS = 1e-3
@@ -75,6 +76,8 @@ def run_ticks(loop, until_tick):
     try:
         _require_counts(loop)
         outcome = _run_ticks(loop, until_tick)
+        if outcome != DONE:
+            _end_lateness(loop)
     except Exception:
         publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, (TRIP_LAW, 0.0))
     return outcome
@@ -252,9 +255,32 @@ def _report(loop, status, written, missed):
         loop.failed_tick, loop.failed_status = loop.tick, failing
         publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), verb))
     if missed > 0.0:
-        if loop.tick >= loop.next_late_event:
-            publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))
-        loop.next_late_event = loop.tick + np.int64(1.0 / loop.period_s)
+        _note_lateness(loop, missed)
+    elif loop.late_ticks > 0 and loop.tick >= loop.late_until:
+        _end_lateness(loop)
+
+
+@seldom
+def _note_lateness(loop, missed):
+    """Begin an episode, or go on with it; it ends a second after its last tick that missed a period."""
+    if loop.late_ticks > 0 and loop.tick >= loop.late_until:
+        _end_lateness(loop)
+    if loop.late_ticks == 0:
+        publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))
+    periods = np.int64(missed)
+    loop.late_ticks += 1
+    loop.late_periods += periods
+    loop.late_largest = max(loop.late_largest, periods)
+    loop.late_until = loop.tick + np.int64(1.0 / loop.period_s)
+
+
+@seldom
+def _end_lateness(loop):
+    """What the whole episode missed, where that is more than its first event has said."""
+    if loop.late_ticks > 1:
+        values = (float(loop.late_periods), float(loop.late_ticks), float(loop.late_largest))
+        publish_event(loop, LATENESS_OVER, ALL_AXES, LOOP_ORIGIN, 0, values)
+    loop.late_ticks = loop.late_periods = loop.late_largest = 0
 
 
 @seldom

@@ -49,6 +49,9 @@ class Kind(IntEnum):
     """values[0]: status returned; values[1]: 0 read, 1 write."""
     PERIODS_MISSED = 104
     """values[0]: periods missed by the tick that begins an episode of late ticks."""
+    LATENESS_OVER = 105
+    """A second without a missed period, or the end of the run, after more than one tick that missed some. values: the
+    periods missed in the whole episode, by how many ticks, and by one at most."""
 
 
 class Origin(IntEnum):

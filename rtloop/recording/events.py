@@ -40,6 +40,10 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
         meaning = {"mode": _name(Mode, values[0])}
     elif kind == Kind.TRIPPED:
         meaning = {"causes": trip_causes(values[0]), "reason": trip_reason(message, axes)}
+    elif kind == Kind.PERIODS_MISSED:
+        meaning = {"periods": json_value(values[0])}
+    elif kind == Kind.LATENESS_OVER:
+        meaning = dict(zip(("periods", "late_ticks", "largest"), map(json_value, values), strict=False))
     return {
         "tick": int(message["tick"]),
         "time_ns": time_ns,

@@ -123,9 +123,9 @@ class LoopBench:
         self._cursors[name] += int(copied)
         return out[: int(copied)]
 
-    def events(self) -> list[tuple[int, Kind, float, float]]:
-        """(tick, kind, first value, second value) of each new event."""
-        return [(int(e["tick"]), Kind(int(e["kind"])), *e["values"][:2].tolist()) for e in self.drain("events")]
+    def events(self, values: int = 2) -> list[tuple[Any, ...]]:
+        """Tick, kind and so many of the values of each new event."""
+        return [(int(e["tick"]), Kind(int(e["kind"])), *e["values"][:values].tolist()) for e in self.drain("events")]
 
     def send(self, kind: Kind, *values: float, axis: int = -1, origin: Origin = Origin.OPERATOR) -> None:
         """Put a command into the queue."""

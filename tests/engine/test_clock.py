@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rtloop.engine.clock import Clock, clock_context, paced_clock, unpaced_clock
+from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.signals import Flag
 from tests.engine.harness import AXIS, IDEAL, LoopBench, ScriptedClock, text
@@ -78,6 +79,28 @@ def test_a_late_tick_runs_once():
     assert bench.column(rows, "periods_missed").tolist() == [0, 0, 5, 0, 6]
     np.testing.assert_allclose(bench.column(rows, "lateness_us"), [20, 20, 90, 20, 10])
     assert bench.events() == [(2, Kind.PERIODS_MISSED, 5.0, 0.0)]  # the second belongs to the same episode
+
+
+def test_an_episode_of_late_ticks_is_told_of_as_a_whole():
+    """623 missed periods are not one event of 5: a second later, or as the run ends, the sum follows."""
+    ticks = 34_000
+    missed = np.zeros(ticks)
+    missed[[100, 105, 400]] = 5, 7, 611
+    missed[15_000] = 4  # alone: its first event says all
+    missed[30_000], missed[33_990] = 2, 3
+    script = np.zeros((ticks, 4))
+    script[:, 0] = 1e5 * (np.arange(ticks) + np.cumsum(missed))
+    script[:, 1], script[:, 2] = script[:, 0] + 1e3, missed
+    bench = LoopBench(RAW, clock=ScriptedClock(script))
+    bench.run(ticks + 1)  # the clock fails at the end of its script
+    assert bench.outcome is Outcome.DRIVER_FAILED
+    assert bench.events(3) == [
+        (100, Kind.PERIODS_MISSED, 5.0, 0.0, 0.0),
+        (10_400, Kind.LATENESS_OVER, 623.0, 3.0, 611.0),
+        (15_000, Kind.PERIODS_MISSED, 4.0, 0.0, 0.0),
+        (30_000, Kind.PERIODS_MISSED, 2.0, 0.0, 0.0),
+        (34_000, Kind.LATENESS_OVER, 5.0, 2.0, 3.0),
+    ]
 
 
 def test_measured_times_and_overruns():
