@@ -112,7 +112,7 @@ def _run_ticks(loop, until_tick):
 
 @jit
 def _prepare(loop):
-    """What a tick does before its deadline: schedule and commands, stop request, snapshot of the law."""
+    """What a tick does before its deadline: schedule and commands, stop request, and what is done once a second."""
     apply_commands(loop)
     failing = loop.failed == WRITE_FAILED  # one write may fail and the next succeed: the ramp is tried
     if loop.stopping == 0 and (failing or load_acquire(words_of(loop), STOP_WORD) != 0):
@@ -122,6 +122,8 @@ def _prepare(loop):
     if loop.tick >= loop.next_snapshot:
         _publish_snapshot(loop)
         loop.next_snapshot = loop.tick + loop.snapshot_ticks
+        if loop.tick >= loop.late_until:
+            _end_lateness(loop)
 
 
 @jit
@@ -256,14 +258,12 @@ def _report(loop, status, written, missed):
         publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), verb))
     if missed > 0.0:
         _note_lateness(loop, missed)
-    elif loop.late_ticks > 0 and loop.tick >= loop.late_until:
-        _end_lateness(loop)
 
 
 @seldom
 def _note_lateness(loop, missed):
-    """Begin an episode, or go on with it; it ends a second after its last tick that missed a period."""
-    if loop.late_ticks > 0 and loop.tick >= loop.late_until:
+    """Begin an episode, or go on with it; it is over when a second has passed without a missed period."""
+    if loop.tick >= loop.late_until:
         _end_lateness(loop)
     if loop.late_ticks == 0:
         publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))

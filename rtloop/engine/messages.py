@@ -50,8 +50,8 @@ class Kind(IntEnum):
     PERIODS_MISSED = 104
     """values[0]: periods missed by the tick that begins an episode of late ticks."""
     LATENESS_OVER = 105
-    """A second without a missed period, or the end of the run, after more than one tick that missed some. values: the
-    periods missed in the whole episode, by how many ticks, and by one at most."""
+    """One to two seconds without a missed period, or the end of the run, after more than one tick that missed some.
+    values: the periods missed in the whole episode, by how many ticks, and by one at most."""
 
 
 class Origin(IntEnum):

@@ -82,12 +82,12 @@ def test_a_late_tick_runs_once():
 
 
 def test_an_episode_of_late_ticks_is_told_of_as_a_whole():
-    """623 missed periods are not one event of 5: a second later, or as the run ends, the sum follows."""
-    ticks = 34_000
+    """623 missed periods are not one event of 5: with a snapshot a second later, or as the run ends, the sum follows."""
+    ticks = 38_000
     missed = np.zeros(ticks)
     missed[[100, 105, 400]] = 5, 7, 611
-    missed[15_000] = 4  # alone: its first event says all
-    missed[30_000], missed[33_990] = 2, 3
+    missed[22_000] = 4  # alone: its first event says all
+    missed[33_000], missed[37_990] = 2, 3
     script = np.zeros((ticks, 4))
     script[:, 0] = 1e5 * (np.arange(ticks) + np.cumsum(missed))
     script[:, 1], script[:, 2] = script[:, 0] + 1e3, missed
@@ -96,10 +96,10 @@ def test_an_episode_of_late_ticks_is_told_of_as_a_whole():
     assert bench.outcome is Outcome.DRIVER_FAILED
     assert bench.events(3) == [
         (100, Kind.PERIODS_MISSED, 5.0, 0.0, 0.0),
-        (10_400, Kind.LATENESS_OVER, 623.0, 3.0, 611.0),
-        (15_000, Kind.PERIODS_MISSED, 4.0, 0.0, 0.0),
-        (30_000, Kind.PERIODS_MISSED, 2.0, 0.0, 0.0),
-        (34_000, Kind.LATENESS_OVER, 5.0, 2.0, 3.0),
+        (20_000, Kind.LATENESS_OVER, 623.0, 3.0, 611.0),
+        (22_000, Kind.PERIODS_MISSED, 4.0, 0.0, 0.0),
+        (33_000, Kind.PERIODS_MISSED, 2.0, 0.0, 0.0),
+        (38_000, Kind.LATENESS_OVER, 5.0, 2.0, 3.0),
     ]
 
 
