@@ -82,7 +82,7 @@ def test_a_late_tick_runs_once():
 
 
 def test_an_episode_of_late_ticks_is_told_of_as_a_whole():
-    """623 missed periods are not one event of 5: with a snapshot a second later, or as the run ends, the sum follows."""
+    """623 missed periods are not one event of 5: a second or two later, or as the run ends, the sum follows."""
     ticks = 38_000
     missed = np.zeros(ticks)
     missed[[100, 105, 400]] = 5, 7, 611
