@@ -104,7 +104,7 @@ def _print_latency(latency: Latency) -> None:
         f"\n[bold]the loop's clock[/], {seconds:g} s at {pacing.rate_hz:g} Hz, {spin}: late by {quantiles} µs; "
         f"{int(latency.missed.sum())} periods missed; {latency.stolen_s:.2f} s stolen by a hypervisor"
     )
-    out.print(bars(_classes(latency)))
+    out.print(bars(_classes(latency), "late by µs"))
 
 
 def _classes(latency: Latency) -> list[dict[str, Any]]:

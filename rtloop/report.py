@@ -24,7 +24,7 @@ from rtloop.signals import Mode
 from rtloop.specifications import load_specification
 from rtloop.steps import step_metrics
 
-BAR = " ▁▂▃▄▅▆▇█"
+BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
 """Of a specification, in the order of the table."""
 LONGEST_STEP_ANALYSIS_TICKS = 6_000_000
@@ -120,21 +120,24 @@ def _print_timing(console: Console, summary: dict[str, Any]) -> None:
     console.print(table)
     histogram = summary.get("lateness_histogram")
     if histogram:
-        console.print("lateness  " + bars(histogram))
+        console.print(bars(histogram, "late by µs"))
     phases = summary["phases"]
     labels = (("read", "read_us"), ("law", "law_us"), ("write", "write_us"))
     console.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
 
 
-def bars(histogram: list[dict[str, Any]]) -> str:
-    """Counts per class as bars on a logarithmic scale."""
-    largest = max((entry["count"] for entry in histogram), default=0)
-    cells = []
-    for entry in histogram:
-        height = 0 if not entry["count"] else 1 + int(7 * entry["count"].bit_length() / max(largest.bit_length(), 1))
-        label = "more" if entry["below_us"] is None else f"<{entry['below_us']:g}"
-        cells.append(f"{label} {BAR[min(height, 8)]}{entry['count']}")
-    return "  ".join(cells) + "  (µs, count)"
+def bars(histogram: list[dict[str, Any]], heading: str) -> Table:
+    """Counts and shares per class, from the first class to the last that has any; a full bar is all of them."""
+    table = _table(heading, "ticks", "share", "")
+    table.columns[3].justify = "left"
+    counts = np.array([entry["count"] for entry in histogram])
+    edges = ["0", *(f"{entry['below_us']:g}" for entry in histogram[:-1]), ""]
+    some = np.flatnonzero(counts)
+    for k in range(some[0], some[-1] + 1) if some.size else ():
+        label = f"{edges[k]} … {edges[k + 1]}" if edges[k + 1] else f"{edges[k]} and more"
+        share = counts[k] / counts.sum()
+        table.add_row(label, f"{counts[k]:,}", f"{100 * share:.3g} %", "█" * round(BAR_WIDTH * share))
+    return table
 
 
 def _print_steps(prepared: Prepared, recording: str) -> None:

@@ -73,6 +73,11 @@ class Totals:
                 axis.add(column[f"{axis.name}_error_um"], column[f"{axis.name}_drive_v"], closed)
 
     @property
+    def executed(self) -> int:
+        """Ticks from the first to the last, whether they are in the recording or not."""
+        return int(self.last[0] - self.first[0]) if self.first else 0
+
+    @property
     def span_s(self) -> float:
         """From the first deadline to the last."""
         return (self.last[1] - self.first[1]) / 1e9 if self.first else 0.0
@@ -115,7 +120,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
         "ticks_lost": lost,
         "periods_missed": totals.periods_missed,
         "rate_hz": rate_hz,
-        "achieved_rate_hz": (totals.ticks - 1) / totals.span_s if totals.span_s else None,
+        "achieved_rate_hz": totals.executed / totals.span_s if totals.span_s else None,
         "duration_s": totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
         "paced": header["paced"],
         "overruns": totals.overruns,

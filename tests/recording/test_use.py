@@ -64,6 +64,17 @@ def test_summary_of_a_paced_run(path: Path, rows: np.ndarray):
     assert summary["size_bytes"] == path.stat().st_size
 
 
+def test_damage_is_no_lower_rate(path: Path, tmp_path: Path, rows: np.ndarray):
+    """Ticks that cannot be read were executed all the same."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged = tmp_path / "run.mcap"
+    damaged.write_bytes(data)
+    summary = summarise(damaged)
+    assert summary["ticks_lost"] > 100
+    assert summary["achieved_rate_hz"] == pytest.approx(10_000.0)
+
+
 def test_summary_of_an_unpaced_run_has_no_times(tmp_path: Path):
     path = write_recording(tmp_path / "run.mcap", make_rows(500, paced=False), paced=False)
     summary = summarise(path)
