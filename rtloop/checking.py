@@ -20,6 +20,7 @@ from rtloop.designing import verified
 from rtloop.errors import ConfigError
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import AxisCheck, Prepared, prepare
+from rtloop.terminal import console as _console
 
 ROWS = (
     ("stable", lambda loop: "yes" if loop.stable else "NO"),
@@ -45,7 +46,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     if as_json:
         click.echo(json.dumps(_report(prepared, warnings, shifts, judged)))
         return 0
-    console = Console(highlight=False)
+    console = _console()
     plan, facts = prepared.plan, prepared.facts
     axes = "1 axis" if len(plan.axes) == 1 else f"{len(plan.axes)} axes"
     console.print(

@@ -104,6 +104,8 @@ class Configuration:
     """A configuration whose every part is valid by itself; `rtloop.prepare` judges how the parts fit."""
 
     name: str
+    source: str
+    """Its file, or what else it is of, for messages."""
     folder: Path
     text: str
     loop: LoopOptions
@@ -157,6 +159,7 @@ def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
         raise ConfigError(source, faults)
     return Configuration(
         name=name,
+        source=source,
         folder=folder,
         text=text,
         loop=sections.loop,
@@ -201,7 +204,7 @@ def _validated(adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[st
 
 
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
-    """One line for each fault of `raw`, which stands at the key `prefix`."""
+    """One line for each fault of `raw`, which stands at the key `prefix`; None where it is not at hand."""
     details = error.errors(include_url=False)
     details = [detail for detail in details if not (detail["type"] == "too_short" and detail["input"])]
     more = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
@@ -228,7 +231,7 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
             node = node[part]  # type: ignore[index]
             name = node.get("name") if isinstance(part, int) and isinstance(node, dict) else None
             path.append(str(name if isinstance(name, str) else part))
-        elif detail["type"] in ("missing", "extra_forbidden") and part == detail["loc"][-1]:
+        elif raw is None or (detail["type"] in ("missing", "extra_forbidden") and part == detail["loc"][-1]):
             path.append(str(part))
     where = ".".join(path)
     if detail["type"] == "missing":
@@ -244,10 +247,10 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
         return f"{where}.kind: {detail['ctx']['tag']!r}: allowed are {detail['ctx']['expected_tags']}"
     if detail["type"] == "tuple_type" and isinstance(detail["input"], dict):
         return f"{where}: one table; a list of tables, each headed [[{where}]], is needed"
-    message = detail["msg"].removeprefix("Value error, ")
+    message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     value = detail["input"]
     shown = f" {_shown(value)}:" if isinstance(value, str | int | float | bool) else ""
-    return f"{where}:{shown} {message[0].lower()}{message[1:]}" if not shown else f"{where}:{shown} {message}"
+    return f"{where}:{shown} {message if shown else message[0].lower() + message[1:]}"
 
 
 def _shown(value: Any) -> str:

@@ -111,13 +111,13 @@ def verified(configuration: Configuration, axis: AxisOptions, spec: Path | None)
     design = DesignOptions() if spec is None else load_specification(spec).design
     model, options, where = axis.model or design.plant, axis.controller, f"axis.{axis.name}"
     if model is None:
-        raise ConfigError(configuration.name, [f"{where}.model: missing; there is no plant to verify against"])
+        raise ConfigError(configuration.source, [f"{where}.model: missing; there is no plant to verify against"])
     try:
         controller = options.transfer()
         discrete = discretise(controller, 1 / configuration.loop.rate_hz, options.method, options.prewarp_hz)
         return verify(controller, discrete, model.transfer(), design, model.delay_ticks), design
     except ValueError as error:
-        raise ConfigError(configuration.name, [f"{where}: {error}"]) from None
+        raise ConfigError(configuration.source, [f"{where}: {error}"]) from None
 
 
 def _write_report(

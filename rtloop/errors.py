@@ -20,6 +20,12 @@ LOW_SPACE = 1 << 16
 """Beyond every errno: less space is free than is to stay free."""
 
 
+def listed(source: str, faults: Sequence[str]) -> str:
+    """All faults of a file or request, a line each."""
+    count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+    return "\n  ".join([f"{source}: {count}", *faults])
+
+
 class RtloopError(Exception):
     """Base: the message names the thing, the value and what is allowed."""
 
@@ -32,9 +38,8 @@ class ConfigError(RtloopError):
     exit_code = 78
 
     def __init__(self, source: str, faults: Sequence[str]) -> None:
-        self.faults = list(faults)
-        count = "1 fault" if len(self.faults) == 1 else f"{len(self.faults)} faults"
-        super().__init__("\n  ".join([f"{source}: {count}", *self.faults]))
+        self.source, self.faults = source, list(faults)
+        super().__init__(listed(source, self.faults))
 
 
 class UnavailableError(RtloopError):

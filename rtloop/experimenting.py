@@ -108,9 +108,9 @@ def take_and_report(paths: Sequence[Path]) -> tuple[Report, dict[str, Path]]:
 def _axis(base: Configuration, name: str | None) -> AxisOptions:
     names = [axis.name for axis in base.axes]
     if name is None and len(names) > 1:
-        raise ConfigError(base.name, [f"it has the axes {', '.join(names)}: --axis says which one is meant"])
+        raise ConfigError(base.source, [f"it has the axes {', '.join(names)}: --axis says which one is meant"])
     if name is not None and name not in names:
-        raise ConfigError(base.name, [f"--axis {name}: there is no such axis; there are {', '.join(names)}"])
+        raise ConfigError(base.source, [f"--axis {name}: there is no such axis; there are {', '.join(names)}"])
     return next(axis for axis in base.axes if name in (None, axis.name))
 
 

@@ -76,7 +76,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     driver = findings.attempt("driver.", lambda: _driver(configuration))
     facts = driver and findings.attempt("", lambda: require_facts(driver, rate_hz, paced))
     if facts is None:
-        raise ConfigError(configuration.name, findings.faults)
+        raise ConfigError(configuration.source, findings.faults)
     if configuration.loop.enable_input is not None:
         enable_input = configuration.loop.enable_input
         findings.attempt("loop.enable_input: ", lambda: index_of(facts.inputs, enable_input))
@@ -92,7 +92,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     schedule = _schedule(configuration, facts, table, findings)
     ticks = _ticks(duration_s, rate_hz, findings)
     if findings.faults:
-        raise ConfigError(configuration.name, findings.faults)
+        raise ConfigError(configuration.source, findings.faults)
     plan = Plan(
         name=configuration.name,
         axes=tuple(axis.name for axis in configuration.axes),
@@ -117,7 +117,7 @@ def _driver(configuration: Configuration) -> Driver:
     try:
         return kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
     except DriverError as error:
-        raise ConfigError(configuration.name, [f"driver: {error}"]) from None
+        raise ConfigError(configuration.source, [f"driver: {error}"]) from None
 
 
 def _pacing(configuration: Configuration, paced: bool) -> Pacing:

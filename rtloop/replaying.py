@@ -56,7 +56,7 @@ def _coefficients(configuration: Configuration, recording: Recording) -> Records
     if configuration.loop.rate_hz != header["rate_hz"]:
         faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g}; the recording has {header['rate_hz']:g}")
     if faults:
-        raise ConfigError(configuration.name, faults)
+        raise ConfigError(configuration.source, faults)
     return prepare(changed(configuration, schedule=())).plan.coefficients.view(np.recarray)
 
 
@@ -64,9 +64,9 @@ def _rig(configuration: Configuration, recording: Recording) -> Driver:
     """The simulated rig of a configuration. Raises ConfigError where its driver is another one."""
     if configuration.driver_kind != "sim":
         fault = f"driver.kind: {configuration.driver_kind!r}; a new simulation needs the simulated rig, 'sim'"
-        raise ConfigError(configuration.name, [fault])
+        raise ConfigError(configuration.source, [fault])
     try:
         kind = driver_class(configuration.driver_kind)
         return kind(configuration.driver_options, configuration.wiring, recording.header["rate_hz"])
     except ValueError as error:
-        raise ConfigError(configuration.name, [f"driver.{error}"]) from None
+        raise ConfigError(configuration.source, [f"driver.{error}"]) from None

@@ -23,6 +23,7 @@ from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
 from rtloop.specifications import load_specification
 from rtloop.steps import step_metrics
+from rtloop.terminal import console
 
 BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
@@ -69,11 +70,11 @@ def print_run(prepared: Prepared, summary: dict[str, Any]) -> None:
 
 def print_summary(summary: dict[str, Any]) -> None:
     """What a recording holds, as tables."""
-    console = Console(highlight=False)
+    out = console()
     if "ticks_logged" not in summary:
-        console.print(f"nothing recorded in {escape(str(summary.get('recording')))}")
+        out.print(f"nothing recorded in {escape(str(summary.get('recording')))}")
         return
-    console.print(f"[bold]{escape(summary['recording'])}[/]  {_size(summary)}")
+    out.print(f"[bold]{escape(summary['recording'])}[/]  {_size(summary)}")
     table = _table("", "", "")
     expected = summary["ticks_expected"]
     table.add_row(
@@ -103,27 +104,27 @@ def print_summary(summary: dict[str, Any]) -> None:
         table.add_row(
             "[red]trip[/]", f"tick {trip['tick']}", "; ".join(filter(None, [", ".join(trip["causes"]), reason]))
         )
-    console.print(table)
+    out.print(table)
     if summary["lateness_us"] is not None:
-        _print_timing(console, summary)
+        _print_timing(out, summary)
     axes = _table("axis", "rms error µm", "largest drive V")
     for axis in summary["axes"]:
         error = "–" if axis["rms_error_um"] is None else f"{axis['rms_error_um']:.4f}"
         axes.add_row(axis["name"], error, f"{axis['max_abs_drive_v']:.3f}")
-    console.print(axes)
+    out.print(axes)
 
 
-def _print_timing(console: Console, summary: dict[str, Any]) -> None:
+def _print_timing(out: Console, summary: dict[str, Any]) -> None:
     table = _table("µs", "p50", "p99", "p99.9", "max")
     for label, key in (("lateness", "lateness_us"), ("tick", "exec_us")):
         table.add_row(label, *(f"{summary[key][name]:.2f}" for name in ("p50", "p99", "p999", "max")))
-    console.print(table)
+    out.print(table)
     histogram = summary.get("lateness_histogram")
     if histogram:
-        console.print(bars(histogram, "late by µs"))
+        out.print(bars(histogram, "late by µs"))
     phases = summary["phases"]
     labels = (("read", "read_us"), ("law", "law_us"), ("write", "write_us"))
-    console.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
+    out.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
 
 
 def bars(histogram: list[dict[str, Any]], heading: str) -> Table:
@@ -142,7 +143,7 @@ def bars(histogram: list[dict[str, Any]], heading: str) -> Table:
 
 def _print_steps(prepared: Prepared, recording: str) -> None:
     """Step metrics where references were micrometres, beside what each axis's own specification asks for."""
-    console, loaded = Console(highlight=False), load(recording)
+    out, loaded = console(), load(recording)
     table = _table("steps", "overshoot %", "settling ms (5 %)", "static error %")
     driven = np.isin(loaded["mode"], (Mode.FEEDFORWARD, Mode.CLOSED_LOOP))
     for axis in prepared.configuration.axes:
@@ -157,7 +158,7 @@ def _print_steps(prepared: Prepared, recording: str) -> None:
         for label, values in _asked(prepared.configuration, axis):
             table.add_row(label, *values)
     if table.row_count:
-        console.print(table)
+        out.print(table)
 
 
 def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[str, list[str]]]:
@@ -186,7 +187,7 @@ def print_drivers() -> None:
         limit_hz = found["max_rate_hz"]
         rate = "any" if limit_hz is None else f"{limit_hz:g} Hz"
         table.add_row(found["kind"], "yes" if found["real"] else "no", "rtloop's", rate, found["defined_in"])
-    Console(highlight=False).print(table)
+    console().print(table)
 
 
 def known_drivers() -> list[dict[str, Any]]:

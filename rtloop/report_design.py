@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import click
-from rich.console import Console
 from rich.table import Table
 
 from rtloop.design.synthesise import Synthesis
 from rtloop.design.verify import Verification
 from rtloop.design.verify_text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+from rtloop.terminal import console as _console
 
 RED = {"MISSED", "NO"}
 
@@ -30,7 +30,7 @@ def print_synthesis(found: Synthesis, slicot: float | None) -> None:
 
 def print_verification(name: str, found: Verification) -> None:
     """Every table of one axis, and the answer."""
-    console = Console(highlight=False, width=None if Console().is_terminal else 160)
+    console = _console()
     console.print(f"[bold]axis {name}[/]")
     console.print(_table(HEADINGS, table(found)))
     if found.robustness.shifts:

@@ -13,7 +13,6 @@ from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.progress import StatusLine
 from rtloop.terminal import console, table
 
-WIDTH = 150
 COLOURS = {"good": "green", "mixed": "yellow", "bad": "red", "": "default"}
 
 
@@ -58,7 +57,6 @@ def print_list() -> None:
 def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
     """Verdicts of every experiment; lines that are too long are left to the terminal."""
     shown = console()
-    shown.width = max(shown.width, WIDTH)
     for section in content["experiments"]:
         shown.print(f"[bold]{section['title']}[/]")
         if section["problem"]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
+WIDEST = 10_000
+
 
 def console() -> Console:
-    """The standard output, unhighlighted, long lines left to the terminal."""
-    return Console(highlight=False, soft_wrap=True)
+    """Standard output, unhighlighted; long lines are left to the terminal, and no number is cut to fit it."""
+    return Console(highlight=False, soft_wrap=True, width=WIDEST)
 
 
 def table(*headings: str) -> Table:

@@ -24,18 +24,27 @@ def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
     @wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> None:
         from drivers.errors import DriverError
-        from rtloop.errors import RtloopError, UnavailableError
+        from rtloop.errors import ConfigError, RtloopError, UnavailableError
 
         try:
             code = command(*args, **kwargs) or 0
         except (RtloopError, DriverError) as error:
             code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
-            click.echo(f"rtloop: {error}", err=True)
+            message = _with_lines(error) if isinstance(error, ConfigError) else str(error)
+            click.echo(f"rtloop: {message}", err=True)
             if kwargs.get("as_json"):
-                click.echo(json.dumps({"error": str(error), "exit_code": code}))
+                click.echo(json.dumps({"error": message, "exit_code": code}))
         sys.exit(code)
 
     return wrapped
+
+
+def _with_lines(error: Any) -> str:
+    """The faults of a configuration with the lines of its file."""
+    from rtloop.errors import listed
+    from rtloop.toml_lines import numbered
+
+    return listed(error.source, numbered(error.faults, error.source))
 
 
 class Seconds(click.ParamType):

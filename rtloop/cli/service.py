@@ -171,12 +171,7 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
 @fails_clearly
 def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repeat: bool) -> int:
     """Play the numbers in FILE (one a line) on AXIS."""
-    from rtloop.errors import RtloopError
-
-    try:
-        samples = [float(line) for line in file if line.strip()]
-    except ValueError as error:
-        raise RtloopError(f"{file.name}: {error}") from None
+    samples = _numbers(file)
     body = {"axis": axis, "samples": samples, "hold_ticks": hold_ticks, "repeat": repeat}
     click.echo(json.dumps(_client(context).post("/waveform", body)))
     return 0
@@ -206,7 +201,8 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
 
     axes = {one.name: one for one in load(config).axes}
     if axis not in axes or axes[axis].controller is None:
-        raise click.UsageError(f"{config}: no controller for axis {axis!r}; axes: {', '.join(axes)}")
+        has = f"axis {axis} has none" if axis in axes else f"its axes are {', '.join(axes)}"
+        raise click.UsageError(f"{config}: no controller for axis {axis!r}; {has}")
     section = axes[axis].controller
     assert section is not None
     body = {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
@@ -214,14 +210,25 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
     return 0
 
 
+def _numbers(file: Any) -> list[float]:
+    """One a line; empty lines are left out. Raises a usage error."""
+    found: list[float] = []
+    for number, line in enumerate(file, start=1):
+        try:
+            found += [float(line)] if line.strip() else []
+        except ValueError:
+            raise click.UsageError(f"{file.name}, line {number}: {line.strip()!r}; a number is needed") from None
+    return found
+
+
 def _inline_table(text: str) -> dict[str, Any]:
-    """TOML's inline table without its braces. Raises a usage error."""
+    """TOML's inline table without its braces. Raises a usage error, with no place in a text that nobody typed."""
     from rtloop.files import parse_toml
 
     try:
         return parse_toml(f"table = {{ {text} }}")["table"]
-    except ValueError as error:
-        raise click.UsageError(f"{text!r}: not `key = value, …`: {error}") from None
+    except ValueError:
+        raise click.UsageError(f"{text!r}: `key = value, key = value` is needed, values as in TOML") from None
 
 
 COMMANDS = (serve, park, hil, ctl)

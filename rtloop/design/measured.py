@@ -125,8 +125,12 @@ def _axis(recording: Recording, axis: str | None, path: Path) -> str:
     if axis is None and len(axes) == 1:
         return str(axes[0])
     if axis is None or axis not in axes:
-        raise RecordingError(f"{path}: axis {axis!r}; it holds {', '.join(axes) or 'none'}: --axis says which")
+        raise RecordingError(f"{path}: {_which(axis)}, it holds {', '.join(axes) or 'none'}: --axis says which")
     return axis
+
+
+def _which(axis: str | None) -> str:
+    return "of several axes" if axis is None else f"no axis {axis!r}"
 
 
 def _digest(paths: tuple[Path, ...]) -> str:

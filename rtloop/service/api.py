@@ -188,7 +188,7 @@ async def _answer(service: Service, lanes: Lanes, path: str, data: bytes | str) 
         wanted = None if body is None else body.model_validate_json(data)
         return JSONResponse(await lanes.run(LANES.get(path, Lane.ORDINARY), action, service, wanted))
     except ValidationError as error:
-        return _error(422, "; ".join(describe(error, "", {})))
+        return _error(422, "; ".join(describe(error, "", None)))
     except ConfigError as error:
         return _error(422, "; ".join(error.faults))
     except (Busy, UnavailableError) as error:

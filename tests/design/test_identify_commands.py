@@ -156,7 +156,7 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
     nothing, paper = tmp_path / "nothing.mcap", DEPLOY / "paper.toml"
     for code, says, *arguments in (
         (66, "nothing.mcap", "identify", "hysteresis", nothing),
-        (66, "axis 'y'; it holds x", "identify", "hysteresis", sine, "--axis", "y"),
+        (66, "no axis 'y', it holds x", "identify", "hysteresis", sine, "--axis", "y"),
         (2, "numbers separated by commas", "identify", "hysteresis", sine, "--thresholds", "a,b"),
         (78, "must be at least 0 and ascend", "identify", "hysteresis", sine, "--thresholds", "2,1"),
         (78, "another recording is needed", "identify", "dynamics", sine, "--criterion", "validation"),

@@ -1,0 +1,133 @@
+"""What a person reads where something is wrong: the line of a key, whole numbers, no place in a text nobody typed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from rtloop.cli import main
+from rtloop.toml_lines import key_lines, numbered
+from tests.recording.hand_made_loop import make_rows, write_recording
+from tests.recording.real_loop import TWO_AXES, record
+
+PAPER = Path(__file__).resolve().parents[1] / "deploy" / "paper.toml"
+TEXT = """# a comment with key = 1
+[loop]
+rate_hz = 10000
+"mode" = 'raw'
+
+[driver.channels.x]
+um_per_v = 10.0
+
+[[axis]]
+name = "x"
+[axis.limits]
+drive_v = 10.0
+[[axis]]
+margins.gain = 2.0
+name = 'y'
+[axis.limits]
+drive_v = 9.0
+[axis.feedforward]
+thresholds_v = [
+    0.0,
+    1.0,
+]
+[[schedule]]
+at_tick = 5
+[[schedule]]
+at_tick = 6
+"""
+
+
+def command(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def test_lines_of_keys() -> None:
+    lines = key_lines(TEXT)
+    expected = {
+        "loop": 2, "loop.rate_hz": 3, "loop.mode": 4, "driver.channels.x.um_per_v": 7, "axis.x": 9, "axis.x.name": 10,
+        "axis.x.limits.drive_v": 12, "axis.y": 13, "axis.y.margins.gain": 14, "axis.y.limits": 16,
+        "axis.y.limits.drive_v": 17, "axis.y.feedforward.thresholds_v": 19, "schedule.0.at_tick": 24,
+        "schedule.1.at_tick": 26,
+    }  # fmt: skip
+    assert {key: lines.get(key) for key in expected} == expected
+
+
+def test_faults_get_the_line_of_what_is_there(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text(TEXT)
+    faults = ["axis.y.feedforward.thresholds_v.1: nan", "axis.y.limits.slew: unknown", "recording.x: 1", "all: wrong"]
+    assert numbered(faults, str(file)) == [
+        "line 19: axis.y.feedforward.thresholds_v.1: nan",
+        "line 16: axis.y.limits.slew: unknown",
+        "recording.x: 1",
+        "all: wrong",
+    ]
+    assert numbered(faults, "no file") == faults
+
+
+def test_a_fault_is_found_in_the_file(tmp_path: Path) -> None:
+    """Both in a key by itself, and in how parts fit."""
+    text = PAPER.read_text()
+    file = tmp_path / "own.toml"
+    for old, new, at, said in (
+        ("um_per_v = 10.0", "um_per_v = nan", "um_per_v = nan", "driver.channels.x.um_per_v: nan: must be a finite"),
+        ("gain = 0.016", "gain = 16.0", "[axis.controller]", "axis.x.controller: the loop is unstable"),
+    ):
+        file.write_text(text.replace(old, new, 1))
+        line = file.read_text().splitlines().index(at) + 1
+        result = command("check", file)
+        assert result.exit_code == 78
+        assert f"{file}: 1 fault\n  line {line}: {said}" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("tune", "x", "limits", "drive_v="), "'drive_v=': `key = value, key = value` is needed"),
+        (("tune", "x", "limits", "{"), "'{': `key = value, key = value` is needed"),
+        (("controller", "x", PAPER.with_name("own-stage.toml")), "no controller for axis 'x'; axis x has none"),
+        (("controller", "z", PAPER), "no controller for axis 'z'; its axes are x"),
+    ],
+)
+def test_what_was_typed_is_what_is_named(arguments: tuple[object, ...], said: str) -> None:
+    result = command("ctl", *arguments)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert "column" not in result.stderr
+
+
+def test_a_line_of_a_waveform_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "wave.txt"
+    file.write_text("1.0\n\nabc\n")
+    result = command("ctl", "waveform", "x", file)
+    assert result.exit_code == 2
+    assert f"{file}, line 3: 'abc'; a number is needed" in result.stderr
+
+
+def test_an_axis_must_be_said_where_there_are_several(tmp_path: Path) -> None:
+    (path,) = record(tmp_path / "run.mcap", TWO_AXES, 200)
+    for arguments, said in (((), "of several axes, it holds x, y"), (("--axis", "z"), "no axis 'z', it holds x, y")):
+        result = command("identify", "hysteresis", path, *arguments)
+        assert result.exit_code == 66
+        assert f"{path}: {said}: --axis says which" in result.stderr
+
+
+def test_no_number_is_cut_in_a_narrow_terminal(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", make_rows(500))
+    shown = [
+        subprocess.run(
+            [sys.executable, "-m", "rtloop", "info", str(path)], capture_output=True, text=True,
+            env=os.environ | {"COLUMNS": columns}, check=True,
+        ).stdout
+        for columns in ("40", "200")
+    ]  # fmt: skip
+    assert shown[0] == shown[1]
+    assert "…" not in shown[0].replace(" … ", "")
