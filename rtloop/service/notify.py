@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import time
 
 
 class Notifier:
@@ -35,9 +34,8 @@ class Notifier:
         if self.watchdog_s and limit_s:
             self.send(WATCHDOG_USEC=round(limit_s * 1e6))
 
-    def due(self, period_s: float) -> bool:
-        """True once a period, for what is told again and again."""
-        now_s = time.monotonic()
+    def due(self, period_s: float, now_s: float) -> bool:
+        """True once a period of monotonic time, for what is told again and again."""
         if now_s < self._next_s:
             return False
         self._next_s = now_s + period_s

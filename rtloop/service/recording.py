@@ -106,7 +106,7 @@ class RecorderKeeper:
             return
         words = self._block.words
         behind = int(self._block["ticks_head"][0]) != int(words[Word.RECORDER_CURSOR])
-        stuck = self._watch.stalled(int(words[Word.RECORDER_CURSOR])) and behind
+        stuck = self._watch.stalled(int(words[Word.RECORDER_CURSOR]), time.monotonic()) and behind
         if (self.exit_code is not None or stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
             if not self._child.end():

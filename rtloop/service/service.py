@@ -255,7 +255,7 @@ class Service:
             self.notifier.send(READY=1)
         if self._told_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
-        if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4)):
+        if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):
             return
         if supervisor.ticks > self._told_ticks or supervisor.ended or supervisor.block.words[Word.STOP]:
             self.notifier.send(WATCHDOG=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import math
 
 STALL_PERIODS = 3.0
 
@@ -22,13 +22,12 @@ class StallWatch:
     def __init__(self, limit_s: float, longest_step_s: float) -> None:
         self._limit_s, self._longest_step_s = limit_s, longest_step_s
         self._counter: int | None = None
-        self._last_s = time.monotonic()
+        self._last_s = math.inf
         self.stalled_s = 0.0
 
-    def stalled(self, counter: int) -> bool:
-        """Call often; True once the counter stood still for the limit."""
-        now_s = time.monotonic()
-        step_s, self._last_s = now_s - self._last_s, now_s
+    def stalled(self, counter: int, now_s: float) -> bool:
+        """Call often, with a monotonic time; True once the counter stood still for the limit."""
+        step_s, self._last_s = max(now_s - self._last_s, 0.0), now_s
         if counter != self._counter:
             self._counter, self.stalled_s = counter, 0.0
         else:

@@ -215,7 +215,7 @@ class Supervisor:
             running and self.prepared.plan.pacing.paced and self.ticks and not self.block.words[Word.FINISHED_TICKS]
         ):
             return False
-        if not self._stall.stalled(self.ticks):
+        if not self._stall.stalled(self.ticks, time.monotonic()):
             return False
         self._stalled = True
         self._loop.end()
