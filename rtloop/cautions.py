@@ -11,7 +11,6 @@ from hil.options import RigOptions
 from rtloop.config import ChannelOptions, Configuration
 from rtloop.design.plays import loading_curve
 from rtloop.engine.messages import ALL_AXES, Kind
-from rtloop.identifying import actuator_model
 from rtloop.law.options import AxisOptions
 from rtloop.law.reference import Generator
 from rtloop.prepare import AxisCheck, Prepared
@@ -73,7 +72,7 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
 def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     """Limits that nothing can come to."""
     limits, interlocks = axis.limits, axis.interlocks
-    model = actuator_model(axis.feedforward)
+    model = axis.feedforward.actuator()
     reach_um = float(np.max(np.abs(loading_curve(model, np.array([limits.drive_v, -limits.lowest_v])))))
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"

@@ -140,7 +140,7 @@ def compensation_report(
     if command_um is None:
         axes = load_configuration(config).axes
         command_um = next(one for one in axes if axis in (None, one.name)).limits.command_um
-    actuator, (_, inverse) = actuator_model(read_feedforward(identified, axis)), compensator.models()
+    actuator, (_, inverse) = read_feedforward(identified, axis).actuator(), compensator.models()
     try:
         residual = residual_operator(actuator, inverse, command_um)
     except ValueError as fault:
@@ -175,18 +175,11 @@ def compensation_report(
     )
 
 
-def actuator_model(options: Any) -> PlayModel:
-    """The forward model as it was identified, its dead band included."""
-    if options.thresholds_v:
-        return PlayModel(np.array(options.thresholds_v), np.array(options.weights_um_per_v))
-    return options.models()[0]
-
-
 def _actuator(run: Measured, hysteresis: Path | None, axis: str | None) -> PlayModel:
     """From the file given, else from the configuration that the recording was made with."""
     if hysteresis is not None:
-        return actuator_model(read_feedforward(hysteresis, axis))
-    return actuator_model(feedforward_of(run.configuration, f"{run.name}: configuration", axis))
+        return read_feedforward(hysteresis, axis).actuator()
+    return feedforward_of(run.configuration, f"{run.name}: configuration", axis).actuator()
 
 
 def _compared(fit: DynamicsFit, run: Excitation) -> tuple[FrequencyResponse, Agreement]:

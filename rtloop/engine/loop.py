@@ -36,7 +36,32 @@ from rtloop.engine.trips import publish_trip
 from rtloop.law.law import counts_fit, evaluate, set_mode, update
 from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
 from rtloop.law.reference import reference_sample
-from rtloop.signals import COMMON_COUNT, PER_AXIS_COUNT, Flag, Mode
+from rtloop.signals import (
+    ADC,
+    COMMAND,
+    COMMON_COUNT,
+    DEADLINE,
+    DEMAND,
+    DRIVE,
+    DRIVER_STATUS,
+    ENABLE,
+    ERROR,
+    EXEC,
+    FLAGS,
+    LATENESS,
+    LAW,
+    MODE,
+    PER_AXIS_COUNT,
+    PERIODS_MISSED,
+    POSITION,
+    READ,
+    REFERENCE,
+    SAMPLE_AGE,
+    TICK,
+    WRITE,
+    Flag,
+    Mode,
+)
 
 
 class Outcome(IntEnum):
@@ -57,7 +82,7 @@ OVERRUN, WRITE_FAILED_FLAG, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.WRITE_F
 LOOP_ORIGIN, SUPERVISOR = int(Origin.LOOP), int(Origin.SUPERVISOR)
 STOP_KIND = int(Kind.STOP)
 TRIPPED, DRIVER_FAILED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED)
-PERIODS_MISSED, LATENESS_OVER = int(Kind.PERIODS_MISSED), int(Kind.LATENESS_OVER)
+LATENESS_BEGINS, LATENESS_OVER = int(Kind.PERIODS_MISSED), int(Kind.LATENESS_OVER)
 DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
 COEFFICIENT_BYTES, STATE_BYTES, LOOP_STATE_BYTES = COEFFICIENTS.itemsize, STATE.itemsize, LOOP_STATE.itemsize
 US_PER_NS = 1e-3
@@ -150,18 +175,18 @@ def _tick(loop):
     ring, position = tick_ring(loop), np.uint64(loop.tick)
     row = ring.slots[claim(ring, position)]
     _fill_signals(loop, row)
-    row[0] = float(loop.tick)
-    row[1] = deadline_ns
-    row[2] = lateness_us
-    row[3] = (read_ns - wake_ns) * US_PER_NS
-    row[4] = (law_ns - read_ns) * US_PER_NS
-    row[5] = (write_ns - law_ns) * US_PER_NS
-    row[7] = missed
-    row[9] = float(state.mode)
-    row[10] = float(status)
-    row[6] = (_now(loop) - wake_ns) * US_PER_NS
-    overrun = lateness_us + row[6] > loop.period_us
-    row[8] = float(state.tick_flags | (OVERRUN if overrun else 0) | (WRITE_FAILED_FLAG if written < 0 else 0))
+    row[TICK] = float(loop.tick)
+    row[DEADLINE] = deadline_ns
+    row[LATENESS] = lateness_us
+    row[READ] = (read_ns - wake_ns) * US_PER_NS
+    row[LAW] = (law_ns - read_ns) * US_PER_NS
+    row[WRITE] = (write_ns - law_ns) * US_PER_NS
+    row[PERIODS_MISSED] = missed
+    row[MODE] = float(state.mode)
+    row[DRIVER_STATUS] = float(status)
+    row[EXEC] = (_now(loop) - wake_ns) * US_PER_NS
+    overrun = lateness_us + row[EXEC] > loop.period_us
+    row[FLAGS] = float(state.tick_flags | (OVERRUN if overrun else 0) | (WRITE_FAILED_FLAG if written < 0 else 0))
     publish(ring, position)
 
 
@@ -229,17 +254,17 @@ def _fill_signals(loop, row):
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
     axes = axes_of(loop)
-    row[11] = inputs[loop.input_count]
-    row[12] = conditions_of(loop).enable_v
+    row[SAMPLE_AGE] = inputs[loop.input_count]
+    row[ENABLE] = conditions_of(loop).enable_v
     for a in range(loop.axis_count):
         column = COMMON_COUNT + a * PER_AXIS_COUNT
-        row[column] = adc_v[a]
-        row[column + 1] = axes[a].position_um
-        row[column + 2] = references[a]
-        row[column + 3] = axes[a].error_um
-        row[column + 4] = axes[a].command_um
-        row[column + 5] = axes[a].demand_v
-        row[column + 6] = axes[a].drive_v
+        row[column + ADC] = adc_v[a]
+        row[column + POSITION] = axes[a].position_um
+        row[column + REFERENCE] = references[a]
+        row[column + ERROR] = axes[a].error_um
+        row[column + COMMAND] = axes[a].command_um
+        row[column + DEMAND] = axes[a].demand_v
+        row[column + DRIVE] = axes[a].drive_v
     column = COMMON_COUNT + loop.axis_count * PER_AXIS_COUNT
     for i in range(loop.observed_count):
         row[column + i] = inputs[loop.input_count + 1 + i]
@@ -266,7 +291,7 @@ def _note_lateness(loop, missed):
     if loop.tick >= loop.late_until:
         _end_lateness(loop)
     if loop.late_ticks == 0:
-        publish_event(loop, PERIODS_MISSED, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))
+        publish_event(loop, LATENESS_BEGINS, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))
     periods = np.int64(missed)
     loop.late_ticks += 1
     loop.late_periods += periods

@@ -11,7 +11,6 @@ from rtloop.design.plays import loading_curve
 from rtloop.design.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Timeline
-from rtloop.identifying import actuator_model
 from rtloop.law.options import AxisOptions
 
 UNKNOWN_PEAK, LEAST_PEAK = 1.4, 1.1
@@ -52,7 +51,7 @@ class Setting:
         """How far a slow drive may go to both sides: by its limits, and where the position trips."""
         largest_v = min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
         drives_v = np.linspace(0.0, largest_v, 1001)
-        moved_um = np.abs(loading_curve(actuator_model(self.axis.feedforward), drives_v))
+        moved_um = np.abs(loading_curve(self.axis.feedforward.actuator(), drives_v))
         beyond = np.flatnonzero(moved_um > self.trips_um)
         return float(drives_v[max(beyond[0] - 1, 1)]) if beyond.size else largest_v
 
@@ -65,7 +64,7 @@ class Setting:
     def um_per_v(self) -> float:
         """Static gain of the axis's hysteresis model over its whole range."""
         largest_v = self.axis.limits.drive_v
-        return float(loading_curve(actuator_model(self.axis.feedforward), largest_v) / largest_v)
+        return float(loading_curve(self.axis.feedforward.actuator(), largest_v) / largest_v)
 
     @property
     def largest_command_um(self) -> float:

@@ -17,7 +17,6 @@ from rtloop.experiments.derive import about
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
 from rtloop.experiments.verdict import Row
-from rtloop.identifying import actuator_model
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import AxisOptions
 from rtloop.recording.errors import RecordingError
@@ -66,7 +65,7 @@ class Taken:
     @property
     def actuator_model(self) -> PlayModel:
         """The forward hysteresis model as it was identified, its dead band included."""
-        return actuator_model(self.axis_options.feedforward)
+        return self.axis_options.feedforward.actuator()
 
     @cached_property
     def model(self) -> LinearModel | None:

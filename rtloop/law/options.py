@@ -35,6 +35,12 @@ class FeedforwardOptions(Options):
             raise ValueError("dead_band is 'exact': allowed only with thresholds_v, whose first value it needs")
         return self
 
+    def actuator(self) -> PlayModel:
+        """The forward model as it was identified, its dead band included."""
+        if self.thresholds_v:
+            return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))
+        return self.models()[0]
+
     def models(self) -> tuple[PlayModel, PlayModel]:
         """Forward model and inverse, consistent with each other."""
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):

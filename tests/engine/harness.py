@@ -136,7 +136,9 @@ class LoopBench:
         return rows[:, self.plan.columns.index(name)]
 
 
-SCRIPT = np.dtype([("rows", np.int64), ("row", np.int64), ("address", np.int64), ("now_ns", np.float64)])
+SCRIPT = np.dtype(
+    [("rows", np.int64), ("row", np.int64), ("address", np.int64), ("looks", np.int64), ("now_ns", np.float64)]
+)
 
 
 @cfunc(SIGNATURE)
@@ -149,16 +151,17 @@ def scripted_wait(context, timing):
     out = carray(timing, 4)
     for i in range(4):
         out[i] = data[script.row, i]
-    script.now_ns = out[1]
+    script.now_ns, script.looks = out[1], 0
     script.row += 1
     return 0
 
 
 @cfunc(SIGNATURE)
 def scripted_now(context, timing):
-    """10 µs pass between one look at the clock and the next."""
+    """4 µs pass before the first look at the clock in a tick, 8 µs before the second, and so on."""
     script = carray(context, 1, SCRIPT)[0]
-    script.now_ns += 10_000.0
+    script.looks += 1
+    script.now_ns += 4_000.0 * script.looks
     carray(timing, 4)[0] = script.now_ns
     return 0
 

@@ -12,7 +12,6 @@ from rtloop.config import load
 from rtloop.experiments.harmonic import hysteresis_db
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.promised import Promised
-from rtloop.identifying import actuator_model
 from rtloop.law.options import AxisOptions
 
 RATE_HZ = 10_000.0
@@ -137,7 +136,7 @@ def test_the_papers_printed_equations() -> None:
     tracking = found.tracking(0.01)
     assert tracking is not None
     assert 20 * np.log10(abs(tracking[0])) == pytest.approx(-0.0145, abs=1e-4)
-    actuator, inverse = actuator_model(axis.feedforward), axis.feedforward.models()[1]
+    actuator, inverse = axis.feedforward.actuator(), axis.feedforward.models()[1]
     raw, behind_inverse = hysteresis_db(actuator, inverse, 4.30185, 2.0)
     at_rest_db = 20 * np.log10(1.01086)
     assert (raw + at_rest_db, behind_inverse + at_rest_db) == pytest.approx((-5.213, -0.746), abs=0.002)
