@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -73,7 +74,8 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
         for number, one in enumerate(runs):
             text = derived(made, "x", name, options.model_dump(mode="json"), one, len(runs), values).text
             files += record(folder / f"{name}-{number}.mcap", text, one.timeline.ticks)
-    content = report(take(files)).content
+    takings = take(files)
+    content = report(takings).content
     assert not any(word in json.dumps(content, ensure_ascii=False).lower() for word in ("paper", "eq (", "fig "))
     rows = {row["quantity"]: row for section in content["experiments"] for row in section["rows"]}
     assert {section["problem"] for section in content["experiments"]} == {None}
@@ -81,6 +83,10 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
     assert rows["settling time to 5 %, median"]["met"]
     assert rows["what is left at 2.9 Hz"]["met"]
     assert rows["what is left at 50 Hz"]["met"] is None  # asked up to 5 Hz
+    disturbed = [taken for taken in takings if taken.experiment == "disturbance"]
+    curves = EXPERIMENTS["disturbance"].analyse(disturbed, options).curves
+    assert curves["time_ms"] == pytest.approx(0.1 * np.arange(1500))  # 150 ms of ticks of 0.1 ms, from the step on
+    assert 0.0 < curves["time_ms"][np.abs(curves["step"]).argmax()] < 10.0
     for quantity in ("frequency of the ringing", "overshoot", "final position", "what is left at 1 Hz"):
         assert rows[quantity]["as_the_model"], rows[quantity]
 

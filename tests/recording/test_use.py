@@ -187,3 +187,9 @@ def test_decimation_keeps_every_peak(tmp_path: Path):
     assert band.time_s[band.high.argmax()] == pytest.approx(1.2345, abs=0.01)
     few = read_bands(recording, ["x_error_um"], 1.2, 1.3, points=5_000)["x_error_um"]
     assert np.array_equal(few.low, few.high)
+
+
+def test_times_are_counted_to_the_nearest_nanosecond():
+    histogram = Histogram()
+    histogram.add(np.array([0.0006, 0.0014, 0.0016, 7.0004999]))
+    assert histogram.quantiles_us(0.25, 0.5, 0.75, 1.0) == [0.001, 0.001, 0.002, 7.0]

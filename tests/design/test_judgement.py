@@ -1,0 +1,66 @@
+"""Limits, and the figures that they are about, on loops whose answers can be written down."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from rtloop.design.closedloop import continuous_loop, discrete_loop
+from rtloop.design.discretise import discretise
+from rtloop.design.judgement import described, limits
+from rtloop.design.margins import margins
+from rtloop.design.specification import CommandOptions, DisturbanceOptions, SensorOptions, SpecificationOptions
+from rtloop.design.transfer import Transfer
+
+PERIOD_S, POLE, GAIN = 1e-3, 200.0, 3.0
+PLANT = Transfer.from_zpk([], [-POLE], POLE)
+PROPORTIONAL = Transfer.from_zpk([], [], GAIN)
+
+
+@pytest.mark.parametrize(
+    ("asked", "name", "good", "bad"),
+    [
+        (SpecificationOptions(overshoot_percent=5.0), "overshoot_percent", 4.0, 6.0),
+        (SpecificationOptions(static_error_percent=0.1), "static_error_percent", 0.05, 0.2),
+        (SpecificationOptions(settling_ms=3.0), "settling_ms", 2.0, 4.0),
+        (SpecificationOptions(bandwidth_hz=50.0), "bandwidth_hz", 60.0, 40.0),
+        (SpecificationOptions(command=CommandOptions(reference_um=20.0, command_um=22.0)), "peak_command", 1.0, 1.2),
+        (SpecificationOptions(disturbance=DisturbanceOptions(largest_um=1.0, error_um=0.1, up_to_hz=5.0)),
+         "disturbance_hz", 6.0, 4.0),
+        (SpecificationOptions(disturbance=DisturbanceOptions(largest_um=1.0, error_um=0.1)),
+         "disturbance_hz", math.inf, 1e6),
+    ],
+)  # fmt: skip
+def test_a_limit_has_a_direction(asked: SpecificationOptions, name: str, good: float, bad: float) -> None:
+    (found,) = limits(asked).items()
+    assert found[0] == name
+    assert found[1].met(good)
+    assert found[1].met(found[1].value)
+    assert not found[1].met(bad)
+    assert not found[1].met(math.nan)
+
+
+def test_noise_of_the_sensor_in_position_and_command() -> None:
+    """x⁺ = a x − b K (x + n): var x = (b K)² σ²/(1 − (a − b K)²), and v = −K (x + n) holds the noise itself."""
+    sigma_nm, a = 10.0, math.exp(-POLE * PERIOD_S)
+    b = 1 - a
+    loop = discrete_loop(discretise(PROPORTIONAL, PERIOD_S), PLANT)
+    found = described(loop, SensorOptions(noise_um=1e-3 * sigma_nm))
+    variance_x = (b * GAIN * sigma_nm) ** 2 / (1 - (a - b * GAIN) ** 2)
+    assert found["noise_x_nm"] == pytest.approx(math.sqrt(variance_x))
+    assert found["noise_v_nm"] == pytest.approx(GAIN * math.sqrt(variance_x + sigma_nm**2))
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_gain_margin_may_lie_at_0_hz(held: bool) -> None:
+    """L(0) = −0.4 is the nearest that L comes to −1: 2.5 times the gain, and a real pole is on its way out."""
+    wrong_sign = Transfer.from_zpk([], [], -0.4)
+    loop = discrete_loop(discretise(wrong_sign, PERIOD_S), PLANT) if held else continuous_loop(wrong_sign, PLANT)
+    found = margins(loop)
+    assert found.gain_margin == pytest.approx(2.5)
+    assert found.gain_margin_hz == 0.0
+    for gain, stable in ((0.4 * 2.49, True), (0.4 * 2.51, False)):
+        assert continuous_loop(Transfer.from_zpk([], [], -gain), PLANT).is_stable is stable
+    assert np.isnan(found.crossover_hz)
