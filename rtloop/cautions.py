@@ -30,9 +30,9 @@ def cautions(prepared: Prepared) -> list[str]:
             *_margins(axis, check),
             *_references(prepared, axis),
             *_reach(axis, channel),
-            *_sensor(configuration, axis, channel),
         )
         found += [f"axis.{axis.name}.{line}" for line in lines]
+        found += _sensor(configuration, axis, channel)
     return found
 
 
@@ -88,7 +88,7 @@ def _sensor(configuration: Configuration, axis: AxisOptions, channel: ChannelOpt
     if not isinstance(options, RigOptions):
         return
     there = options.plants.get(axis.name, options.plant).sensor.um_per_v
-    where = f"um_per_v: {channel.um_per_v:g} µm/V in driver.channels.{axis.name}"
+    where = f"driver.channels.{axis.name}.um_per_v: {channel.um_per_v:g} µm/V"
     if channel.um_per_v < 0 < there:
         yield f"{where}, of the other sign than the simulated sensor's {there:g}: the feedback is positive"
     elif abs(channel.um_per_v / there - 1) > SAME_SCALE:

@@ -27,7 +27,7 @@ PROVOKED = [
     (((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"), RAW), "reference: -20 V … 20 V, beyond the drive's limits"),
     ((("position_um = 60.0", "position_um = 120.0"),), "interlocks.position_um: 120 µm; the sensor's range"),
     ((("um_per_v = 10.0", "um_per_v = -10.0"),), "of the other sign than the simulated sensor's 10: the feedback is"),
-    ((("um_per_v = 10.0", "um_per_v = 20.0"),), "20 µm/V in driver.channels.x, but the simulated sensor has 10"),
+    ((("um_per_v = 10.0", "um_per_v = 20.0"),), "driver.channels.x.um_per_v: 20 µm/V, but the simulated sensor has 10"),
 ]
 
 

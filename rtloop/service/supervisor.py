@@ -230,10 +230,12 @@ class Supervisor:
             if "ready" in self._reports and self.recorder.state >= ProcessState.READY:
                 self.realtime = self._reports["ready"]["realtime"]
                 return
-            if self._loop.exit_code is not None:
+            if self._loop.exit_code is not None and "ready" not in self._reports:
                 self._loop.wait(1.0)
                 self._collect()
-                self._raise_failure(self._loop.exit_code)
+                if "ready" not in self._reports:
+                    self._raise_failure(self._loop.exit_code)
+                continue  # it was ready, and was stopped before anybody looked
             if self.recorder.exit_code is not None:
                 raise LoopFault(f"the recorder's process ended with {self.recorder.exit_code} before the run began")
             if time.monotonic() > deadline:

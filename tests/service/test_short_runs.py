@@ -11,13 +11,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
 import rtloop
 from rtloop.cli import main
+from rtloop.engine.memory import ProcessState
 from rtloop.recording.session import Options, Session
+from rtloop.service.supervisor import Supervisor
 from tests.recording.real_loop import PAPER, RealLoop, changed
 from tests.service.test_python_driver import DRIVER, install
 from tests.service.test_run import ROOT, start
@@ -111,3 +115,25 @@ def test_ctrl_c_before_the_loop_runs_ends_well(tmp_path: Path) -> None:
     assert recorded or "nothing was driven, nothing is recorded" in err
     for path in recorded:
         assert uses(path)["info"] == 0
+
+
+class StoppedLoop:
+    """A loop's process that was stopped as soon as it was ready: its report comes with its end."""
+
+    def __init__(self) -> None:
+        self.exit_code, self.waited = 0, False
+
+    def wait(self, _: float) -> int:
+        self.waited = True
+        return 0
+
+    def reports(self) -> list[dict[str, object]]:
+        return [{"report": "ready", "realtime": {"scheduler": "SCHED_OTHER"}}] if self.waited else []
+
+
+def test_a_loop_that_was_stopped_before_anybody_saw_it_ready_was_ready() -> None:
+    supervisor: Any = object.__new__(Supervisor)
+    supervisor._loop, supervisor._reports = StoppedLoop(), {}
+    supervisor.recorder = SimpleNamespace(state=ProcessState.READY, exit_code=None)
+    supervisor._await_ready()
+    assert supervisor.realtime == {"scheduler": "SCHED_OTHER"}
