@@ -50,7 +50,7 @@ def test_the_papers_configuration_gives_no_cause() -> None:
 @pytest.mark.parametrize(("changes", "said"), PROVOKED, ids=[said[:30] for _, said in PROVOKED])
 def test_each_is_said_in_a_line(changes: tuple[tuple[str, str], ...], said: str) -> None:
     lines = found(changed(*changes))
-    assert any(line.startswith("axis.x.") and said in line for line in lines), lines
+    assert any(line.startswith(("axis.x.", "driver.channels.x.")) and said in line for line in lines), lines
 
 
 def test_a_reference_of_the_schedule_counts() -> None:

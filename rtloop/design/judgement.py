@@ -98,6 +98,6 @@ def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
     if loop.period_s is None or not loop.is_stable or sensor.deviation_um == 0:
         return {}
     a, b, c, d = loop.matrices
-    covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b)) @ c.T
+    covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c.T
     x, v = 1e3 * sensor.deviation_um * np.sqrt(np.diag(covariance) + d**2)
     return {"noise_x_nm": float(x), "noise_v_nm": float(v)}
