@@ -14,7 +14,7 @@ from rtloop.engine.messages import ALL_AXES, Kind
 from rtloop.law.options import AxisOptions
 from rtloop.law.reference import Generator
 from rtloop.prepare import AxisCheck, Prepared
-from rtloop.references import extent
+from rtloop.references import extent, volts
 from rtloop.signals import Mode
 
 SAME_SCALE = 0.01
@@ -64,7 +64,7 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
         lowest, highest = extent(values, plan.table[first : first + count])
         if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
-            yield f"{where}: {lowest:g} V … {highest:g} V, beyond the drive's limits, {allowed}"
+            yield f"{where}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP) and max(-lowest, highest) > limits.command_um:
             yield f"{where}: reaches {max(-lowest, highest):g} µm, beyond limits.command_um = {limits.command_um:g}"
 

@@ -118,6 +118,11 @@ def _numbers(text: str) -> npt.NDArray[np.float64]:
     return np.array(numbers)
 
 
+def volts(lowest: float, highest: float) -> str:
+    """An extent in words."""
+    return f"{lowest:g} V" if lowest == highest else f"{lowest:g} V … {highest:g} V"
+
+
 def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Lowest and highest value that a generator can come to; (0, 0) for an input, of which it is not known before."""
     kind = Generator(int(values[0]))

@@ -20,7 +20,7 @@ from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 from rtloop.prepare import Prepared
-from rtloop.references import TableOfSamples, extent, generator_values
+from rtloop.references import TableOfSamples, extent, generator_values, volts
 from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused, Taken
 from rtloop.signals import MODE, Mode
@@ -187,7 +187,7 @@ class LiveLaw:
         if self._in_raw_mode():
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
                 allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v), and mode raw takes volts"
-                raise _unsuitable(f"reference: {lowest:g} V … {highest:g} V, beyond the axis's {allowed}")
+                raise _unsuitable(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
         elif not (most := max(-lowest, highest)) <= limits.command_um:
             limit = limits.command_um
             raise _unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
