@@ -14,6 +14,7 @@ test: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+	$(BIN)/python -m rtloop.warm
 	$(BIN)/pytest -n 2 --dist loadfile
 
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.

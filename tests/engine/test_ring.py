@@ -115,7 +115,7 @@ def test_no_torn_read_under_a_writer_that_never_waits(slots):
     writer = threading.Thread(target=hammer, args=(ring, stop))
     writer.start()
     try:
-        wrong, lost, laps = watch(ring, out, 300_000)
+        wrong, lost, laps = watch(ring, out, 100_000)
     finally:
         stop[0] = 1
         writer.join()

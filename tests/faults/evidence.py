@@ -15,7 +15,7 @@ from hil.board import LSB_V, BoardMemory
 from tests.faults import plain_card
 from tests.faults.configuration import SLEW_V_PER_S
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 POLL_S = 0.002
 
 
