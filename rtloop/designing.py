@@ -12,7 +12,6 @@ import click
 from rtloop.config import Configuration, load, parse
 from rtloop.design.assumptions import NoController
 from rtloop.design.augment import augmented
-from rtloop.design.discretise import discretise
 from rtloop.design.section import controller_configuration, controller_section
 from rtloop.design.specification import DesignOptions
 from rtloop.design.synthesise import Synthesis, synthesise_design
@@ -20,6 +19,7 @@ from rtloop.design.verify import Verification, as_dict, verify
 from rtloop.design.verify_page import page
 from rtloop.errors import ConfigError, NoDesign, OutputError
 from rtloop.law.options import AxisOptions
+from rtloop.linear.discretise import discretise
 from rtloop.prepare import prepare
 from rtloop.report_design import print_synthesis, print_verification
 from rtloop.specifications import load_specification

@@ -13,9 +13,7 @@ from drivers.errors import DriverError
 from drivers.registry import driver_class
 from rtloop.config import Configuration, ScheduleOptions
 from rtloop.design.compare import Comparison, compare
-from rtloop.design.discretise import DiscreteController, discretise
 from rtloop.design.loop import LoopAnalysis, analyse_continuous, analyse_discrete
-from rtloop.design.transfer import Transfer
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
@@ -23,6 +21,8 @@ from rtloop.law.build import axis_coefficients, joined
 from rtloop.law.layout import Records
 from rtloop.law.options import AxisOptions
 from rtloop.law.reference import GENERATOR
+from rtloop.linear.discretise import DiscreteController, discretise
+from rtloop.linear.transfer import Transfer
 from rtloop.references import TableOfSamples, generator_values
 from rtloop.signals import Mode
 

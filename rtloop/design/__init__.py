@@ -1,1 +1,1 @@
-"""Design of controllers: transfer functions, discretisation, and the analysis of the loop before it runs."""
+"""From recordings and specifications to a verified controller."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from hil.linear import Complex
 from rtloop.design.closedloop import discrete_loop
-from rtloop.design.discretise import Method, discretise
 from rtloop.design.margins import margins
-from rtloop.design.transfer import Transfer
 from rtloop.law.layout import MAX_ORDER
+from rtloop.linear.discretise import Method, discretise
+from rtloop.linear.transfer import Transfer
 
 FAR = 1000.0
 """A root beyond so many times half the sampling rate turns the phase there by less than 0.06°: it is left out."""

@@ -18,8 +18,8 @@ from scipy.linalg import block_diag
 
 from hil.linear import Complex, Real
 from rtloop.design.closedloop import realised
-from rtloop.design.transfer import Transfer
 from rtloop.design.weights import Weights
+from rtloop.linear.transfer import Transfer
 
 
 class Matrices(NamedTuple):

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.linear import Complex, Real
-from rtloop.design.discretise import DiscreteController, held
-from rtloop.design.realisation import System, beside_imaginary_axis, realise
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import DiscreteController, held
+from rtloop.linear.realisation import System, beside_imaginary_axis, realise
+from rtloop.linear.transfer import Transfer
 
 
 @dataclass(frozen=True, eq=False)

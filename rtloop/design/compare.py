@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from hil.linear import Complex, Real
-from rtloop.design.discretise import DiscreteController
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.transfer import Transfer
 
 LIGHT_DAMPING = 0.2
 """Damping ratio below which a pair of roots counts as a notch (zeros) or a resonance (poles)."""

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_continuous_lyapunov
 
 from hil.linear import Complex, Modal, Real
-from rtloop.design.realisation import System
+from rtloop.linear.realisation import System
 
 
 def modal_root(poles: Complex, inputs: Complex) -> Real:

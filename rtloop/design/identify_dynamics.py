@@ -31,10 +31,10 @@ from rtloop.design.prediction_error import (
     refined,
     rms_error,
 )
-from rtloop.design.realisation import system_of
 from rtloop.design.residuals import ResidualTests, residual_tests
-from rtloop.design.transfer import Transfer
-from rtloop.design.zeros import zeros_and_gain
+from rtloop.linear.realisation import system_of
+from rtloop.linear.transfer import Transfer
+from rtloop.linear.zeros import zeros_and_gain
 
 Criterion = Literal["aic", "held-out", "validation"]
 LEAST_EXCITED = 4

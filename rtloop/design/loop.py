@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
-from rtloop.design.discretise import DiscreteController
 from rtloop.design.margins import margins
 from rtloop.design.reach import reach
 from rtloop.design.step import step_metrics
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.transfer import Transfer
 
 TIMES_S = (0.001, 0.002, 0.003, 0.005, 0.010)
 """When the step response is reported."""

@@ -3,7 +3,7 @@
 The rig in `hil` keeps a copy of D(s) of its own on purpose: the plant and the model of the plant are independent.
 """
 
-from rtloop.design.transfer import Transfer
+from rtloop.linear.transfer import Transfer
 
 PAPER_D = Transfer.from_factors(
     -20.7,

@@ -17,8 +17,8 @@ import numpy as np
 
 from hil.linear import Modal, Real, RepeatedPoles, modal_sum
 from rtloop.design.gramian import modal_root, modal_vectors, real_modal_system, system_roots
-from rtloop.design.realisation import System, beside_imaginary_axis, cascade, scaled
-from rtloop.design.transfer import Transfer
+from rtloop.linear.realisation import System, beside_imaginary_axis, cascade, scaled
+from rtloop.linear.transfer import Transfer
 
 ReductionMethod = Literal["residualise", "truncate"]
 MINIMAL = 1e-14

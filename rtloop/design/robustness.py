@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
-from rtloop.design.discretise import DiscreteController
 from rtloop.design.judgement import Limit, specified
 from rtloop.design.loop import lightest_pair, with_resonance_shifted
 from rtloop.design.margins import crossings
 from rtloop.design.reach import reach
 from rtloop.design.specification import SpecificationOptions
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.transfer import Transfer
 
 Maker = Callable[[Transfer], Loop]
 

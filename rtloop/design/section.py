@@ -16,7 +16,7 @@ from rtloop import __version__
 from rtloop.design.specification import DesignOptions
 from rtloop.design.synthesise import Synthesis
 from rtloop.design.toml_text import roots, section
-from rtloop.design.transfer import Transfer
+from rtloop.linear.transfer import Transfer
 
 STAND_IN_UM_PER_V = 4.3
 """Of the rig that is written around a controller: a proportional actuator."""

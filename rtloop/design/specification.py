@@ -12,9 +12,9 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from hil.options import Options
-from rtloop.design.transfer import Transfer
 from rtloop.design.weights import DisturbanceRule, Weights, command_weight, disturbance_weight, tracking_weight
 from rtloop.law.options import ModelOptions, TransferOptions
+from rtloop.linear.transfer import Transfer
 
 
 class DisturbanceOptions(Options):

@@ -20,8 +20,8 @@ from rtloop.design.norm import hinf_norm
 from rtloop.design.normalised import normalised
 from rtloop.design.reduce import ReductionMethod, hankel_singular_values, reduce_order
 from rtloop.design.specification import DesignOptions, weights_of
-from rtloop.design.transfer import Transfer
 from rtloop.design.weights import Weights
+from rtloop.linear.transfer import Transfer
 
 
 class DoesNotRun(NoController):

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from rtloop.design.augment import augmented
 from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
 from rtloop.design.compare import compare
-from rtloop.design.discretise import DiscreteController
 from rtloop.design.judgement import Limit, described, limits, specified
 from rtloop.design.robustness import (
     Range,
@@ -28,8 +27,9 @@ from rtloop.design.robustness import (
 )
 from rtloop.design.specification import QUANTITIES, DesignOptions, weights_of
 from rtloop.design.synthesise import weighted_norm
-from rtloop.design.transfer import Transfer
 from rtloop.design.weights import Weights
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.transfer import Transfer
 
 DELAYS = (0, 1, 2)
 """Samples of delay for which the tolerated shift of the resonance is always shown."""

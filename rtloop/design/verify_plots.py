@@ -16,9 +16,9 @@ from hil.linear import Real
 from rtloop.design.closedloop import Loop
 from rtloop.design.specification import SpecificationOptions
 from rtloop.design.step import step_response
-from rtloop.design.transfer import Transfer
 from rtloop.design.verify import Verification
 from rtloop.errors import MissingExtra
+from rtloop.linear.transfer import Transfer
 
 PAPER_TIME, RUN_TIME, TEMPLATE = "tab:blue", "tab:red", "0.35"
 

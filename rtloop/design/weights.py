@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from rtloop.design.transfer import Transfer
+from rtloop.linear.transfer import Transfer
 
 DisturbanceRule = Literal["printed", "implied", "none"]
 

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from hil.linear import Complex, Real
 from rtloop.design.closedloop import Loop, discrete_loop, sampled_plant
-from rtloop.design.discretise import DiscreteController, discretise
 from rtloop.design.loop import lightest_pair, resonance_shift_tolerated, with_resonance_shifted
 from rtloop.design.step import step_metrics
 from rtloop.law.options import AxisOptions, ModelOptions, PrefilterOptions
+from rtloop.linear.discretise import DiscreteController, discretise
 
 GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
 

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.base import Channel
-from rtloop.design.discretise import DiscreteController
-from rtloop.design.realisation import blocks, row_bands
 from rtloop.law.layout import BLOCK, COEFFICIENTS, LANES, MAX_ORDER, Records, records
 from rtloop.law.options import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.realisation import blocks, row_bands
 
 
 def axis_coefficients(

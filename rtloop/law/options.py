@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hil.options import Factor, Numbers, Options, Root
-from rtloop.design.transfer import Transfer
 from rtloop.law.hysteresis import PlayModel, play_model
 from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
+from rtloop.linear.transfer import Transfer
 
 Matrix = Annotated[tuple[Numbers, ...], Field(strict=False)]
 

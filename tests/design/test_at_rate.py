@@ -7,8 +7,8 @@ import pytest
 
 from rtloop.design.at_rate import dead_time, runs, within_rate
 from rtloop.design.synthesise import DoesNotRun, synthesise
-from rtloop.design.transfer import Transfer
 from rtloop.design.weights import PAPER_WEIGHTS
+from rtloop.linear.transfer import Transfer
 
 RATE_HZ = 10_000.0
 BAND = 1j * np.geomspace(1.0, math.pi * RATE_HZ, 200)

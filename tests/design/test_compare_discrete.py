@@ -5,9 +5,9 @@ import json
 import pytest
 
 from rtloop.design.compare import compare
-from rtloop.design.discretise import discretise
 from rtloop.design.paper import PAPER_C
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
 
 T = 1e-4
 

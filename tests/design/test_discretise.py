@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from rtloop.design.discretise import discretise
 from rtloop.design.paper import PAPER_C
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
 
 T = 1e-4
 HZ = np.array([0.1, 3.0, 107.9, 350.0, 595.5, 640.0, 2000.0, 4400.0])

@@ -14,8 +14,8 @@ from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
 from rtloop.design.hinf import synthesise_hinf
 from rtloop.design.norm import hinf_norm
 from rtloop.design.paper import PAPER_D
-from rtloop.design.transfer import Transfer
 from rtloop.design.weights import PAPER_WEIGHTS
+from rtloop.linear.transfer import Transfer
 from tests.design.plants import dense_norm, hamiltonian_norm, random_plant
 
 NORMALISED_D = Transfer(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain / PAPER_D.dc_gain)

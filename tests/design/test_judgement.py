@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from rtloop.design.closedloop import continuous_loop, discrete_loop
-from rtloop.design.discretise import discretise
 from rtloop.design.judgement import described, limits
 from rtloop.design.margins import margins
 from rtloop.design.specification import CommandOptions, DisturbanceOptions, SensorOptions, SpecificationOptions
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
 
 PERIOD_S, POLE, GAIN = 1e-3, 200.0, 3.0
 PLANT = Transfer.from_zpk([], [-POLE], POLE)

@@ -8,11 +8,11 @@ import pytest
 from scipy import linalg
 
 from rtloop.design.closedloop import continuous_loop, discrete_loop
-from rtloop.design.discretise import discretise
 from rtloop.design.loop import analyse_continuous, analyse_discrete, resonance_shift_tolerated, with_resonance_shifted
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.step import step_response
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
 
 T = 1e-4
 PAPER = analyse_continuous(PAPER_C, PAPER_D)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.reduce import hankel_singular_values, order_for, reduce_order
-from rtloop.design.transfer import Transfer
+from rtloop.linear.transfer import Transfer
 
 RNG = np.random.default_rng(20)
 PAIRS = [complex(-(10 ** RNG.uniform(-3, -0.3)) * w, w) for w in np.geomspace(5, 5e4, 8)]

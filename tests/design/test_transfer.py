@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.transfer import Transfer
+from rtloop.linear.transfer import Transfer
 
 S = 2j * np.pi * np.geomspace(0.01, 1e5, 200)
 

@@ -12,7 +12,6 @@ from click.testing import CliRunner
 
 from rtloop.cli import main
 from rtloop.design.closedloop import continuous_loop, discrete_loop
-from rtloop.design.discretise import discretise
 from rtloop.design.judgement import Limit, described, held_up_to, specified
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.robustness import changes as robust_changes
@@ -26,7 +25,8 @@ from rtloop.design.robustness import (
     with_gain_changed,
 )
 from rtloop.design.specification import SensorOptions, SpecificationOptions
-from rtloop.design.transfer import Transfer
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PAPER_LOOP = continuous_loop(PAPER_C, PAPER_D)

@@ -16,10 +16,10 @@ import pytest
 from rtloop.config import parse
 from rtloop.design.closedloop import continuous_loop
 from rtloop.design.margins import delay_tolerated
-from rtloop.design.transfer import Transfer
 from rtloop.doctor.examine import Examination, Latency, conditions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
+from rtloop.linear.transfer import Transfer
 from rtloop.prepare import prepare
 from tests.doctor.hosts import host
 from tests.recording.real_loop import ROOT, changed

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from drivers.base import Channel
 from hil.compiled import jit
-from rtloop.design.discretise import discretise
 from rtloop.law.build import axis_coefficients
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, Records, initial_state, records
 from rtloop.law.options import AxisOptions
+from rtloop.linear.discretise import discretise
 from rtloop.signals import Mode
 
 PERIOD_S = 1e-4

@@ -22,10 +22,10 @@ from rtloop.chaining import write_design
 from rtloop.config import load
 from rtloop.design.chain import Chain
 from rtloop.design.closedloop import discrete_loop
-from rtloop.design.discretise import discretise
 from rtloop.design.judgement import limits, specified
 from rtloop.design.loop import LoopAnalysis
 from rtloop.errors import RtloopError
+from rtloop.linear.discretise import discretise
 from rtloop.prepare import prepare
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, modal_rig

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.linear import Complex, Real
-from rtloop.design.antiwindup import antiwindup, steady_state_gain
-from rtloop.design.holds import first_order_hold, held_matrices
-from rtloop.design.realisation import (
+from rtloop.linear.antiwindup import antiwindup, steady_state_gain
+from rtloop.linear.holds import first_order_hold, held_matrices
+from rtloop.linear.realisation import (
     Form,
     System,
     around_unit_circle,
@@ -31,8 +31,8 @@ from rtloop.design.realisation import (
     system_of,
     well_conditioned_sum,
 )
-from rtloop.design.transfer import Transfer
-from rtloop.design.zeros import zeros_and_gain
+from rtloop.linear.transfer import Transfer
+from rtloop.linear.zeros import zeros_and_gain
 
 Method = Literal["matched", "tustin", "foh", "zoh"]
 SEEN = 36.0

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
 from hil.linear import Real
-from rtloop.design.realisation import Form, System, blocks
+from rtloop.linear.realisation import Form, System, blocks
 
 
 def antiwindup(system: System, form: Form) -> Real:

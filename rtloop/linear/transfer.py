@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.linear import Complex, conjugate_pairs
-from rtloop.design.realisation import System
-from rtloop.design.zeros import zeros_and_gain
+from rtloop.linear.realisation import System
+from rtloop.linear.zeros import zeros_and_gain
 
 MAX_ORDER = 200
 """Far above what a loop can run, and its roots are found in milliseconds."""

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from hil.linear import Complex, Modal
-from rtloop.design.realisation import System
+from rtloop.linear.realisation import System
 
 
 def first_order_hold(modal: Modal, period_s: float) -> Modal:

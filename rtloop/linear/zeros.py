@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.linear import Complex, Real
-from rtloop.design.realisation import System
+from rtloop.linear.realisation import System
 
 
 def zeros_and_gain(system: System) -> tuple[Complex, float]:
