@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rtloop.analysis.loop_analysis import LoopAnalysis, Tolerance, resonance_shift_tolerated
 from rtloop.cautions import cautions
 from rtloop.config import load
-from rtloop.design.loop import LoopAnalysis, Tolerance, resonance_shift_tolerated
 from rtloop.design.verify import Verification
 from rtloop.design.verify_text import answer
 from rtloop.designing import verified

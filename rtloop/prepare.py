@@ -11,9 +11,9 @@ import numpy as np
 from drivers.base import Channel, Driver, Facts, index_of
 from drivers.errors import DriverError
 from drivers.registry import driver_class
+from rtloop.analysis.comparison import Comparison, compare
+from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_continuous, analyse_discrete
 from rtloop.config import Configuration, ScheduleOptions
-from rtloop.design.compare import Comparison, compare
-from rtloop.design.loop import LoopAnalysis, analyse_continuous, analyse_discrete
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError

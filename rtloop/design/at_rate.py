@@ -11,8 +11,8 @@ import math
 import numpy as np
 
 from hil.linear import Complex
-from rtloop.design.closedloop import discrete_loop
-from rtloop.design.margins import margins
+from rtloop.analysis.closed_loop import discrete_loop
+from rtloop.analysis.margins import margins
 from rtloop.law.layout import MAX_ORDER
 from rtloop.linear.discretise import Method, discretise
 from rtloop.linear.transfer import Transfer

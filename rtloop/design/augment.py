@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from hil.linear import Complex, Real
-from rtloop.design.closedloop import realised
+from rtloop.analysis.closed_loop import realised
 from rtloop.design.weights import Weights
 from rtloop.linear.transfer import Transfer
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.design.compare import LIGHT_DAMPING
+from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.design.identified import (
     dynamics_provenance,
     feedforward_section,

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
-from rtloop.design.closedloop import Loop
-from rtloop.design.margins import margins
+from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.margins import margins
+from rtloop.analysis.step_response import step_metrics
 from rtloop.design.specification import SensorOptions, SpecificationOptions
-from rtloop.design.step import step_metrics
 
 
 class Limit(NamedTuple):

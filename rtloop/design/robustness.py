@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.loop_analysis import lightest_pair, with_resonance_shifted
+from rtloop.analysis.margins import crossings
+from rtloop.analysis.search import reach
 from rtloop.design.judgement import Limit, specified
-from rtloop.design.loop import lightest_pair, with_resonance_shifted
-from rtloop.design.margins import crossings
-from rtloop.design.reach import reach
 from rtloop.design.specification import SpecificationOptions
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer

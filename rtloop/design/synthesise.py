@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.linear import Real
+from rtloop.analysis.closed_loop import realised
 from rtloop.design.at_rate import LARGEST_SENSITIVITY, dead_time, runs, within_rate
 from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
-from rtloop.design.closedloop import realised
 from rtloop.design.hinf import Hinf, NoController, smallest_gamma, synthesise_hinf
 from rtloop.design.norm import hinf_norm
 from rtloop.design.normalised import normalised

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.comparison import compare
 from rtloop.design.augment import augmented
-from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
-from rtloop.design.compare import compare
 from rtloop.design.judgement import Limit, described, limits, specified
 from rtloop.design.robustness import (
     Range,

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.closedloop import Loop
+from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.step_response import step_response
 from rtloop.design.specification import SpecificationOptions
-from rtloop.design.step import step_response
 from rtloop.design.verify import Verification
 from rtloop.errors import MissingExtra
 from rtloop.linear.transfer import Transfer

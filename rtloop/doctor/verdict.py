@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rtloop.design.closedloop import discrete_loop
-from rtloop.design.margins import delay_tolerated
+from rtloop.analysis.closed_loop import discrete_loop
+from rtloop.analysis.margins import delay_tolerated
 from rtloop.doctor.examine import Examination, Latency
 from rtloop.prepare import Prepared
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.linear import Complex, Real
-from rtloop.design.closedloop import Loop, discrete_loop, sampled_plant
-from rtloop.design.loop import lightest_pair, resonance_shift_tolerated, with_resonance_shifted
-from rtloop.design.step import step_metrics
+from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
+from rtloop.analysis.loop_analysis import lightest_pair, resonance_shift_tolerated, with_resonance_shifted
+from rtloop.analysis.step_response import step_metrics
 from rtloop.law.options import AxisOptions, ModelOptions, PrefilterOptions
 from rtloop.linear.discretise import DiscreteController, discretise
 

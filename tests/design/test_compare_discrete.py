@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rtloop.design.compare import compare
+from rtloop.analysis.comparison import compare
 from rtloop.design.paper import PAPER_C
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from rtloop.design.closedloop import continuous_loop, discrete_loop
+from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
+from rtloop.analysis.margins import margins
 from rtloop.design.judgement import described, limits
-from rtloop.design.margins import margins
 from rtloop.design.specification import CommandOptions, DisturbanceOptions, SensorOptions, SpecificationOptions
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer

@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from rtloop.design.closedloop import continuous_loop, discrete_loop
-from rtloop.design.loop import analyse_continuous, analyse_discrete, resonance_shift_tolerated, with_resonance_shifted
+from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
+from rtloop.analysis.loop_analysis import (
+    analyse_continuous,
+    analyse_discrete,
+    resonance_shift_tolerated,
+    with_resonance_shifted,
+)
+from rtloop.analysis.step_response import step_response
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.step import step_response
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.cli import main
-from rtloop.design.closedloop import continuous_loop, discrete_loop
 from rtloop.design.judgement import Limit, described, held_up_to, specified
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.robustness import changes as robust_changes

@@ -13,9 +13,9 @@ import sys
 import numpy as np
 import pytest
 
+from rtloop.analysis.closed_loop import continuous_loop
+from rtloop.analysis.margins import delay_tolerated
 from rtloop.config import parse
-from rtloop.design.closedloop import continuous_loop
-from rtloop.design.margins import delay_tolerated
 from rtloop.doctor.examine import Examination, Latency, conditions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing

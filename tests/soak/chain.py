@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
+from rtloop.analysis.closed_loop import discrete_loop
+from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.chaining import write_design
 from rtloop.config import load
 from rtloop.design.chain import Chain
-from rtloop.design.closedloop import discrete_loop
 from rtloop.design.judgement import limits, specified
-from rtloop.design.loop import LoopAnalysis
 from rtloop.errors import RtloopError
 from rtloop.linear.discretise import discretise
 from rtloop.prepare import prepare

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.design.closedloop import Loop, continuous_loop, discrete_loop
-from rtloop.design.margins import margins
-from rtloop.design.reach import reach
-from rtloop.design.step import step_metrics
+from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.margins import margins
+from rtloop.analysis.search import reach
+from rtloop.analysis.step_response import step_metrics
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 

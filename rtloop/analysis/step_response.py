@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from hil.linear import Real
-from rtloop.design.closedloop import Loop
+from rtloop.analysis.closed_loop import Loop
 
 COUNT = 1 << 16
 """Samples of a response; the first 1/64 of continuous time is sampled 64 times as densely once more."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.linear import Complex, Real
-from rtloop.design.closedloop import Loop
+from rtloop.analysis.closed_loop import Loop
 
 
 class Margins(NamedTuple):
