@@ -9,8 +9,8 @@ import numpy as np
 
 from hil.options import RigOptions
 from rtloop.config import ChannelOptions, Configuration
-from rtloop.design.plays import loading_curve
 from rtloop.engine.messages import ALL_AXES, Kind
+from rtloop.hysteresis.plays import loading_curve
 from rtloop.law.options import AxisOptions
 from rtloop.law.reference import Generator
 from rtloop.prepare import AxisCheck, Prepared

@@ -10,7 +10,6 @@ import numpy as np
 
 from hil.linear import Real
 from rtloop.config import load as load_configuration
-from rtloop.design.compensation import compensated, residual_operator
 from rtloop.design.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
 from rtloop.design.identified import (
     dynamics_provenance,
@@ -26,9 +25,10 @@ from rtloop.design.identify_delay import delayed
 from rtloop.design.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identify_hysteresis import Placement, Weights, identify_hysteresis
 from rtloop.design.measured import Measured, UnsuitableData, measured
-from rtloop.design.plays import model_output
 from rtloop.design.prediction_error import LARGEST_ORDER
 from rtloop.errors import ConfigError
+from rtloop.hysteresis.compensation import compensated, residual_operator
+from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 from rtloop.plain import fields_of, plain
 

@@ -27,11 +27,11 @@ from rtloop.design.identified import (
 from rtloop.design.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identify_hysteresis import HysteresisFit, identify_hysteresis
 from rtloop.design.measured import Measured, UnsuitableData, noise_of
-from rtloop.design.plays import model_output
 from rtloop.design.section import controller_section
 from rtloop.design.specification import DesignOptions
 from rtloop.design.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import section
+from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 from rtloop.law.options import ModelOptions
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.compensation import Residual, compensated
 from rtloop.design.frequency_response import FrequencyResponse
 from rtloop.design.identify_dynamics import DynamicsFit, Excitation
 from rtloop.design.identify_hysteresis import HysteresisFit
 from rtloop.design.measured import Measured
-from rtloop.design.plays import model_output
 from rtloop.errors import MissingExtra, OutputError
+from rtloop.hysteresis.compensation import Residual, compensated
+from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 
 POINTS = 20_000

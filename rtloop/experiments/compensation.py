@@ -9,14 +9,14 @@ import numpy as np
 from pydantic import Field
 
 from hil.options import Options
-from rtloop.design.loop_shape import loop_shape
-from rtloop.design.plays import model_output
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken, whole
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import thinned
 from rtloop.experiments.verdict import Analysis
+from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.plays import model_output
 
 REST_S = 0.1
 NEAR = 0.1

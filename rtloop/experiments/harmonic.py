@@ -17,7 +17,6 @@ from pydantic import Field
 from hil.linear import Real
 from hil.options import Numbers, Options
 from rtloop.config import ModeName
-from rtloop.design.plays import model_output
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
 from rtloop.experiments.promised import REFERENCE_HZ, Promised
@@ -25,6 +24,7 @@ from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")

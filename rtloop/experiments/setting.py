@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from rtloop.design.plays import loading_curve
 from rtloop.design.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Timeline
+from rtloop.hysteresis.plays import loading_curve
 from rtloop.law.options import AxisOptions
 
 UNKNOWN_PEAK, LEAST_PEAK = 1.4, 1.1

@@ -12,13 +12,13 @@ from scipy.optimize import least_squares
 from hil.linear import Real
 from hil.options import Options
 from rtloop.design.measured import UnsuitableData
-from rtloop.design.plays import loading_curve
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken, whole
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis
+from rtloop.hysteresis.plays import loading_curve
 
 REST_S, SHOWN_S, SHOWN_PERIODS = 0.1, 0.1, 9.0
 RINGING_S = 0.015, 0.1

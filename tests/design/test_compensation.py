@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
-from rtloop.design.compensation import compensated, residual_operator
-from rtloop.design.plays import model_output
+from rtloop.hysteresis.compensation import compensated, residual_operator
+from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 from tests.design.rigs import COMMAND_UM, EQ_4, drawn
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hil.hysteresis import THRESHOLDS_V
 from rtloop.design.identified import feedforward_of, feedforward_section
 from rtloop.design.identify_hysteresis import identify_hysteresis, placed_thresholds
-from rtloop.design.loop_shape import loop_shape
 from rtloop.design.measured import Measured, UnsuitableData, require_usable
-from rtloop.design.plays import loading_curve, model_output, play_outputs, turning_points
+from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
 from rtloop.law.hysteresis import PlayModel
 from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
 

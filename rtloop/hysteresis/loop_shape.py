@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.plays import turning_points
+from rtloop.hysteresis.plays import turning_points
 
 BINS = 1000
 

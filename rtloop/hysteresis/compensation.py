@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.linear import Real
-from rtloop.design.plays import loading_curve, loading_slopes, model_output
+from rtloop.hysteresis.plays import loading_curve, loading_slopes, model_output
 from rtloop.law.hysteresis import PlayModel
 
 SAME = 1e-9
