@@ -14,8 +14,8 @@ from rich.table import Table
 from rtloop.analysis.loop_analysis import LoopAnalysis, Tolerance, resonance_shift_tolerated
 from rtloop.cautions import cautions
 from rtloop.config import load
-from rtloop.design.verify import Verification
-from rtloop.design.verify_text import answer
+from rtloop.design.verification.text import answer
+from rtloop.design.verification.verify import Verification
 from rtloop.designing import verified
 from rtloop.errors import ConfigError
 from rtloop.law.options import AxisOptions

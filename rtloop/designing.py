@@ -10,13 +10,13 @@ from typing import Any
 import click
 
 from rtloop.config import Configuration, load, parse
-from rtloop.design.assumptions import NoController
-from rtloop.design.augment import augmented
-from rtloop.design.section import controller_configuration, controller_section
-from rtloop.design.specification import DesignOptions
-from rtloop.design.synthesise import Synthesis, synthesise_design
-from rtloop.design.verify import Verification, as_dict, verify
-from rtloop.design.verify_page import page
+from rtloop.design.synthesis.assumptions import NoController
+from rtloop.design.synthesis.augment import augmented
+from rtloop.design.synthesis.section import controller_configuration, controller_section
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
+from rtloop.design.verification.page import page
+from rtloop.design.verification.verify import Verification, as_dict, verify
 from rtloop.errors import ConfigError, NoDesign, OutputError
 from rtloop.law.options import AxisOptions
 from rtloop.linear.discretise import discretise
@@ -78,7 +78,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
 
 
 def _slicot(found: Synthesis, design: DesignOptions) -> float:
-    from rtloop.design.slicot import slicot_gamma
+    from rtloop.design.synthesis.slicot import slicot_gamma
 
     assert design.plant is not None
     return slicot_gamma(augmented(design.plant.transfer(), found.weights), 10 * found.hinf.gamma_opt)[0]
@@ -124,7 +124,7 @@ def _write_report(
     folder: Path, name: str, judged: dict[str, tuple[Verification, DesignOptions]], report: dict[str, Any]
 ) -> list[Path]:
     """verify.json, verify.html and the pictures of each axis."""
-    from rtloop.design.verify_plots import pictures
+    from rtloop.design.verification.plots import pictures
 
     drawn = {
         axis: pictures(found, design.specification, f"{name}, axis {axis}") for axis, (found, design) in judged.items()

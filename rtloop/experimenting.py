@@ -16,7 +16,7 @@ import click
 from drivers.errors import DriverError
 from hil.options import RigOptions
 from rtloop.config import Configuration, load
-from rtloop.design.specification import SpecificationOptions
+from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
 from rtloop.experiments.page import page

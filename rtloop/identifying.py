@@ -10,8 +10,8 @@ import numpy as np
 
 from hil.linear import Real
 from rtloop.config import load as load_configuration
-from rtloop.design.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
-from rtloop.design.identified import (
+from rtloop.design.identification.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
+from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_of,
     feedforward_section,
@@ -21,11 +21,11 @@ from rtloop.design.identified import (
     with_gain,
     write_new,
 )
-from rtloop.design.identify_delay import delayed
-from rtloop.design.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identify_hysteresis import Placement, Weights, identify_hysteresis
-from rtloop.design.measured import Measured, UnsuitableData, measured
-from rtloop.design.prediction_error import LARGEST_ORDER
+from rtloop.design.identification.identify_delay import delayed
+from rtloop.design.identification.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identification.identify_hysteresis import Placement, Weights, identify_hysteresis
+from rtloop.design.identification.measured import Measured, UnsuitableData, measured
+from rtloop.design.identification.prediction_error import LARGEST_ORDER
 from rtloop.errors import ConfigError
 from rtloop.hysteresis.compensation import compensated, residual_operator
 from rtloop.hysteresis.plays import model_output
@@ -56,7 +56,7 @@ def hysteresis_report(
     if out is not None:
         write_new(out, feedforward_section(fit.model, hysteresis_provenance(fit, runs)))
     if plot is not None:
-        from rtloop.design.identification_plots import plot_hysteresis
+        from rtloop.design.identification.plots import plot_hysteresis
 
         plot_hysteresis(fit, runs[0], plot)
     return plain(
@@ -115,7 +115,7 @@ def dynamics_report(
     if out is not None:
         write_new(out, _sections(fit, runs[0], how, actuator))
     if plot is not None:
-        from rtloop.design.identification_plots import plot_dynamics
+        from rtloop.design.identification.plots import plot_dynamics
 
         plot_dynamics(fit, delayed(inputs[0], fit.delay_ticks), found, plot)
     tests = {"white": fit.tests.white, "independent": fit.tests.independent}
@@ -156,7 +156,7 @@ def compensation_report(
         simulated = {key: _largest(actuator, inverse, v, gain) for key, v in (commands | worst).items()}
         rows.append({"gain": name, "rho": gain, "xi_um": residual.bound_um(gain), "simulated_um": simulated})
     if plot is not None:
-        from rtloop.design.identification_plots import plot_compensation
+        from rtloop.design.identification.plots import plot_compensation
 
         plot_compensation(residual, actuator, inverse, plot)
     return plain(

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import click
 from rich.table import Table
 
-from rtloop.design.synthesise import Synthesis
-from rtloop.design.verify import Verification
-from rtloop.design.verify_text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+from rtloop.design.synthesis.synthesise import Synthesis
+from rtloop.design.verification.text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+from rtloop.design.verification.verify import Verification
 from rtloop.terminal import console as _console
 
 RED = {"MISSED", "NO"}

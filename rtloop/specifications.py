@@ -8,7 +8,7 @@ from typing import NamedTuple
 from pydantic import ValidationError
 
 from rtloop.config import InputFileError, describe
-from rtloop.design.specification import DesignOptions
+from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.errors import ConfigError
 from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 

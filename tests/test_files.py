@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rtloop.config import InputFileError, load
-from rtloop.design.identified import read_feedforward
+from rtloop.design.identification.identified import read_feedforward
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.options import TableOptions
 from rtloop.references import MAX_TABLE_BYTES, TableOfSamples, generator_values

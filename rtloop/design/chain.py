@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
-from rtloop.design.identified import (
+from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_section,
     hysteresis_provenance,
     model_values,
     with_gain,
 )
-from rtloop.design.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.measured import Measured, UnsuitableData, noise_of
-from rtloop.design.section import controller_section
-from rtloop.design.specification import DesignOptions
-from rtloop.design.synthesise import Synthesis, synthesise_design
+from rtloop.design.identification.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identification.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
+from rtloop.design.synthesis.section import controller_section
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import section
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel

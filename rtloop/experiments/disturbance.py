@@ -15,7 +15,7 @@ from pydantic import Field
 
 from hil.linear import Real
 from hil.options import Numbers, Options
-from rtloop.design.judgement import Limit
+from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting

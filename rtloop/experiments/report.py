@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtloop.design.measured import UnsuitableData
+from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.experiments.taken import Taken

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rtloop.design.specification import SpecificationOptions
+from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Timeline
 from rtloop.hysteresis.plays import loading_curve

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from hil.linear import Real
 from hil.options import Options
-from rtloop.design.measured import UnsuitableData
+from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from hil.linear import Real
 from hil.options import Numbers, Options
-from rtloop.design.measured import UnsuitableData
+from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.judgement import limits
-from rtloop.design.measured import UnsuitableData
-from rtloop.design.specification import SpecificationOptions
+from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.synthesis.specification import SpecificationOptions
+from rtloop.design.verification.judgement import limits
 from rtloop.experiments.derive import about
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment

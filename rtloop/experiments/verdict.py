@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from rtloop.design.judgement import Limit
-from rtloop.design.specification import ClaimOptions
+from rtloop.design.synthesis.specification import ClaimOptions
+from rtloop.design.verification.judgement import Limit
 
 
 @dataclass(frozen=True)

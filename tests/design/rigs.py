@@ -22,10 +22,10 @@ from hil.options import (
     SensorOptions,
 )
 from hil.rig import advance, build_rig, sample, zeros_poles_gain
-from rtloop.design.identify_dynamics import DynamicsFit, identify_dynamics
-from rtloop.design.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.measured import Measured
-from rtloop.design.prediction_error import Excitation
+from rtloop.design.identification.identify_dynamics import DynamicsFit, identify_dynamics
+from rtloop.design.identification.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.prediction_error import Excitation
 from rtloop.hysteresis.compensation import residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel

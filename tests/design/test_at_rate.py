@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from rtloop.design.at_rate import dead_time, runs, within_rate
-from rtloop.design.synthesise import DoesNotRun, synthesise
-from rtloop.design.weights import PAPER_WEIGHTS
+from rtloop.design.synthesis.at_rate import dead_time, runs, within_rate
+from rtloop.design.synthesis.synthesise import DoesNotRun, synthesise
+from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer
 
 RATE_HZ = 10_000.0

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from rtloop.design.assumptions import NoController
-from rtloop.design.augment import GeneralisedPlant, Matrices, augmented
-from rtloop.design.hinf import synthesise_hinf
-from rtloop.design.norm import hinf_norm
 from rtloop.design.paper import PAPER_D
-from rtloop.design.weights import PAPER_WEIGHTS
+from rtloop.design.synthesis.assumptions import NoController
+from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.design.synthesis.hinf import synthesise_hinf
+from rtloop.design.synthesis.norm import hinf_norm
+from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer
 from tests.design.plants import dense_norm, hamiltonian_norm, random_plant
 

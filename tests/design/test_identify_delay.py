@@ -5,8 +5,8 @@ import pytest
 
 from hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
 from hil.rig import build_rig
-from rtloop.design.identify_dynamics import identify_dynamics
-from rtloop.design.prediction_error import Excitation
+from rtloop.design.identification.identify_dynamics import identify_dynamics
+from rtloop.design.identification.prediction_error import Excitation
 from tests.design.rigs import _record
 
 PERIOD_S, GAIN_UM_PER_V = 1e-4, 2.0

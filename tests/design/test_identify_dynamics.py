@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from hil.linear import Modal, modal_sum
-from rtloop.design.frequency_response import agreement, frequency_response
-from rtloop.design.identify_dynamics import identify_dynamics
-from rtloop.design.innovations import Innovations
-from rtloop.design.inverse_hold import continuous_modes
-from rtloop.design.measured import UnsuitableData
+from rtloop.design.identification.frequency_response import agreement, frequency_response
+from rtloop.design.identification.identify_dynamics import identify_dynamics
+from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.inverse_hold import continuous_modes
+from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.prediction_error import Excitation, excited_order
+from rtloop.design.identification.residuals import residual_tests
 from rtloop.design.paper import PAPER_D
-from rtloop.design.prediction_error import Excitation, excited_order
-from rtloop.design.residuals import residual_tests
 from tests.design.rigs import EQ_4, FAST_S, chirp_drive, closeness, drawn, excited, identified, step_drive
 
 PAIR_AND_REAL = Innovations(

@@ -9,8 +9,13 @@ import pytest
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.margins import margins
-from rtloop.design.judgement import described, limits
-from rtloop.design.specification import CommandOptions, DisturbanceOptions, SensorOptions, SpecificationOptions
+from rtloop.design.synthesis.specification import (
+    CommandOptions,
+    DisturbanceOptions,
+    SensorOptions,
+    SpecificationOptions,
+)
+from rtloop.design.verification.judgement import described, limits
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from rtloop.cli import main
 from rtloop.config import Configuration, load
-from rtloop.design.measured import UnsuitableData
+from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.derive import derived
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.experiments.report import report, take

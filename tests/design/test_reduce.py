@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.reduce import hankel_singular_values, order_for, reduce_order
+from rtloop.design.synthesis.reduce import hankel_singular_values, order_for, reduce_order
 from rtloop.linear.transfer import Transfer
 
 RNG = np.random.default_rng(20)

@@ -11,8 +11,8 @@ from click.testing import CliRunner, Result
 
 from rtloop.cli import main
 from rtloop.config import load
-from rtloop.design.synthesise import synthesise
-from rtloop.design.weights import PAPER_WEIGHTS
+from rtloop.design.synthesis.synthesise import synthesise
+from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer
 from rtloop.prepare import prepare
 

@@ -12,10 +12,11 @@ from click.testing import CliRunner
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.cli import main
-from rtloop.design.judgement import Limit, described, held_up_to, specified
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.robustness import changes as robust_changes
-from rtloop.design.robustness import (
+from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
+from rtloop.design.verification.judgement import Limit, described, held_up_to, specified
+from rtloop.design.verification.robustness import changes as robust_changes
+from rtloop.design.verification.robustness import (
     delay_margin_us,
     delay_ticks_tolerated,
     maker,
@@ -24,7 +25,6 @@ from rtloop.design.robustness import (
     with_damping_changed,
     with_gain_changed,
 )
-from rtloop.design.specification import SensorOptions, SpecificationOptions
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import signal
 
 from rtloop.config import load
-from rtloop.design.judgement import Limit
-from rtloop.design.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
+from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
+from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import about, derived
 from rtloop.experiments.harmonic import bandwidth

@@ -23,7 +23,7 @@ from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.chaining import write_design
 from rtloop.config import load
 from rtloop.design.chain import Chain
-from rtloop.design.judgement import limits, specified
+from rtloop.design.verification.judgement import limits, specified
 from rtloop.errors import RtloopError
 from rtloop.linear.discretise import discretise
 from rtloop.prepare import prepare

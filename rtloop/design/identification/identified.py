@@ -11,9 +11,9 @@ from pydantic import ValidationError
 
 from rtloop import __version__
 from rtloop.config import describe
-from rtloop.design.identify_dynamics import DynamicsFit
-from rtloop.design.identify_hysteresis import HysteresisFit
-from rtloop.design.measured import Measured, UnsuitableData
+from rtloop.design.identification.identify_dynamics import DynamicsFit
+from rtloop.design.identification.identify_hysteresis import HysteresisFit
+from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
 from rtloop.errors import ConfigError, OutputError
 from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import margins
 from rtloop.analysis.step_response import step_metrics
-from rtloop.design.specification import SensorOptions, SpecificationOptions
+from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 
 
 class Limit(NamedTuple):
@@ -27,7 +27,7 @@ class Limit(NamedTuple):
 
 
 def limits(asked: SpecificationOptions) -> dict[str, Limit]:
-    """What is required, by the name of the quantity (`rtloop.design.specification.QUANTITIES`)."""
+    """What is required, by the name of the quantity (`rtloop.design.synthesis.specification.QUANTITIES`)."""
     found: dict[str, Limit] = {}
     for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
                           ("bandwidth_hz", False)):  # fmt: skip

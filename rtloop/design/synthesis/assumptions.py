@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.augment import GeneralisedPlant
+from rtloop.design.synthesis.augment import GeneralisedPlant
 
 SMALL = 1e-10
 """A singular value is zero below this, relative to the largest of the same rows, each brought to length 1."""

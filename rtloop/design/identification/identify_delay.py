@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.markov import ARX_ORDER, lagged
-from rtloop.design.prediction_error import WORTH, Excitation, model_at_gap
+from rtloop.design.identification.markov import ARX_ORDER, lagged
+from rtloop.design.identification.prediction_error import WORTH, Excitation, model_at_gap
 
 MOST_TICKS = 3
 LEAST_SHARE = 0.25

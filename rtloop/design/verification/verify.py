@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.comparison import compare
-from rtloop.design.augment import augmented
-from rtloop.design.judgement import Limit, described, limits, specified
-from rtloop.design.robustness import (
+from rtloop.design.synthesis.augment import augmented
+from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions, weights_of
+from rtloop.design.synthesis.synthesise import weighted_norm
+from rtloop.design.synthesis.weights import Weights
+from rtloop.design.verification.judgement import Limit, described, limits, specified
+from rtloop.design.verification.robustness import (
     Range,
     changes,
     delay_margin_us,
@@ -25,9 +28,6 @@ from rtloop.design.robustness import (
     until_missed,
     until_unstable,
 )
-from rtloop.design.specification import QUANTITIES, DesignOptions, weights_of
-from rtloop.design.synthesise import weighted_norm
-from rtloop.design.weights import Weights
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 

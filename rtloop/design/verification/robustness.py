@@ -17,8 +17,8 @@ from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.loop_analysis import lightest_pair, with_resonance_shifted
 from rtloop.analysis.margins import crossings
 from rtloop.analysis.search import reach
-from rtloop.design.judgement import Limit, specified
-from rtloop.design.specification import SpecificationOptions
+from rtloop.design.synthesis.specification import SpecificationOptions
+from rtloop.design.verification.judgement import Limit, specified
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.frequency_response import FrequencyResponse
-from rtloop.design.identify_dynamics import DynamicsFit, Excitation
-from rtloop.design.identify_hysteresis import HysteresisFit
-from rtloop.design.measured import Measured
+from rtloop.design.identification.frequency_response import FrequencyResponse
+from rtloop.design.identification.identify_dynamics import DynamicsFit, Excitation
+from rtloop.design.identification.identify_hysteresis import HysteresisFit
+from rtloop.design.identification.measured import Measured
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.hysteresis.compensation import Residual, compensated
 from rtloop.hysteresis.plays import model_output

@@ -15,8 +15,8 @@ import numpy as np
 from hil.linear import Real
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.step_response import step_response
-from rtloop.design.specification import SpecificationOptions
-from rtloop.design.verify import Verification
+from rtloop.design.synthesis.specification import SpecificationOptions
+from rtloop.design.verification.verify import Verification
 from rtloop.errors import MissingExtra
 from rtloop.linear.transfer import Transfer
 

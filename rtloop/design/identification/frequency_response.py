@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.signal import csd, welch
 
 from hil.linear import Complex, Real
-from rtloop.design.innovations import Innovations
-from rtloop.design.measured import UnsuitableData
+from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.measured import UnsuitableData
 
 LEAST_COHERENCE = 0.95
 SEGMENT_S = 0.8

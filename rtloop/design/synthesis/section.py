@@ -13,8 +13,8 @@ import numpy as np
 
 from hil.linear import Complex, RepeatedPoles, modal_sum
 from rtloop import __version__
-from rtloop.design.specification import DesignOptions
-from rtloop.design.synthesise import Synthesis
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.toml_text import roots, section
 from rtloop.linear.transfer import Transfer
 

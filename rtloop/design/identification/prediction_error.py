@@ -13,9 +13,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hil.linear import Real
-from rtloop.design.innovations import Innovations
-from rtloop.design.markov import CLEAR, HANKEL_ROWS, LIKELY, Guesses, impulse_response, with_residues
-from rtloop.design.measured import noise_of
+from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.markov import CLEAR, HANKEL_ROWS, LIKELY, Guesses, impulse_response, with_residues
+from rtloop.design.identification.measured import noise_of
 
 LARGEST_ORDER = 14
 WORTH = 0.01

@@ -17,11 +17,11 @@ import numpy as np
 from scipy.linalg import sqrtm
 
 from hil.linear import Real
-from rtloop.design.assumptions import NoController, check_assumptions
-from rtloop.design.augment import GeneralisedPlant, Matrices
-from rtloop.design.norm import hinf_norm
-from rtloop.design.normalised import Normalised, normalised
-from rtloop.design.riccati import Fault, NoSolution, stabilising_solution
+from rtloop.design.synthesis.assumptions import NoController, check_assumptions
+from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices
+from rtloop.design.synthesis.norm import hinf_norm
+from rtloop.design.synthesis.normalised import Normalised, normalised
+from rtloop.design.synthesis.riccati import Fault, NoSolution, stabilising_solution
 
 LARGEST_GAMMA = 1e8
 

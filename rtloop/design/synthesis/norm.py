@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.augment import Matrices
+from rtloop.design.synthesis.augment import Matrices
 
 
 class Peak(NamedTuple):

@@ -12,7 +12,13 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from hil.options import Options
-from rtloop.design.weights import DisturbanceRule, Weights, command_weight, disturbance_weight, tracking_weight
+from rtloop.design.synthesis.weights import (
+    DisturbanceRule,
+    Weights,
+    command_weight,
+    disturbance_weight,
+    tracking_weight,
+)
 from rtloop.law.options import ModelOptions, TransferOptions
 from rtloop.linear.transfer import Transfer
 

@@ -1,6 +1,6 @@
 """Linear dynamics D(s) from recorded input and output: ARMAX by prediction errors, normalised to D(0) = 1.
 
-    minimise Σ ε_k²     over the modes of G and H (`rtloop.design.innovations`; Ljung 1999, sections 7.2 and 10.2)
+    minimise Σ ε_k²     over the modes of G and H (`rtloop.design.identification.innovations`; Ljung 1999, sections 7.2 and 10.2)
     s = log(z)/T,   r_s = r_z s/(z − 1)          inverse of the zero-order hold, exact for each mode
 
 A first guess of each order comes from the modes of a long ARX model. Only the product of hysteresis gain and D(0) can
@@ -18,11 +18,11 @@ from typing import Literal
 import numpy as np
 
 from hil.linear import Real
-from rtloop.design.identify_delay import delayed, first_part, held_out_from, identified_delay
-from rtloop.design.innovations import Innovations
-from rtloop.design.inverse_hold import held_from
-from rtloop.design.measured import UnsuitableData
-from rtloop.design.prediction_error import (
+from rtloop.design.identification.identify_delay import delayed, first_part, held_out_from, identified_delay
+from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.inverse_hold import held_from
+from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.prediction_error import (
     LARGEST_ORDER,
     WORTH,
     Excitation,
@@ -31,7 +31,7 @@ from rtloop.design.prediction_error import (
     refined,
     rms_error,
 )
-from rtloop.design.residuals import ResidualTests, residual_tests
+from rtloop.design.identification.residuals import ResidualTests, residual_tests
 from rtloop.linear.realisation import system_of
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain

@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 
 from hil.linear import Complex, Real
 from rtloop.analysis.closed_loop import realised
-from rtloop.design.weights import Weights
+from rtloop.design.synthesis.weights import Weights
 from rtloop.linear.transfer import Transfer
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from rtloop.design.judgement import Limit
-from rtloop.design.robustness import Range
-from rtloop.design.verify import Row, Verification
+from rtloop.design.verification.judgement import Limit
+from rtloop.design.verification.robustness import Range
+from rtloop.design.verification.verify import Row, Verification
 
 HEADINGS = ("", "required", "continuous C(s)", "", "as it runs C(z)", "", "its source says")
 ROBUSTNESS_HEADINGS = (

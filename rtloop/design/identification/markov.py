@@ -16,7 +16,7 @@ from scipy.linalg import hankel
 from scipy.signal import lfilter
 
 from hil.linear import Complex, Real
-from rtloop.design.innovations import Innovations
+from rtloop.design.identification.innovations import Innovations
 
 ARX_ORDER = 40
 HANKEL_ROWS = 150

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from hil.linear import Real
-from rtloop.design.augment import GeneralisedPlant, Matrices
+from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices
 
 
 class Normalised(NamedTuple):

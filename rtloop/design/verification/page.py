@@ -6,8 +6,8 @@ import base64
 from collections.abc import Sequence
 from html import escape
 
-from rtloop.design.verify import Verification
-from rtloop.design.verify_text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+from rtloop.design.verification.text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+from rtloop.design.verification.verify import Verification
 
 STYLE = """
 :root { color-scheme: light dark }
