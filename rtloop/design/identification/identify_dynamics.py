@@ -1,6 +1,6 @@
 """Linear dynamics D(s) from recorded input and output: ARMAX by prediction errors, normalised to D(0) = 1.
 
-    minimise Σ ε_k²     over the modes of G and H (`rtloop.design.identification.innovations`; Ljung 1999, sections 7.2 and 10.2)
+    minimise Σ ε_k²     over the modes of G and H (`innovations`; Ljung 1999, sections 7.2 and 10.2)
     s = log(z)/T,   r_s = r_z s/(z − 1)          inverse of the zero-order hold, exact for each mode
 
 A first guess of each order comes from the modes of a long ARX model. Only the product of hysteresis gain and D(0) can
