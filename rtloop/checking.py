@@ -20,7 +20,7 @@ from rtloop.designing import verified
 from rtloop.errors import ConfigError
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import AxisCheck, Prepared, prepare
-from rtloop.terminal import console as _console
+from rtloop.terminal.table import console as _console
 
 ROWS = (
     ("stable", lambda loop: "yes" if loop.stable else "NO"),

@@ -21,8 +21,8 @@ from rtloop.errors import ConfigError, NoDesign, OutputError
 from rtloop.law.options import AxisOptions
 from rtloop.linear.discretise import discretise
 from rtloop.prepare import prepare
-from rtloop.report_design import print_synthesis, print_verification
 from rtloop.specifications import load_specification
+from rtloop.terminal.design import print_synthesis, print_verification
 
 
 def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> int:

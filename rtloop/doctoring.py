@@ -19,10 +19,10 @@ from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
 from rtloop.plain import plain
 from rtloop.prepare import Prepared, prepare
-from rtloop.progress import StatusLine
 from rtloop.recording.histogram import Histogram
-from rtloop.report import bars
-from rtloop.terminal import console, table
+from rtloop.terminal.progress import StatusLine
+from rtloop.terminal.run import bars
+from rtloop.terminal.table import console, table
 
 MARKS = {True: "[green]good[/]", False: "[red]BAD[/]", None: "[dim]?[/]"}
 DEFAULT_RATE_HZ = 10_000.0

@@ -26,13 +26,13 @@ from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import Prepared, prepare
-from rtloop.progress import StatusLine
 from rtloop.recording.errors import RecordingError
-from rtloop.report_experiments import Progress, print_report
 from rtloop.running import recording_path, recover_leftovers
 from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 from rtloop.specifications import load_specification
+from rtloop.terminal.experiments import Progress, print_report
+from rtloop.terminal.progress import StatusLine
 
 
 class Planned(NamedTuple):

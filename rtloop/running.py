@@ -15,12 +15,12 @@ from rtloop.cautions import cautions
 from rtloop.config import load
 from rtloop.errors import LoopFault, OutputError, RtloopError
 from rtloop.prepare import Prepared, prepare
-from rtloop.progress import Counter
 from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
-from rtloop.report import RunView, print_run
 from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.terminal.progress import Counter
+from rtloop.terminal.run import RunView, print_run
 
 
 def run_configuration(

@@ -25,12 +25,12 @@ from rtloop.errors import LoopFault
 from rtloop.law.options import AxisOptions, PrefilterOptions, StepsOptions
 from rtloop.loopback import Pair, measure
 from rtloop.prepare import Prepared, prepare
-from rtloop.progress import StatusLine
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
 from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
-from rtloop.terminal import console, table
+from rtloop.terminal.progress import StatusLine
+from rtloop.terminal.table import console, table
 
 CYCLES, LEVELS = 5, 4
 SHORTEST_DWELL_S, SHORTEST_DWELL_TICKS = 0.05, 40

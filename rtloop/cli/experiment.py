@@ -29,7 +29,7 @@ def experiment() -> None:
 @fails_clearly
 def list_experiments() -> int:
     """Show every experiment and its parameters."""
-    from rtloop.report_experiments import print_list
+    from rtloop.terminal.experiments import print_list
 
     print_list()
     return 0

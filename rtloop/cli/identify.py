@@ -59,7 +59,7 @@ def hysteresis(
 ) -> int:  # fmt: skip
     """Thresholds and weights from recorded slow sines, each RUN from rest with its initial loading curve."""
     from rtloop.identifying import hysteresis_report
-    from rtloop.report_identification import print_hysteresis
+    from rtloop.terminal.identification import print_hysteresis
 
     report = hysteresis_report(
         runs,
@@ -100,7 +100,7 @@ def dynamics(
 ) -> int:  # fmt: skip
     """D(s) from the first RUN, a step or any other excitation from rest; further RUNs validate it."""
     from rtloop.identifying import dynamics_report
-    from rtloop.report_identification import print_dynamics
+    from rtloop.terminal.identification import print_dynamics
 
     report = dynamics_report(
         runs, axis=axis, how=how, hysteresis=hysteresis, order=order, largest_order=largest_order,
@@ -123,7 +123,7 @@ def compensation(
 ) -> int:
     """What the inverse compensation of CONFIG leaves on the identified actuator: ρ, Ω and its bound ξ."""
     from rtloop.identifying import compensation_report
-    from rtloop.report_identification import print_compensation
+    from rtloop.terminal.identification import print_compensation
 
     report = compensation_report(config, actuator, axis=axis, command_um=command_um, plot=plot)
     _show(report, as_json, print_compensation)

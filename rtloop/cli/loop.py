@@ -76,7 +76,7 @@ def drivers(
     The self-test moves outputs: nothing fragile may hang on them.
     """
     if config is None:
-        from rtloop.report import known_drivers, print_drivers
+        from rtloop.terminal.run import known_drivers, print_drivers
 
         if as_json:
             click.echo(json.dumps({"drivers": known_drivers()}))

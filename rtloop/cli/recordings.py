@@ -22,9 +22,9 @@ TO = click.Choice(["csv", "parquet", "npz"])
 @fails_clearly
 def info(files: tuple[Path, ...], as_json: bool) -> int:
     """Show what a recording holds: completeness, timing, errors, drives. The parts of a rotated one count as one."""
-    from rtloop.progress import Counter
     from rtloop.recording.summary import summarise
-    from rtloop.report import print_summary
+    from rtloop.terminal.progress import Counter
+    from rtloop.terminal.run import print_summary
 
     with Counter("ticks read", sys.stderr) as counter:
         summary = summarise(files, counter.show)
@@ -45,11 +45,11 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
     would have followed the recorded reference on the simulated rig of its configuration (without --config: the
     recorded law and rig). Both end with 0.
     """
-    from rtloop.progress import Counter
     from rtloop.recording.load import load
     from rtloop.recording.replay import replay as replay_recording
     from rtloop.replaying import replay_on_the_rig, replay_with_other_law
-    from rtloop.report_recordings import print_differences, print_replay, print_resimulation
+    from rtloop.terminal.progress import Counter
+    from rtloop.terminal.recordings import print_differences, print_replay, print_resimulation
 
     with Counter("ticks replayed", sys.stderr) as counter:
         if resimulate:
@@ -72,10 +72,10 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
 @fails_clearly
 def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     """Make a complete file of a recording that was killed, cut off or damaged; the original stays as it is."""
-    from rtloop.progress import Counter
     from rtloop.recording.parts import find_files
     from rtloop.recording.recover import recover as recover_recording
-    from rtloop.report_recordings import print_recovery
+    from rtloop.terminal.progress import Counter
+    from rtloop.terminal.recordings import print_recovery
 
     paths = find_files(files)
     if len(paths) > 1 and (out is not None or as_json):
@@ -95,9 +95,9 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
 @fails_clearly
 def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) -> int:
     """Hand a recording on as CSV, Parquet or npz: every number exactly, never over an existing file."""
-    from rtloop.progress import Counter
     from rtloop.recording.export import export as export_recording
-    from rtloop.report_recordings import print_export
+    from rtloop.terminal.progress import Counter
+    from rtloop.terminal.recordings import print_export
 
     with Counter("ticks exported", sys.stderr) as counter:
         report = export_recording(files, to, out, counter.show)
@@ -117,10 +117,10 @@ def plot(
     files: tuple[Path, ...], out: Path | None, start_s: float, end_s: float | None, html: bool, as_json: bool
 ) -> int:
     """Draw reference and position, error, drive, timing and events."""
-    from rtloop.progress import Counter
     from rtloop.recording.load import load
     from rtloop.recording.page import write_page
     from rtloop.recording.plot import plot as plot_recording
+    from rtloop.terminal.progress import Counter
 
     draw, recording = write_page if html else plot_recording, load(files)
     with Counter("ticks read", sys.stderr) as counter:

@@ -17,7 +17,7 @@ from rich.console import Console
 
 import rtloop
 from rtloop.steps import step_metrics
-from rtloop.terminal import table
+from rtloop.terminal.table import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install
 from tests.one_axis import one_axis

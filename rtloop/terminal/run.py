@@ -17,13 +17,13 @@ from rtloop.config import Configuration
 from rtloop.errors import RtloopError
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import Prepared
-from rtloop.progress import StatusLine
 from rtloop.recording.load import load
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
 from rtloop.specifications import load_specification
 from rtloop.steps import step_metrics
-from rtloop.terminal import console
+from rtloop.terminal.progress import StatusLine
+from rtloop.terminal.table import console
 
 BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")

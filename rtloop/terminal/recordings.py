@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from rtloop.recording.replay import ReplayReport
-from rtloop.terminal import console as _console
-from rtloop.terminal import table as _table
+from rtloop.terminal.table import console as _console
+from rtloop.terminal.table import table as _table
 
 METRICS = (
     ("rms_error_um", "rms error µm"),

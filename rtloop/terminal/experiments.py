@@ -10,8 +10,8 @@ from rich.markup import escape
 
 from rtloop.experiments.page import HEADINGS, compared, compared_cell, number
 from rtloop.experiments.registry import EXPERIMENTS
-from rtloop.progress import StatusLine
-from rtloop.terminal import console, table
+from rtloop.terminal.progress import StatusLine
+from rtloop.terminal.table import console, table
 
 COLOURS = {"good": "green", "mixed": "yellow", "bad": "red", "": "default"}
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.verification.text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
 from rtloop.design.verification.verify import Verification
-from rtloop.terminal import console as _console
+from rtloop.terminal.table import console as _console
 
 RED = {"MISSED", "NO"}
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from rich.console import Console
 
-from rtloop.terminal import console as _console
-from rtloop.terminal import table as _table
+from rtloop.terminal.table import console as _console
+from rtloop.terminal.table import table as _table
 
 
 def print_hysteresis(report: dict[str, Any]) -> None:
