@@ -14,7 +14,7 @@ test: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
-	$(BIN)/python -m rtloop.warm
+	$(BIN)/python -m rtloop.commands.warm
 	$(BIN)/pytest -n 2 --dist loadfile
 
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
@@ -78,7 +78,7 @@ check: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
-	$(BIN)/python -m rtloop.warm
+	$(BIN)/python -m rtloop.commands.warm
 	touch $@
 
 $(VENV)/.bench: $(READY)

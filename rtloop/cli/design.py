@@ -28,7 +28,7 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
     configuration around a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
     controller into a running loop. Exit 1 where no controller does what is asked, with the condition that fails.
     """
-    from rtloop.designing import synthesise_specification
+    from rtloop.commands.design import synthesise_specification
 
     return synthesise_specification(spec, out, axis, cross_check, as_json)
 
@@ -44,7 +44,7 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 
     Exit 1, "the answer is no", where a loop as it will run is unstable or misses a specification; 0 where all are met.
     """
-    from rtloop.designing import verify_configuration
+    from rtloop.commands.design import verify_configuration
 
     return verify_configuration(config, spec, out, as_json)
 

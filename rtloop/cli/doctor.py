@@ -25,7 +25,7 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
     the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes nothing
     without --apply.
     """
-    from rtloop.doctoring import doctor_host
+    from rtloop.commands.doctor import doctor_host
 
     return doctor_host(config, seconds, change, png, as_json)
 

@@ -53,7 +53,7 @@ def run(
     Only mode, reference and schedule are changed, and the simulated rig where an experiment is about that; limits and
     interlocks stay. Ctrl-C ramps down and reports what there is. Exit 1 where an experiment could not be finished.
     """
-    from rtloop.experimenting import run_experiments
+    from rtloop.commands.experiment import run_experiments
 
     return run_experiments(names, config, settings, axis, paced, out, as_json)
 
@@ -70,7 +70,7 @@ def run_all(
     config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None, as_json: bool
 ) -> int:
     """Run every experiment that the rig or the hardware of CONFIG allows."""
-    from rtloop.experimenting import run_experiments
+    from rtloop.commands.experiment import run_experiments
     from rtloop.experiments.registry import EXPERIMENTS
 
     return run_experiments(tuple(EXPERIMENTS), config, settings, axis, paced, out, as_json)
@@ -83,7 +83,7 @@ def run_all(
 @fails_clearly
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     """Analyse recordings of experiments again; RUN is a recording or a folder of them."""
-    from rtloop.experimenting import report_recordings
+    from rtloop.commands.experiment import report_recordings
 
     return report_recordings(runs, out, as_json)
 

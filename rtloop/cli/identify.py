@@ -58,7 +58,7 @@ def hysteresis(
     as_json: bool,
 ) -> int:  # fmt: skip
     """Thresholds and weights from recorded slow sines, each RUN from rest with its initial loading curve."""
-    from rtloop.identifying import hysteresis_report
+    from rtloop.commands.identify import hysteresis_report
     from rtloop.terminal.identification import print_hysteresis
 
     report = hysteresis_report(
@@ -99,7 +99,7 @@ def dynamics(
     as_json: bool,
 ) -> int:  # fmt: skip
     """D(s) from the first RUN, a step or any other excitation from rest; further RUNs validate it."""
-    from rtloop.identifying import dynamics_report
+    from rtloop.commands.identify import dynamics_report
     from rtloop.terminal.identification import print_dynamics
 
     report = dynamics_report(
@@ -122,7 +122,7 @@ def compensation(
     config: Path, actuator: Path, axis: str | None, command_um: float | None, plot: Path | None, as_json: bool
 ) -> int:
     """What the inverse compensation of CONFIG leaves on the identified actuator: ρ, Ω and its bound ξ."""
-    from rtloop.identifying import compensation_report
+    from rtloop.commands.identify import compensation_report
     from rtloop.terminal.identification import print_compensation
 
     report = compensation_report(config, actuator, axis=axis, command_um=command_um, plot=plot)
@@ -147,7 +147,7 @@ def auto(
     HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
     the loop misses the specification; the configuration is written all the same.
     """
-    from rtloop.chaining import design_from_recordings
+    from rtloop.commands.design_auto import design_from_recordings
 
     return design_from_recordings(hysteresis, step, specs, out, axis, order, as_json)
 

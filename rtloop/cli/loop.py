@@ -36,7 +36,7 @@ def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None,
     from rtloop.service.interruption import Interruption
 
     with Interruption() as interruption:
-        from rtloop.running import run_configuration
+        from rtloop.commands.run import run_configuration
 
         return run_configuration(config, duration_s, not unpaced, out, as_json, interruption)
 
@@ -48,7 +48,7 @@ def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None,
 @fails_clearly
 def check(config: Path, strict: bool, as_json: bool) -> int:
     """Validate CONFIG and show what would run: law, C(z) against C(s), margins, limits. Touches no hardware."""
-    from rtloop.checking import check_configuration
+    from rtloop.commands.check import check_configuration
 
     return check_configuration(config, strict, as_json)
 
@@ -83,7 +83,7 @@ def drivers(
         else:
             print_drivers()
         return 0
-    from rtloop.selftest import Tolerances, selftest_configuration
+    from rtloop.commands.selftest import Tolerances, selftest_configuration
 
     return selftest_configuration(
         config, amplitude_v, Tolerances(gain_tolerance, offset_v) if loopback else None, as_json

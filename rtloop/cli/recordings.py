@@ -45,9 +45,9 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
     would have followed the recorded reference on the simulated rig of its configuration (without --config: the
     recorded law and rig). Both end with 0.
     """
+    from rtloop.commands.replay import replay_on_the_rig, replay_with_other_law
     from rtloop.recording.load import load
     from rtloop.recording.replay import replay as replay_recording
-    from rtloop.replaying import replay_on_the_rig, replay_with_other_law
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_differences, print_replay, print_resimulation
 

@@ -44,7 +44,7 @@ def hil() -> None:
 @fails_clearly
 def hil_serve(config: Path, on_can: bool) -> int:
     """Be the board of CONFIG, whose driver is of kind shm: a rig with its own clock that outlives its controllers."""
-    from rtloop.board import serve_board, serve_node
+    from rtloop.commands.board import serve_board, serve_node
 
     return serve_node(config) if on_can else serve_board(config)
 

@@ -83,7 +83,7 @@ def test_a_drive_that_stands_still_shows_nothing():
 @pytest.fixture
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The command on a board of its own, with one rate; its result and the board."""
-    monkeypatch.setattr("rtloop.selftest.RUNGS", 1)
+    monkeypatch.setattr("rtloop.commands.selftest.RUNGS", 1)
 
     def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
         device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"

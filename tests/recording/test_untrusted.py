@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtloop.commands.replay import replay_on_the_rig
+from rtloop.commands.run import recover_leftovers
 from rtloop.law.layout import MAX_ORDER, MAX_PLAYS, MAX_SECTIONS, MAX_TAPS
 from rtloop.recording import format
 from rtloop.recording.errors import RecordingError
@@ -20,8 +22,6 @@ from rtloop.recording.load import load
 from rtloop.recording.recover import recover
 from rtloop.recording.replay import replay
 from rtloop.recording.summary import summarise
-from rtloop.replaying import replay_on_the_rig
-from rtloop.running import recover_leftovers
 from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed, with_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,7 +20,7 @@ import numpy as np
 import rtloop
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.loop_analysis import LoopAnalysis
-from rtloop.chaining import write_design
+from rtloop.commands.design_auto import write_design
 from rtloop.config import load
 from rtloop.design.chain import Chain
 from rtloop.design.verification.judgement import limits, specified

@@ -13,10 +13,10 @@ from rich.table import Table
 
 from rtloop.analysis.loop_analysis import LoopAnalysis, Tolerance, resonance_shift_tolerated
 from rtloop.cautions import cautions
+from rtloop.commands.design import verified
 from rtloop.config import load
 from rtloop.design.verification.text import answer
 from rtloop.design.verification.verify import Verification
-from rtloop.designing import verified
 from rtloop.errors import ConfigError
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import AxisCheck, Prepared, prepare

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import click
 
+from rtloop.commands.design import verify_configuration
 from rtloop.config import parse
 from rtloop.design.chain import Chain, configuration_text, designed
 from rtloop.design.identification.identified import write_new
 from rtloop.design.identification.measured import measured
 from rtloop.design.synthesis.assumptions import NoController
-from rtloop.designing import verify_configuration
 from rtloop.errors import ConfigError, NoDesign
 from rtloop.prepare import prepare
 from rtloop.specifications import load_specification

@@ -15,6 +15,7 @@ import click
 
 from drivers.errors import DriverError
 from hil.options import RigOptions
+from rtloop.commands.run import recording_path, recover_leftovers
 from rtloop.config import Configuration, load
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
@@ -27,7 +28,6 @@ from rtloop.experiments.setting import Setting
 from rtloop.law.options import AxisOptions
 from rtloop.prepare import Prepared, prepare
 from rtloop.recording.errors import RecordingError
-from rtloop.running import recording_path, recover_leftovers
 from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
 from rtloop.specifications import load_specification
