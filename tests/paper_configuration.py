@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.errors import ConfigError
-from rtloop.prepare import Prepared, prepare
 
 PAPER = Path(__file__).resolve().parents[1] / "deploy" / "paper.toml"
 TEXT = PAPER.read_text(encoding="utf-8")

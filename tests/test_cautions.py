@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from rtloop.cautions import cautions
 from rtloop.cli import main
-from rtloop.config import parse
-from rtloop.prepare import prepare
+from rtloop.configuration.cautions import cautions
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from tests.paper_configuration import PAPER, RATE, TEXT
 
 RAW = (RATE, f'{RATE}mode = "raw"\n')

@@ -10,10 +10,10 @@ import pytest
 from pydantic import BaseModel
 
 from hil.options import RigOptions
-from rtloop.config import ChannelOptions, InputFileError, LoopOptions, RecordingOptions, load, parse
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import ChannelOptions, InputFileError, LoopOptions, RecordingOptions, load, parse
+from rtloop.configuration.service import ServiceOptions
 from rtloop.errors import ConfigError
-from rtloop.law.options import AxisOptions
-from rtloop.service.options import ServiceOptions
 from rtloop.signals import Mode
 from tests.paper_configuration import CONTROLLER, PAPER, RATE, REFERENCE, TEXT, UNSTABLE, built, entry, faults
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.config import InputFileError, load
+from rtloop.configuration.axis import TableOptions
+from rtloop.configuration.file import InputFileError, load
+from rtloop.configuration.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
 from rtloop.design.identification.identified import read_feedforward
+from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.law.options import TableOptions
-from rtloop.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
-from rtloop.specifications import load_specification
 from tests.paper_configuration import REFERENCE, built
 
 PATIENCE_S = 20

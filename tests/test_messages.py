@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.toml_lines import key_lines, numbered
+from rtloop.configuration.toml_lines import key_lines, numbered
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import TWO_AXES, record
 

@@ -41,8 +41,8 @@ def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
 
 def _with_lines(error: Any) -> str:
     """The faults of a configuration with the lines of its file."""
+    from rtloop.configuration.toml_lines import numbered
     from rtloop.errors import listed
-    from rtloop.toml_lines import numbered
 
     return listed(error.source, numbered(error.faults, error.source))
 

@@ -197,7 +197,7 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
 @fails_clearly
 def controller(context: click.Context, axis: str, config: Path) -> int:
     """Swap in the [axis.controller] of AXIS from another configuration file."""
-    from rtloop.config import load
+    from rtloop.configuration.file import load
 
     axes = {one.name: one for one in load(config).axes}
     if axis not in axes or axes[axis].controller is None:
@@ -223,7 +223,7 @@ def _numbers(file: Any) -> list[float]:
 
 def _inline_table(text: str) -> dict[str, Any]:
     """TOML's inline table without its braces. Raises a usage error, with no place in a text that nobody typed."""
-    from rtloop.files import parse_toml
+    from rtloop.configuration.text_files import parse_toml
 
     try:
         return parse_toml(f"table = {{ {text} }}")["table"]

@@ -11,7 +11,7 @@ import click
 from drivers.can.options import CanOptions
 from drivers.shm import ShmOptions
 from hil.board import serve
-from rtloop.config import Configuration, load
+from rtloop.configuration.file import Configuration, load
 from rtloop.engine.plan import Pacing
 from rtloop.engine.realtime import prepare_realtime
 from rtloop.errors import ConfigError, UnavailableError

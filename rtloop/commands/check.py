@@ -12,14 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from rtloop.analysis.loop_analysis import LoopAnalysis, Tolerance, resonance_shift_tolerated
-from rtloop.cautions import cautions
 from rtloop.commands.design import verified
-from rtloop.config import load
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.cautions import cautions
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import AxisCheck, Prepared, prepare
 from rtloop.design.verification.text import answer
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
-from rtloop.law.options import AxisOptions
-from rtloop.prepare import AxisCheck, Prepared, prepare
 from rtloop.terminal.table import console as _console
 
 ROWS = (

@@ -9,19 +9,19 @@ from typing import Any
 
 import click
 
-from rtloop.config import Configuration, load, parse
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration, load, parse
+from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.assumptions import NoController
 from rtloop.design.synthesis.augment import augmented
 from rtloop.design.synthesis.section import controller_configuration, controller_section
 from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.verification.page import page
 from rtloop.design.verification.verify import Verification, as_dict, verify
 from rtloop.errors import ConfigError, NoDesign, OutputError
-from rtloop.law.options import AxisOptions
 from rtloop.linear.discretise import discretise
-from rtloop.prepare import prepare
-from rtloop.specifications import load_specification
 from rtloop.terminal.design import print_synthesis, print_verification
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import click
 
 from rtloop.commands.design import verify_configuration
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain, configuration_text, designed
 from rtloop.design.identification.identified import write_new
 from rtloop.design.identification.measured import measured
 from rtloop.design.synthesis.assumptions import NoController
+from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, NoDesign
-from rtloop.prepare import prepare
-from rtloop.specifications import load_specification
 
 
 def design_from_recordings(

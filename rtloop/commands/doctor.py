@@ -11,18 +11,18 @@ from typing import Any
 import click
 from rich.markup import escape
 
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.doctor.examine import Examination, Latency, examine
 from rtloop.doctor.remedy import Write, apply
 from rtloop.doctor.software import versions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
-from rtloop.plain import plain
-from rtloop.prepare import Prepared, prepare
 from rtloop.recording.histogram import Histogram
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.run import bars
 from rtloop.terminal.table import console, table
+from rtloop.values import plain
 
 MARKS = {True: "[green]good[/]", False: "[red]BAD[/]", None: "[dim]?[/]"}
 DEFAULT_RATE_HZ = 10_000.0

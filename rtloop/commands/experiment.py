@@ -16,8 +16,11 @@ import click
 from drivers.errors import DriverError
 from hil.options import RigOptions
 from rtloop.commands.run import recording_path, recover_leftovers
-from rtloop.config import Configuration, load
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.synthesis.specification import SpecificationOptions
+from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
 from rtloop.experiments.page import page
@@ -25,12 +28,9 @@ from rtloop.experiments.procedure import Experiment, Run
 from rtloop.experiments.registry import chosen, parameters
 from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
-from rtloop.law.options import AxisOptions
-from rtloop.prepare import Prepared, prepare
 from rtloop.recording.errors import RecordingError
 from rtloop.service.interruption import Interruption
 from rtloop.service.supervisor import Processes, RunResult, Supervisor
-from rtloop.specifications import load_specification
 from rtloop.terminal.experiments import Progress, print_report
 from rtloop.terminal.progress import StatusLine
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hil.linear import Real
-from rtloop.config import load as load_configuration
+from rtloop.configuration.file import load as load_configuration
 from rtloop.design.identification.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
 from rtloop.design.identification.identified import (
     dynamics_provenance,
@@ -30,7 +30,7 @@ from rtloop.errors import ConfigError
 from rtloop.hysteresis.compensation import compensated, residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
-from rtloop.plain import fields_of, plain
+from rtloop.values import fields_of, plain
 
 Input = Literal["hysteresis", "command", "drive"]
 RANDOM_COMMANDS = 20_000

@@ -11,11 +11,11 @@ import numpy as np
 
 from drivers.base import Driver
 from drivers.registry import driver_class
-from rtloop import config
-from rtloop.config import Configuration
+from rtloop.configuration import file as config
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
 from rtloop.law.layout import Records
-from rtloop.prepare import prepare
 from rtloop.recording.load import Recording, load
 from rtloop.recording.whatif import other_law, recorded_coefficients, resimulate
 

@@ -11,10 +11,10 @@ from typing import Any
 import click
 
 from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
-from rtloop.cautions import cautions
-from rtloop.config import load
+from rtloop.configuration.cautions import cautions
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.errors import LoopFault, OutputError, RtloopError
-from rtloop.prepare import Prepared, prepare
 from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
 from rtloop.service.interruption import Interruption

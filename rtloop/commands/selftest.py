@@ -20,11 +20,11 @@ import click
 import numpy as np
 
 from drivers.base import Channel, index_of
-from rtloop.config import Configuration, ModeName, load
+from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
+from rtloop.configuration.file import Configuration, ModeName, load
+from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.doctor.loopback import Pair, measure
 from rtloop.errors import LoopFault
-from rtloop.law.options import AxisOptions, PrefilterOptions, StepsOptions
-from rtloop.loopback import Pair, measure
-from rtloop.prepare import Prepared, prepare
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
 from rtloop.service.interruption import Interruption

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
+from rtloop.configuration.axis import ModelOptions
 from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_section,
@@ -33,7 +34,6 @@ from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import section
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
-from rtloop.law.options import ModelOptions
 
 LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.margins import delay_tolerated
+from rtloop.configuration.prepare import Prepared
 from rtloop.doctor.examine import Examination, Latency
-from rtloop.prepare import Prepared
 
 LATE_SHARE = 0.001
 US_PER_S = 1e6

@@ -11,7 +11,7 @@ import json
 import tomllib
 from typing import Any
 
-from rtloop.config import Configuration, parse
+from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import section
 from rtloop.experiments.procedure import Run, hold
 

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from hil.linear import Real
 from hil.options import Numbers, Options
-from rtloop.config import ModeName
+from rtloop.configuration.file import ModeName
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
 from rtloop.experiments.promised import REFERENCE_HZ, Promised

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hil.options import Options
-from rtloop.config import Configuration, ModeName
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration, ModeName
 from rtloop.errors import ConfigError
-from rtloop.law.options import AxisOptions
 
 if TYPE_CHECKING:
     from rtloop.experiments.setting import Setting

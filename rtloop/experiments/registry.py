@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pydantic import ValidationError
 
 from hil.options import Options
-from rtloop.config import describe
+from rtloop.configuration.file import describe
 from rtloop.errors import ConfigError
 from rtloop.experiments import (
     characterise,

@@ -12,9 +12,9 @@ from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import pictures
 from rtloop.experiments.verdict import Analysis, Table
-from rtloop.plain import plain
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
+from rtloop.values import plain
 
 Say = Callable[[str], None]
 

@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
+from rtloop.configuration.axis import AxisOptions
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Timeline
 from rtloop.hysteresis.plays import loading_curve
-from rtloop.law.options import AxisOptions
 
 UNKNOWN_PEAK, LEAST_PEAK = 1.4, 1.1
 """Of the command per step of the reference: where no model tells, and what the hysteresis takes at least."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hil.linear import Real
+from rtloop.configuration.axis import AxisOptions
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import limits
@@ -18,7 +19,6 @@ from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
 from rtloop.experiments.verdict import Row
 from rtloop.law.hysteresis import PlayModel
-from rtloop.law.options import AxisOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.signals import Flag

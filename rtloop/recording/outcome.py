@@ -10,8 +10,8 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.recording.rerun import Rows
+from rtloop.recording.steps import StepMetrics, step_metrics
 from rtloop.signals import PER_AXIS, TRIP_MASK, Mode
-from rtloop.steps import StepMetrics, step_metrics
 
 JUDGED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 STEP_ANALYSIS_TICKS = 3_000_000

@@ -21,11 +21,11 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from drivers.errors import DriverError
-from rtloop.config import describe
+from rtloop.configuration.axis import TableOptions
+from rtloop.configuration.file import describe
+from rtloop.configuration.references import read_samples
 from rtloop.engine.commands import QueueFull
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
-from rtloop.law.options import TableOptions
-from rtloop.references import read_samples
 from rtloop.service.bodies import (
     MAX_BODY_BYTES,
     Body,

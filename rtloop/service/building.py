@@ -19,9 +19,9 @@ import time
 from typing import IO, Any
 
 from drivers.errors import DriverError
-from rtloop.config import Configuration
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
-from rtloop.prepare import Prepared, prepare
 
 BUILD_S = 10.0
 """A law that is not built and verified within this is refused."""
@@ -58,7 +58,7 @@ class Builder:
         )
 
     def prepare(self, configuration: Configuration) -> Prepared:
-        """As `rtloop.prepare.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
+        """As `rtloop.configuration.prepare.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
         with self._lock:
             self._start()
             if not self._ready:

@@ -11,8 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from hil.compiled import cpu_identity
+from rtloop.configuration.prepare import Prepared
 from rtloop.law.layout import layout_description
-from rtloop.prepare import Prepared
 
 FORMAT = 1
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")

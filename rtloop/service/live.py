@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from rtloop.config import Configuration, describe
+from rtloop.configuration.axis import AxisOptions, ReferenceOptions
+from rtloop.configuration.file import Configuration, describe
+from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.references import TableOfSamples, extent, generator_values, volts
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError
 from rtloop.law.layout import COEFFICIENTS
-from rtloop.law.options import AxisOptions, ReferenceOptions
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
-from rtloop.prepare import Prepared
-from rtloop.references import TableOfSamples, extent, generator_values, volts
 from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused, Taken
 from rtloop.signals import MODE, Mode

@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from drivers.base import Driver
 from drivers.errors import DriverError
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
 from rtloop.errors import UnavailableError
-from rtloop.prepare import prepare
 from rtloop.service.paths import block_path, open_block
 
 POLL_S = 0.005

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from hil.trusted import Untrusted, open_file, open_folder
-from rtloop.config import Configuration
+from rtloop.configuration.file import Configuration
 from rtloop.errors import OutputError, RefusedError, UnavailableError
 
 FOLDER_MODE = 0o750

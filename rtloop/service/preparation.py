@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop import signals
+from rtloop.configuration.service import DepolariseOptions, ServiceOptions
 from rtloop.engine.messages import Kind
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
-from rtloop.service.options import DepolariseOptions, ServiceOptions
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Flag, Mode
 

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rtloop.config import RecordingOptions
+from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
 from rtloop.recording.recover import recover

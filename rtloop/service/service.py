@@ -24,11 +24,11 @@ import numpy as np
 from drivers.errors import DriverError
 from rtloop import signals
 from rtloop.commands.run import recording_path
-from rtloop.config import Configuration, load
+from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
-from rtloop.prepare import Prepared, prepare
 from rtloop.recording.recover import leftovers, recover
 from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused

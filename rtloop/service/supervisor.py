@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import DriverError
+from rtloop.configuration.prepare import Prepared
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
-from rtloop.prepare import Prepared
 from rtloop.recording.events import trip_reason
 from rtloop.service.child import Child
 from rtloop.service.header import recording_header

@@ -13,15 +13,15 @@ from rich.table import Table
 from drivers.errors import DriverError
 from drivers.registry import driver_class, kinds
 from rtloop import signals
-from rtloop.config import Configuration
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.prepare import Prepared
+from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import RtloopError
-from rtloop.law.options import AxisOptions
-from rtloop.prepare import Prepared
 from rtloop.recording.load import load
+from rtloop.recording.steps import step_metrics
 from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
-from rtloop.specifications import load_specification
-from rtloop.steps import step_metrics
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console
 

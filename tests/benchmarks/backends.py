@@ -16,9 +16,9 @@ from drivers.base import Driver, Pointers, Wiring
 from drivers.errors import DriverError
 from drivers.playback import TIMING_COLUMNS, Playback
 from drivers.registry import driver_class
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.errors import RtloopError
-from rtloop.prepare import prepare
 from tests.benchmarks.board import board, on_a_board, served
 from tests.benchmarks.configurations import RIG, SINE, STEPS, at_rate, changed, write
 from tests.benchmarks.measure import Effort, in_turn, spread

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from scipy import signal
 
 from drivers.sim import SimDriver
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.plan import Plan
-from rtloop.prepare import prepare
 from rtloop.signals import ERROR, FLAGS, POSITION, REFERENCE, axis_column
 from tests.benchmarks.configurations import PAPER, RIG, STEPS, TEXT, changed
 from tests.benchmarks.kernels import Differs

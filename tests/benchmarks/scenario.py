@@ -9,13 +9,13 @@ import numpy as np
 
 from drivers.base import Wiring
 from hil.rig import build_rig
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.assembly import Assembly, LawArrays, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Plan
 from rtloop.law.layout import Records
-from rtloop.prepare import prepare
 from tests.benchmarks import native
 from tests.benchmarks.configurations import PAPER
 

@@ -15,8 +15,8 @@ from click.testing import CliRunner, Result
 import rtloop
 from hil.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.cli import main
-from rtloop.config import parse
-from rtloop.prepare import prepare
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from tests.design.rigs import slow_sine
 from tests.law.oracle import Hysteresis
 from tests.recording.real_loop import record

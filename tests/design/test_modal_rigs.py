@@ -8,14 +8,14 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
-from rtloop.config import Configuration, load
+from rtloop.configuration.file import Configuration, load
+from rtloop.configuration.prepare import prepare
 from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.experiments.derive import derived
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.experiments.report import report, take
 from rtloop.experiments.setting import Setting
-from rtloop.prepare import prepare
-from rtloop.specifications import load_specification
 from tests.design.modal_rigs import modal_rig
 from tests.recording.real_loop import record
 from tests.soak.chain import LIMITS, designed_for, run, verdict

@@ -11,11 +11,11 @@ from click.testing import CliRunner
 from rtloop.analysis.closed_loop import continuous_loop, realised
 from rtloop.analysis.step_response import position_at
 from rtloop.cli import main
+from rtloop.configuration.axis import ControllerOptions
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.augment import Matrices, augmented
 from rtloop.design.synthesis.synthesise import synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS, tracking_weight
-from rtloop.law.options import ControllerOptions
 from tests.design.plants import dense_norm
 
 SPEC = Path(__file__).resolve().parents[2] / "deploy" / "paper-spec.toml"

@@ -10,11 +10,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.synthesise import synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer
-from rtloop.prepare import prepare
 
 RATE_HZ = 10_000.0
 HALF_RATE_RAD_S = math.pi * RATE_HZ

@@ -15,12 +15,12 @@ import pytest
 
 from rtloop.analysis.closed_loop import continuous_loop
 from rtloop.analysis.margins import delay_tolerated
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.doctor.examine import Examination, Latency, conditions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
 from rtloop.linear.transfer import Transfer
-from rtloop.prepare import prepare
 from tests.doctor.hosts import host
 from tests.recording.real_loop import ROOT, changed
 

@@ -18,7 +18,7 @@ import pytest
 
 import rtloop
 from hil import board
-from rtloop.config import parse
+from rtloop.configuration.file import parse
 from rtloop.errors import ConfigError
 from rtloop.recording.replay import replay
 from tests.faults.account import account

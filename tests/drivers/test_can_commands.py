@@ -63,9 +63,9 @@ BAD = {
 
 @pytest.mark.parametrize("fault", BAD)
 def test_what_a_configuration_may_not_say(tmp_path, fault):
-    from rtloop.config import load
+    from rtloop.configuration.file import load
+    from rtloop.configuration.prepare import prepare
     from rtloop.errors import ConfigError
-    from rtloop.prepare import prepare
 
     old, new, message = BAD[fault]
     config = configuration(tmp_path, free_port())

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
-from rtloop.loopback import measure
+from rtloop.doctor.loopback import measure
 from tests.drivers.comedi_board import new_board, output_v, stub_library
 
 DWELL, SETTLING = 100, 50

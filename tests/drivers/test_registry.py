@@ -9,9 +9,9 @@ import pytest
 from drivers.errors import DriverError, MissingExtra
 from drivers.registry import driver_class, kinds
 from drivers.sim import SimDriver
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
-from rtloop.prepare import prepare
 from tests.engine.harness import AXIS, text
 
 ENTRY_POINTS = """[rtloop.drivers]

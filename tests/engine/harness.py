@@ -13,7 +13,8 @@ from numba import carray
 from drivers.base import Driver
 from hil.compiled import cfunc
 from hil.pointers import SIGNATURE, address_pointer
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import Clock, clock_context, unpaced_clock
 from rtloop.engine.commands import send
@@ -22,7 +23,6 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
-from rtloop.prepare import prepare
 
 FOR_EVER = 1 << 40
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.law.reference import Generator
-from rtloop.prepare import prepare
 from rtloop.signals import Mode
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, text
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
-from rtloop.prepare import prepare
 from rtloop.recording.load import load
 from rtloop.recording.replay import replay
 from rtloop.recording.session import Options, Session

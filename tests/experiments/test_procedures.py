@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from rtloop.config import load
+from rtloop.configuration.axis import ModelOptions
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
@@ -21,8 +23,6 @@ from rtloop.experiments.robustness import Outcome, range_about_zero, stable_rang
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.step_response import fitted_ringing
 from rtloop.experiments.verdict import Row
-from rtloop.law.options import ModelOptions
-from rtloop.prepare import prepare
 from tests.recording.real_loop import record
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"

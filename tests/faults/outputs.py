@@ -15,10 +15,10 @@ import numpy as np
 from drivers.base import Driver
 from drivers.errors import DriverError
 from hil.board import LSB_V
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.ramp import ramp
-from rtloop.prepare import prepare
 from rtloop.service.parking import park
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for

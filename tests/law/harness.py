@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from drivers.base import Channel
 from hil.compiled import jit
-from rtloop.law.build import axis_coefficients
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.coefficients import axis_coefficients
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, Records, initial_state, records
-from rtloop.law.options import AxisOptions
 from rtloop.linear.discretise import discretise
 from rtloop.signals import Mode
 

@@ -10,9 +10,9 @@ from pydantic import TypeAdapter
 
 from drivers.base import Channel
 from hil.compiled import jit
-from rtloop.law.options import ReferenceOptions
+from rtloop.configuration.axis import ReferenceOptions
+from rtloop.configuration.references import TableOfSamples, extent, generator_values
 from rtloop.law.reference import GENERATOR, reference_sample
-from rtloop.references import TableOfSamples, extent, generator_values
 
 RATE_HZ, START = 10_000.0, 137
 INPUTS = (Channel("adc0"), Channel("joystick"))

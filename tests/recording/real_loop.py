@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
-from rtloop.prepare import prepare
 from rtloop.recording.session import Options, Session
 from rtloop.service.header import recording_header
 

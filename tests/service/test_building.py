@@ -7,9 +7,9 @@ import pickle
 import numpy as np
 import pytest
 
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, UnavailableError
-from rtloop.prepare import prepare
 from rtloop.service.building import Builder
 from tests.paper_configuration import PAPER, TEXT, UNSTABLE
 

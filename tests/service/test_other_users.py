@@ -18,7 +18,7 @@ from drivers.shm import ShmDriver, ShmOptions
 from hil import board
 from hil.compiled import _owned_folder
 from hil.options import BoardOptions
-from rtloop.config import load
+from rtloop.configuration.file import load
 from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.service import parking
 from rtloop.service.client import Client

@@ -220,7 +220,7 @@ def parked(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir(mode=0o700)
 
     def start(card: type[Card]) -> tuple[Hardware, Callable[[], str]]:
-        for module in ("rtloop.config", "rtloop.prepare", "rtloop.engine.plan"):
+        for module in ("rtloop.configuration.file", "rtloop.configuration.prepare", "rtloop.engine.plan"):
             monkeypatch.setattr(f"{module}.driver_class", lambda kind: card)
         (tmp_path / "run" / "lab.block").unlink(missing_ok=True)
         fd = os.open(tmp_path / "run" / "lab.block", os.O_RDWR | os.O_CREAT, 0o600)

@@ -8,7 +8,7 @@ import signal
 import numpy as np
 
 import rtloop
-from rtloop.service.options import DepolariseOptions
+from rtloop.configuration.service import DepolariseOptions
 from rtloop.service.preparation import decaying_sine
 from tests.faults.account import runs_in
 from tests.faults.bench import Bench

@@ -21,12 +21,12 @@ import rtloop
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.commands.design_auto import write_design
-from rtloop.config import load
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain
 from rtloop.design.verification.judgement import limits, specified
 from rtloop.errors import RtloopError
 from rtloop.linear.discretise import discretise
-from rtloop.prepare import prepare
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, modal_rig
 from tests.recording.real_loop import record

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 import rtloop
-from rtloop.config import parse
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import RtloopError
-from rtloop.prepare import prepare
 from rtloop.recording.replay import replay
 from rtloop.service.child import Child
 from rtloop.service.desk import Desk

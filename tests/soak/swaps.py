@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
-from rtloop.config import parse
+from rtloop.configuration.file import parse
 from tests.engine.test_swaps import SINE
 from tests.faults.account import account
 from tests.faults.bench import Bench

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.board import LSB_V, BoardMemory
-from rtloop.config import load
+from rtloop.configuration.file import load
 
 UNIT, BOARD = "rtloop@board.service", "rtloop-board@board.service"
 RTLOOP = "/opt/rtloop/bin/rtloop"

@@ -10,15 +10,15 @@ from typing import Any
 from pydantic import ValidationError
 
 from rtloop import __version__
-from rtloop.config import describe
+from rtloop.configuration.axis import FeedforwardOptions
+from rtloop.configuration.file import describe
+from rtloop.configuration.text_files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.design.identification.identify_dynamics import DynamicsFit
 from rtloop.design.identification.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
 from rtloop.errors import ConfigError, OutputError
-from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.law.hysteresis import PlayModel
-from rtloop.law.options import FeedforwardOptions
 from rtloop.recording.errors import RecordingError
 
 

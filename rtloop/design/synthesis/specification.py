@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from hil.options import Options
+from rtloop.configuration.axis import ModelOptions, TransferOptions
 from rtloop.design.synthesis.weights import (
     DisturbanceRule,
     Weights,
@@ -19,7 +20,6 @@ from rtloop.design.synthesis.weights import (
     disturbance_weight,
     tracking_weight,
 )
-from rtloop.law.options import ModelOptions, TransferOptions
 from rtloop.linear.transfer import Transfer
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from hil.options import RigOptions
-from rtloop.config import ChannelOptions, Configuration
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import ChannelOptions, Configuration
+from rtloop.configuration.prepare import AxisCheck, Prepared
+from rtloop.configuration.references import extent, volts
 from rtloop.engine.messages import ALL_AXES, Kind
 from rtloop.hysteresis.plays import loading_curve
-from rtloop.law.options import AxisOptions
 from rtloop.law.reference import Generator
-from rtloop.prepare import AxisCheck, Prepared
-from rtloop.references import extent, volts
 from rtloop.signals import Mode
 
 SAME_SCALE = 0.01

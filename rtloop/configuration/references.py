@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.base import Channel, index_of
-from rtloop.files import read_below, read_regular
-from rtloop.law.options import (
+from rtloop.configuration.axis import (
     ChirpOptions,
     HoldOptions,
     InputOptions,
@@ -19,6 +18,7 @@ from rtloop.law.options import (
     StepsOptions,
     TableOptions,
 )
+from rtloop.configuration.text_files import read_below, read_regular
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.base import Channel
+from rtloop.configuration.axis import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
 from rtloop.law.layout import BLOCK, COEFFICIENTS, LANES, MAX_ORDER, Records, records
-from rtloop.law.options import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import blocks, row_bands
 

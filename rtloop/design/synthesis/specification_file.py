@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from rtloop.config import InputFileError, describe
+from rtloop.configuration.file import InputFileError, describe
+from rtloop.configuration.text_files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.errors import ConfigError
-from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
 
 
 class SpecificationFile(NamedTuple):

@@ -17,10 +17,10 @@ from drivers.base import Wiring
 from drivers.errors import DriverError
 from drivers.registry import driver_class
 from hil.options import LARGEST_INTEGER, Options
+from rtloop.configuration.axis import AxisOptions, ReferenceOptions
+from rtloop.configuration.service import ServiceOptions
+from rtloop.configuration.text_files import MAX_TEXT_BYTES, parse_toml, read_regular
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.files import MAX_TEXT_BYTES, parse_toml, read_regular
-from rtloop.law.options import AxisOptions, ReferenceOptions
-from rtloop.service.options import ServiceOptions
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -101,7 +101,7 @@ class _Sections(Options):
 
 @dataclass(frozen=True)
 class Configuration:
-    """A configuration whose every part is valid by itself; `rtloop.prepare` judges how the parts fit."""
+    """A configuration whose every part is valid by itself; `rtloop.configuration.prepare` judges how the parts fit."""
 
     name: str
     source: str

@@ -13,17 +13,17 @@ from drivers.errors import DriverError
 from drivers.registry import driver_class
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_continuous, analyse_discrete
-from rtloop.config import Configuration, ScheduleOptions
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.coefficients import axis_coefficients, joined
+from rtloop.configuration.file import Configuration, ScheduleOptions
+from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
-from rtloop.law.build import axis_coefficients, joined
 from rtloop.law.layout import Records
-from rtloop.law.options import AxisOptions
 from rtloop.law.reference import GENERATOR
 from rtloop.linear.discretise import DiscreteController, discretise
 from rtloop.linear.transfer import Transfer
-from rtloop.references import TableOfSamples, generator_values
 from rtloop.signals import Mode
 
 COMPARED_PART = 0.2
