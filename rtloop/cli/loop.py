@@ -33,7 +33,7 @@ POSITIVE = Positive(0.0, 1e6, min_open=True)
 @fails_clearly
 def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None, as_json: bool) -> int:
     """Run the loop of CONFIG and record every tick; Ctrl-C ramps down, finishes the recording and ends well."""
-    from rtloop.service.interruption import Interruption
+    from rtloop.supervision.interruption import Interruption
 
     with Interruption() as interruption:
         from rtloop.commands.run import run_configuration

@@ -27,7 +27,7 @@ def serve(config: Path) -> int:
 @fails_clearly
 def park(config: Path) -> int:
     """Bring every output of CONFIG to its safe value, ramping from where it is."""
-    from rtloop.service.parking import park_configuration
+    from rtloop.supervision.parking import park_configuration
 
     click.echo(park_configuration(config), err=True)
     return 0
@@ -61,7 +61,7 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None) -> N
 def _client(context: click.Context) -> Any:
     from rtloop.errors import UnavailableError
     from rtloop.service.client import Client
-    from rtloop.service.paths import client_folders
+    from rtloop.supervision.paths import client_folders
 
     name, path = context.obj
     if path is None:

@@ -29,8 +29,8 @@ from rtloop.experiments.registry import chosen, parameters
 from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
 from rtloop.recording.errors import RecordingError
-from rtloop.service.interruption import Interruption
-from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.supervision.interruption import Interruption
+from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.experiments import Progress, print_report
 from rtloop.terminal.progress import StatusLine
 

@@ -17,8 +17,8 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.errors import LoopFault, OutputError, RtloopError
 from rtloop.recording.recover import leftovers, recover
 from rtloop.recording.summary import summarise
-from rtloop.service.interruption import Interruption
-from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.supervision.interruption import Interruption
+from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.progress import Counter
 from rtloop.terminal.run import RunView, print_run
 

@@ -27,8 +27,8 @@ from rtloop.doctor.loopback import Pair, measure
 from rtloop.errors import LoopFault
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
-from rtloop.service.interruption import Interruption
-from rtloop.service.supervisor import Processes, RunResult, Supervisor
+from rtloop.supervision.interruption import Interruption
+from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
 

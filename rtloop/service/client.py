@@ -12,7 +12,7 @@ from typing import Any
 
 from hil.trusted import Untrusted, owners
 from rtloop.errors import RefusedError, RtloopError, UnavailableError
-from rtloop.service.paths import refusal
+from rtloop.supervision.paths import refusal
 
 TIMEOUT_S = 20.0
 _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")

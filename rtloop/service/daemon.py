@@ -22,8 +22,8 @@ from rtloop.service.building import builder_ended
 from rtloop.service.can_bus import supervised_by_can
 from rtloop.service.connections import BACKLOG, settings
 from rtloop.service.journal import Journal
-from rtloop.service.paths import FOLDER_MODE, refusal, socket_path
 from rtloop.service.service import Service
+from rtloop.supervision.paths import FOLDER_MODE, refusal, socket_path
 
 END_TIMEOUT_S = 5.0
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from prometheus_client import CollectorRegistry, Gauge, generate_latest
 
-from rtloop.service.recording_state import recording_state
 from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, timing
+from rtloop.supervision.recording_state import recording_state
 
 
 def metrics_text(service: Service) -> str:

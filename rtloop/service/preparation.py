@@ -12,8 +12,8 @@ from rtloop.configuration.service import DepolariseOptions, ServiceOptions
 from rtloop.engine.messages import Kind
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
-from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Flag, Mode
+from rtloop.supervision.supervisor import Supervisor
 
 POLL_S = 0.01
 PATIENCE = 3.0

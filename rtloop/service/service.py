@@ -34,11 +34,11 @@ from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
-from rtloop.service.paths import block_path
 from rtloop.service.preparation import prepare_actuator
-from rtloop.service.recording_state import recording_fault, recording_state
-from rtloop.service.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 from rtloop.signals import Flag, Mode
+from rtloop.supervision.paths import block_path
+from rtloop.supervision.recording_state import recording_fault, recording_state
+from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
 POLL_S = 0.005
 STATUS_PERIOD_S = 1.0

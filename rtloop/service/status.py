@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from rtloop import signals
-from rtloop.service.recording_state import recording_state
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
+from rtloop.supervision.recording_state import recording_state
 
 WINDOW_TICKS = 10_000
 

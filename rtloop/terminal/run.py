@@ -20,8 +20,8 @@ from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import RtloopError
 from rtloop.recording.load import load
 from rtloop.recording.steps import step_metrics
-from rtloop.service.supervisor import Supervisor
 from rtloop.signals import Mode
+from rtloop.supervision.supervisor import Supervisor
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console
 

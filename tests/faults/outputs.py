@@ -19,7 +19,7 @@ from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.ramp import ramp
-from rtloop.service.parking import park
+from rtloop.supervision.parking import park
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible

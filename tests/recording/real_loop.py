@@ -13,7 +13,7 @@ from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.recording.session import Options, Session
-from rtloop.service.header import recording_header
+from rtloop.supervision.description import recording_header
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = (ROOT / "deploy" / "paper.toml").read_text()

@@ -44,7 +44,7 @@ def test_a_socket_that_nobody_serves_any_more_is_replaced(tmp_path: Path):
 def test_the_name_of_a_service_is_no_pattern(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("lab[b]", "labb"):
         _bind(tmp_path / f"{name}.sock", 0o660).close()
-    monkeypatch.setattr("rtloop.service.paths.client_folders", lambda: [tmp_path])
+    monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [tmp_path])
     for name in ("lab[b]", "labb"):
         said = CliRunner().invoke(main, ["ctl", "--name", name, "status"])
         assert said.exit_code == 69

@@ -20,7 +20,7 @@ CASES = [
 def test_what_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: list[str], options: list[str], said: str):
     for name in there:
         (tmp_path / f"{name}.sock").touch()
-    monkeypatch.setattr("rtloop.service.paths.client_folders", lambda: [tmp_path])
+    monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [tmp_path])
     done = CliRunner().invoke(main, ["ctl", *options, "status"])
     assert done.exit_code == 69
     assert done.stderr == f"rtloop: {said.format(folder=tmp_path)}\n"

@@ -20,10 +20,10 @@ from hil.compiled import _owned_folder
 from hil.options import BoardOptions
 from rtloop.configuration.file import load
 from rtloop.engine.memory import SharedBlock, Sizes
-from rtloop.service import parking
 from rtloop.service.client import Client
 from rtloop.service.daemon import _bind
-from rtloop.service.paths import block_path, new_block, runtime_folder, socket_path
+from rtloop.supervision import parking
+from rtloop.supervision.paths import block_path, new_block, runtime_folder, socket_path
 from tests.paper_configuration import PAPER
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user, clean_places
 

@@ -19,7 +19,7 @@ from drivers.base import Channel, Facts
 from drivers.python import PythonDriver
 from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import UnavailableError
-from rtloop.service import parking
+from rtloop.supervision import parking
 
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
 CLAIM = """

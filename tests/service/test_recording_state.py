@@ -8,7 +8,7 @@ import pytest
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
-from rtloop.service.recording_state import recording_fault, recording_state
+from rtloop.supervision.recording_state import recording_fault, recording_state
 from tests.recording.hand_made_loop import HandMadeLoop
 
 

@@ -21,7 +21,7 @@ import rtloop
 from rtloop.cli import main
 from rtloop.engine.memory import ProcessState
 from rtloop.recording.session import Options, Session
-from rtloop.service.supervisor import Supervisor
+from rtloop.supervision.supervisor import Supervisor
 from tests.recording.real_loop import PAPER, RealLoop, changed
 from tests.service.test_python_driver import DRIVER, install
 from tests.service.test_run import ROOT, start

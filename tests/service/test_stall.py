@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rtloop.service.notify import Notifier
-from rtloop.service.stall import StallWatch, stall_limit_s
+from rtloop.supervision.stall import StallWatch, stall_limit_s
 
 
 @pytest.mark.parametrize(

@@ -26,11 +26,11 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import RtloopError
 from rtloop.recording.replay import replay
-from rtloop.service.child import Child
 from rtloop.service.desk import Desk
 from rtloop.service.live import LiveLaw
-from rtloop.service.supervisor import Processes, Supervisor
 from rtloop.signals import Mode
+from rtloop.supervision.child import Child
+from rtloop.supervision.supervisor import Processes, Supervisor
 from tests.recording.real_loop import ROOT
 
 DRIVE_V, SLEW_V_PER_S, TRIP_SLEW_V_PER_S, RATE_HZ = 9.0, 3000.0, 700.0, 10_000.0

@@ -17,8 +17,8 @@ from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
 from rtloop.recording.recover import recover
-from rtloop.service.child import Child
-from rtloop.service.stall import StallWatch
+from rtloop.supervision.child import Child
+from rtloop.supervision.stall import StallWatch
 
 MODULE = "rtloop.recording.recorder"
 STALL_S = 3.0

@@ -18,7 +18,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
 from rtloop.errors import UnavailableError
-from rtloop.service.paths import block_path, open_block
+from rtloop.supervision.paths import block_path, open_block
 
 POLL_S = 0.005
 KILL_S = 5.0

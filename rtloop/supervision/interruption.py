@@ -10,7 +10,7 @@ import signal
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
-    from rtloop.service.supervisor import Supervisor
+    from rtloop.supervision.supervisor import Supervisor
 
 
 class Interruption:

@@ -24,12 +24,12 @@ from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
 from rtloop.recording.events import trip_reason
-from rtloop.service.child import Child
-from rtloop.service.header import recording_header
-from rtloop.service.parking import park
-from rtloop.service.paths import new_block
-from rtloop.service.recording import RecorderKeeper
-from rtloop.service.stall import StallWatch, stall_limit_s
+from rtloop.supervision.child import Child
+from rtloop.supervision.description import recording_header
+from rtloop.supervision.parking import park
+from rtloop.supervision.paths import new_block
+from rtloop.supervision.recorder_keeper import RecorderKeeper
+from rtloop.supervision.stall import StallWatch, stall_limit_s
 
 POLL_S, START_POLL_S = 0.005, 0.002
 PROGRESS_PERIOD_S = 0.1
