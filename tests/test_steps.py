@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from rtloop.recording.steps import step_metrics
+from rtloop.recording.views.steps import step_metrics
 
 RATE_HZ, OMEGA = 10_000.0, 2 * np.pi * 80.0
 DWELL = 4000

@@ -22,7 +22,7 @@ TO = click.Choice(["csv", "parquet", "npz"])
 @fails_clearly
 def info(files: tuple[Path, ...], as_json: bool) -> int:
     """Show what a recording holds: completeness, timing, errors, drives. The parts of a rotated one count as one."""
-    from rtloop.recording.summary import summarise
+    from rtloop.recording.views.summary import summarise
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.run import print_summary
 
@@ -47,7 +47,7 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
     """
     from rtloop.commands.replay import replay_on_the_rig, replay_with_other_law
     from rtloop.recording.load import load
-    from rtloop.recording.replay import replay as replay_recording
+    from rtloop.recording.replay.replay import replay as replay_recording
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_differences, print_replay, print_resimulation
 
@@ -72,8 +72,8 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
 @fails_clearly
 def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     """Make a complete file of a recording that was killed, cut off or damaged; the original stays as it is."""
-    from rtloop.recording.parts import find_files
-    from rtloop.recording.recover import recover as recover_recording
+    from rtloop.recording.file.parts import find_files
+    from rtloop.recording.file.recover import recover as recover_recording
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_recovery
 
@@ -95,7 +95,7 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
 @fails_clearly
 def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) -> int:
     """Hand a recording on as CSV, Parquet or npz: every number exactly, never over an existing file."""
-    from rtloop.recording.export import export as export_recording
+    from rtloop.recording.views.export import export as export_recording
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_export
 
@@ -118,8 +118,8 @@ def plot(
 ) -> int:
     """Draw reference and position, error, drive, timing and events."""
     from rtloop.recording.load import load
-    from rtloop.recording.page import write_page
-    from rtloop.recording.plot import plot as plot_recording
+    from rtloop.recording.views.page import write_page
+    from rtloop.recording.views.plot import plot as plot_recording
     from rtloop.terminal.progress import Counter
 
     draw, recording = write_page if html else plot_recording, load(files)

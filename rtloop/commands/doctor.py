@@ -18,7 +18,7 @@ from rtloop.doctor.remedy import Write, apply
 from rtloop.doctor.software import versions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
-from rtloop.recording.histogram import Histogram
+from rtloop.recording.views.histogram import Histogram
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.run import bars
 from rtloop.terminal.table import console, table

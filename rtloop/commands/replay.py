@@ -17,7 +17,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
 from rtloop.law.layout import Records
 from rtloop.recording.load import Recording, load
-from rtloop.recording.whatif import other_law, recorded_coefficients, resimulate
+from rtloop.recording.replay.whatif import other_law, recorded_coefficients, resimulate
 
 Progress = Callable[[int], None]
 

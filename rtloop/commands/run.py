@@ -15,8 +15,8 @@ from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.errors import LoopFault, OutputError, RtloopError
-from rtloop.recording.recover import leftovers, recover
-from rtloop.recording.summary import summarise
+from rtloop.recording.file.recover import leftovers, recover
+from rtloop.recording.views.summary import summarise
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.progress import Counter

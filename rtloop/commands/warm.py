@@ -38,7 +38,7 @@ def _rehearse_others() -> None:
     from rtloop.engine.memory import SharedBlock, Sizes
     from rtloop.engine.messages import MESSAGE, Kind, message
     from rtloop.engine.ring import drain
-    from rtloop.recording.recorder import Recorder
+    from rtloop.recording.capture.recorder import Recorder
 
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)

@@ -17,7 +17,7 @@ from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
-from rtloop.recording.steps import StepMetrics, step_metrics
+from rtloop.recording.views.steps import StepMetrics, step_metrics
 
 REST_S, SHOWN_SETTLINGS = 0.1, 5.0
 OVERSHOOT_NEAR, STATIC_NEAR, PEAK_NEAR = 0.3, 0.02, 0.1

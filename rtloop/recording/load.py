@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.events import Event
-from rtloop.recording.parts import Files, Parts, absent_parts, find_files
-from rtloop.recording.reader import Reader, Rows, Snapshot
+from rtloop.recording.file.events import Event
+from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
+from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.signals import COMMON, DEADLINE, PER_AXIS
 
 Signal = np.ndarray[Any, Any]

@@ -29,7 +29,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
-from rtloop.recording.recover import leftovers, recover
+from rtloop.recording.file.recover import leftovers, recover
 from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw

@@ -16,11 +16,11 @@ from typing import Any
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
-from rtloop.recording.recover import recover
+from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
 from rtloop.supervision.stall import StallWatch
 
-MODULE = "rtloop.recording.recorder"
+MODULE = "rtloop.recording.capture.recorder"
 STALL_S = 3.0
 LONGEST_STEP_S = 0.1
 END_TIMEOUT_S = 30.0

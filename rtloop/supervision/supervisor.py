@@ -23,7 +23,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
-from rtloop.recording.events import trip_reason
+from rtloop.recording.file.events import trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
 from rtloop.supervision.parking import park
@@ -69,7 +69,7 @@ class Processes:
         """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
         self.fd = SharedBlock.reserve() if block is None else new_block(block)
         self.loop = Child("rtloop.engine.process", self.fd)
-        self.recorder = Child("rtloop.recording.recorder", self.fd)
+        self.recorder = Child("rtloop.recording.capture.recorder", self.fd)
 
     def __enter__(self) -> Processes:
         return self

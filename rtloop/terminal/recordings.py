@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from rtloop.recording.replay import ReplayReport
+from rtloop.recording.replay.replay import ReplayReport
 from rtloop.terminal.table import console as _console
 from rtloop.terminal.table import table as _table
 

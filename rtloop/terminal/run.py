@@ -19,7 +19,7 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import RtloopError
 from rtloop.recording.load import load
-from rtloop.recording.steps import step_metrics
+from rtloop.recording.views.steps import step_metrics
 from rtloop.signals import Mode
 from rtloop.supervision.supervisor import Supervisor
 from rtloop.terminal.progress import StatusLine

@@ -13,10 +13,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as StockWriter
 
-from rtloop.recording import format
-from rtloop.recording.chunkfile import LEVEL
-from rtloop.recording.contents import Message
-from rtloop.recording.writer import Writer
+from rtloop.recording.file import format
+from rtloop.recording.file.chunkfile import LEVEL
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.writer import Writer
 from tests.benchmarks.kernels import Differs
 from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, spread
 from tests.benchmarks.scenario import PythonLoop, paper_plan

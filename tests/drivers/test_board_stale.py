@@ -20,7 +20,7 @@ import rtloop
 from hil import board
 from rtloop.configuration.file import parse
 from rtloop.errors import ConfigError
-from rtloop.recording.replay import replay
+from rtloop.recording.replay.replay import replay
 from tests.faults.account import account
 from tests.faults.bench import Bench
 from tests.faults.configuration import ROOT, on_a_board

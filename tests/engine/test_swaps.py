@@ -11,9 +11,9 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
+from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.load import load
-from rtloop.recording.replay import replay
-from rtloop.recording.session import Options, Session
+from rtloop.recording.replay.replay import replay
 from rtloop.signals import TRIP_MASK, Mode
 from tests.recording.real_loop import ROOT, RealLoop, changed
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import rtloop
 from rtloop.engine.assembly import SNAPSHOT_SECONDS
 from rtloop.engine.memory import SharedBlock
-from rtloop.recording.reader import Reader
-from rtloop.recording.replay import replay
-from rtloop.recording.summary import summarise
-from rtloop.recording.verdict import ReplayReport
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.replay.replay import replay
+from rtloop.recording.replay.verdict import ReplayReport
+from rtloop.recording.views.summary import summarise
 
 
 class Account(NamedTuple):

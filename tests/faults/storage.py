@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import rtloop
 from rtloop.engine.memory import Word
-from rtloop.recording.replay import replay
+from rtloop.recording.replay.replay import replay
 from tests.faults.account import unexplained
 from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ

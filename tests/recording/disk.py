@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.recording.session import Options, Session
+from rtloop.recording.capture.session import Options, Session
 from tests.recording.real_loop import BURST_TICKS, RealLoop, scheduled
 
 PLENTY_BYTES = 1 << 40

@@ -17,12 +17,12 @@ from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
-from rtloop.recording import format
-from rtloop.recording import session as session_module
-from rtloop.recording.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
-from rtloop.recording.contents import Message, split_messages
-from rtloop.recording.reader import Reader
-from rtloop.recording.session import Options, Session
+from rtloop.recording.capture import session as session_module
+from rtloop.recording.capture.session import Options, Session
+from rtloop.recording.file import format
+from rtloop.recording.file.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
+from rtloop.recording.file.contents import Message, split_messages
+from rtloop.recording.file.reader import Reader
 from tests.recording.law_fields import COUNTS, fields_of
 from tests.recording.real_loop import TWO_AXES, RealLoop, changed
 

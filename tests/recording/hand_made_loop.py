@@ -17,11 +17,11 @@ import numpy as np
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.ring import claim, publish
-from rtloop.recording.contents import Message
-from rtloop.recording.events import event_of, recorder_event
-from rtloop.recording.format import EVENTS, LAW, chunk_rows
-from rtloop.recording.recorder import load_word
-from rtloop.recording.writer import Writer
+from rtloop.recording.capture.recorder import load_word
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import event_of, recorder_event
+from rtloop.recording.file.format import EVENTS, LAW, chunk_rows
+from rtloop.recording.file.writer import Writer
 from rtloop.signals import (
     DRIVE,
     ERROR,
@@ -172,7 +172,7 @@ class RecorderProcess:
 
     def __init__(self, loop: HandMadeLoop, *, prefix: tuple[str, ...] = ()) -> None:
         self.loop = loop
-        command = [*prefix, sys.executable, "-m", "rtloop.recording.recorder", "--fd", str(loop.block.fd)]
+        command = [*prefix, sys.executable, "-m", "rtloop.recording.capture.recorder", "--fd", str(loop.block.fd)]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[loop.block.fd]
         )

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
+from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
-from rtloop.recording.recover import recover
-from rtloop.recording.replay import replay
+from rtloop.recording.replay.replay import replay
 from tests.service.test_run import PAPER, TIMEOUT_S, children, start
 
 

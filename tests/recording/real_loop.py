@@ -12,7 +12,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
-from rtloop.recording.session import Options, Session
+from rtloop.recording.capture.session import Options, Session
 from rtloop.supervision.description import recording_header
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.contents import Message
-from rtloop.recording.events import FINAL
-from rtloop.recording.format import CONFIGURATION, EVENTS, LAW
-from rtloop.recording.reader import Reader
-from rtloop.recording.writer import Writer
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.format import CONFIGURATION, EVENTS, LAW
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.writer import Writer
 
 Rows = np.ndarray[Any, Any]
 DIGEST_BYTES = 32

@@ -15,13 +15,13 @@ import pytest
 
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.errors import OutputError
-from rtloop.recording.format import chunk_rows
+from rtloop.recording.capture.session import Options, Session
+from rtloop.recording.file.format import chunk_rows
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
-from rtloop.recording.reader import Reader
-from rtloop.recording.recover import recover
-from rtloop.recording.replay import replay
-from rtloop.recording.session import Options, Session
-from rtloop.recording.summary import summarise
+from rtloop.recording.replay.replay import replay
+from rtloop.recording.views.summary import summarise
 from tests.recording.disk import Disk, Recorded, missing
 from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess, make_header, make_rows
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rtloop.recording.format import chunk_rows
+from rtloop.recording.capture.session import FLUSH_S
+from rtloop.recording.file.format import chunk_rows
 from rtloop.recording.load import load
-from rtloop.recording.replay import replay
-from rtloop.recording.session import FLUSH_S
+from rtloop.recording.replay.replay import replay
 from tests.recording.hand_made_loop import COLUMNS
 from tests.recording.killing import kill_a_run, recovered_ticks
 from tests.service.test_run import PAPER, run

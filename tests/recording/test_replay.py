@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
-from rtloop.recording.recover import recover
-from rtloop.recording.replay import ReplayReport, replay
+from rtloop.recording.replay.replay import ReplayReport, replay
 from rtloop.signals import Flag
 from tests.recording.hand_made_loop import RecorderProcess
 from tests.recording.real_loop import TWO_AXES, RealLoop, record, scheduled

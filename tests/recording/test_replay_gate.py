@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from rtloop.law.layout import COEFFICIENTS
+from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
-from rtloop.recording.replay import replay
-from rtloop.recording.session import Options, Session
-from rtloop.recording.snapshots import first_difference
+from rtloop.recording.replay.replay import replay
+from rtloop.recording.replay.snapshots import first_difference
 from tests.recording.real_loop import PAPER, TWO_AXES, RealLoop, record, rows_of, scheduled
 from tests.recording.tamper import Rows, rewrite
 

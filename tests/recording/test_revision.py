@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import rtloop
-from rtloop.recording import replay as replay_module
-from rtloop.recording.replay import replay
+from rtloop.recording.replay import replay as replay_module
+from rtloop.recording.replay.replay import replay
 
 OLD = Path(__file__).with_name("data") / "revision-1.mcap"
 """2500 ticks through all modes, with a pre-filter of 32 taps and a section that kept its memory throughout."""

@@ -16,12 +16,12 @@ import pytest
 from rtloop.commands.replay import replay_on_the_rig
 from rtloop.commands.run import recover_leftovers
 from rtloop.law.layout import MAX_ORDER, MAX_PLAYS, MAX_SECTIONS, MAX_TAPS
-from rtloop.recording import format
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file import format
+from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
-from rtloop.recording.recover import recover
-from rtloop.recording.replay import replay
-from rtloop.recording.summary import summarise
+from rtloop.recording.replay.replay import replay
+from rtloop.recording.views.summary import summarise
 from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, packed, with_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,13 +11,13 @@ import pytest
 from PIL import Image
 
 from rtloop.errors import MissingExtra, OutputError
-from rtloop.recording.bands import read_bands
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.export import export
-from rtloop.recording.histogram import Histogram
 from rtloop.recording.load import load, unit_of
-from rtloop.recording.plot import plot
-from rtloop.recording.summary import summarise
+from rtloop.recording.views.bands import read_bands
+from rtloop.recording.views.export import export
+from rtloop.recording.views.histogram import Histogram
+from rtloop.recording.views.plot import plot
+from rtloop.recording.views.summary import summarise
 from rtloop.signals import Flag, Mode
 from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
 

@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
-from rtloop.recording import format
+from rtloop.recording.file import format
 from rtloop.recording.load import load
-from rtloop.recording.replay import ReplayReport, replay
-from rtloop.recording.summary import summarise
+from rtloop.recording.replay.replay import ReplayReport, replay
+from rtloop.recording.views.summary import summarise
 from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, packed, with_snapshot
 
 

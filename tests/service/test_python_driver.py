@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
-from rtloop.recording.replay import replay
+from rtloop.recording.replay.replay import replay
 from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import rtloop
-from rtloop.recording.replay import replay
+from rtloop.recording.replay.replay import replay
 from tests.recording.real_loop import record, rows_of
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,7 +20,7 @@ from click.testing import CliRunner
 import rtloop
 from rtloop.cli import main
 from rtloop.engine.memory import ProcessState
-from rtloop.recording.session import Options, Session
+from rtloop.recording.capture.session import Options, Session
 from rtloop.supervision.supervisor import Supervisor
 from tests.recording.real_loop import PAPER, RealLoop, changed
 from tests.service.test_python_driver import DRIVER, install

@@ -20,7 +20,7 @@ import numpy as np
 
 import rtloop
 from rtloop.experiments.registry import EXPERIMENTS
-from rtloop.recording.summary import summarise
+from rtloop.recording.views.summary import summarise
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 280.0

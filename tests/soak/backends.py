@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 import rtloop
-from rtloop.recording.steps import step_metrics
+from rtloop.recording.views.steps import step_metrics
 from rtloop.terminal.table import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install

@@ -25,7 +25,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import RtloopError
-from rtloop.recording.replay import replay
+from rtloop.recording.replay.replay import replay
 from rtloop.service.desk import Desk
 from rtloop.service.live import LiveLaw
 from rtloop.signals import Mode
@@ -47,7 +47,7 @@ class GuardedProcesses(Processes):
     def __init__(self) -> None:
         self.fd = SharedBlock.reserve()
         self.loop = Child("tests.soak.guarded_process", self.fd)
-        self.recorder = Child("rtloop.recording.recorder", self.fd)
+        self.recorder = Child("rtloop.recording.capture.recorder", self.fd)
 
 
 class Changes:

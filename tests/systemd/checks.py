@@ -28,7 +28,7 @@ RTLOOP = "/opt/rtloop/bin/rtloop"
 CONFIG = Path("/etc/rtloop/board.toml")
 RECORDINGS = Path("/var/lib/rtloop/recordings")
 SOCKET = Path("/run/rtloop/board.sock")
-LOOP, RECORDER = "rtloop.engine.process", "rtloop.recording.recorder"
+LOOP, RECORDER = "rtloop.engine.process", "rtloop.recording.capture.recorder"
 HOST_STALL_S = 2.0
 """What is allowed on top of every stated time."""
 EXPOSURE_LIMIT = 2.0

@@ -14,8 +14,8 @@ import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.parts import Files, find_files
 from rtloop.recording.load import Recording, load
-from rtloop.recording.parts import Files, find_files
 
 FORMATS = ("csv", "parquet", "npz")
 PASS_BYTES = 512 << 20

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording import format
-from rtloop.recording.rings import RingReader
+from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.file import format
 from rtloop.signals import DEADLINE, TICK
 
 NS_PER_S = 1e9

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import OutputError
-from rtloop.recording.bands import Band, Progress, drawn_signals, marks, read_bands, title
+from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
-from rtloop.recording.parts import Files
+from rtloop.recording.views.bands import Band, Progress, drawn_signals, marks, read_bands, title
 
 POINTS = 100_000
 """About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
@@ -45,7 +45,7 @@ def write_page(
         "panels": _panels(recording.header["axes"], bands),
         "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
-    page = package_files("rtloop.recording").joinpath("page.html").read_text(encoding="utf-8")
+    page = package_files("rtloop.recording.views").joinpath("page.html").read_text(encoding="utf-8")
     embedded = json.dumps(data).replace("<", "\\u003c")
     try:
         target.write_text(page.replace("TITLE", html.escape(title(recording))).replace("DATA", embedded), "utf-8")

@@ -1,6 +1,6 @@
 """The recorder: a process beside the loop that copies the rings into a file and computes nothing.
 
-    python -m rtloop.recording.recorder --fd N
+    python -m rtloop.recording.capture.recorder --fd N
 
 N is the shared block. One JSON line on stdin starts it: {"path": ".../NAME.mcap", "header": {...}} and optionally
 "options": the fields of `session.Options`. It ends when the loop has and the rings are empty, and prints one JSON
@@ -28,9 +28,9 @@ import numpy as np
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.words import load_word, store_word
 from rtloop.errors import RtloopError
+from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.rings import RingReader
-from rtloop.recording.session import Options, Session
 
 POLL_S = 0.1
 UNPACED_POLL_S = 0.0002
@@ -125,7 +125,7 @@ def run(fd: int) -> int:
 
 def main() -> int:
     """Command line entry."""
-    parser = argparse.ArgumentParser(prog="rtloop.recording.recorder", description="record the loop's rings")
+    parser = argparse.ArgumentParser(prog="rtloop.recording.capture.recorder", description="record the loop's rings")
     parser.add_argument("--fd", type=int, required=True, help="file descriptor of the shared block")
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

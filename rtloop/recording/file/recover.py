@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording import format
-from rtloop.recording.contents import Message
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.events import FINAL, FINISHED, RECOVERED, recorder_event
-from rtloop.recording.reader import Reader, Rows
-from rtloop.recording.writer import Writer
+from rtloop.recording.file import format
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import FINAL, FINISHED, RECOVERED, recorder_event
+from rtloop.recording.file.reader import Reader, Rows
+from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 
 UNFINISHED = ".recovering"

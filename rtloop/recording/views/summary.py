@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.events import RECOVERED
-from rtloop.recording.histogram import Histogram
-from rtloop.recording.parts import Files, Parts, absent_parts, find_files
-from rtloop.recording.reader import Reader
+from rtloop.recording.file.events import RECOVERED
+from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.views.histogram import Histogram
 from rtloop.signals import Flag, Mode
 
 MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.reader import Reader
+from rtloop.recording.file.reader import Reader
 
 Files = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""

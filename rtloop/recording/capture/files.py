@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.errors import OutputError
-from rtloop.recording.buffer import Place
-from rtloop.recording.contents import Message
-from rtloop.recording.writer import Writer
+from rtloop.recording.capture.buffer import Place
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.writer import Writer
 
 
 class Options(NamedTuple):

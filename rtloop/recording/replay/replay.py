@@ -17,12 +17,12 @@ from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.layout import layout_description, split_snapshot
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.events import GAP, RECOVERED, Event, json_value, message_of
+from rtloop.recording.file.events import GAP, RECOVERED, Event, json_value, message_of
+from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.load import Recording
-from rtloop.recording.reader import Snapshot
-from rtloop.recording.rerun import Law, Rerun, Rows, Tape
-from rtloop.recording.snapshots import first_difference
-from rtloop.recording.verdict import MEASURED, ReplayReport, not_judged
+from rtloop.recording.replay.rerun import Law, Rerun, Rows, Tape
+from rtloop.recording.replay.snapshots import first_difference
+from rtloop.recording.replay.verdict import MEASURED, ReplayReport, not_judged
 from rtloop.signals import Flag
 
 FEW_PERIODS, RATE_TOLERANCE = 50, 0.05

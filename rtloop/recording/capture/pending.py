@@ -7,10 +7,10 @@ import json
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from rtloop.recording import format
-from rtloop.recording.buffer import Place, TickBuffer
-from rtloop.recording.contents import Message
-from rtloop.recording.events import RECORDER, Event, recorder_event
+from rtloop.recording.capture.buffer import Place, TickBuffer
+from rtloop.recording.file import format
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import RECORDER, Event, recorder_event
 
 KEPT_EVENTS = 4096
 """From a time in which nothing can be written, for the file that follows."""

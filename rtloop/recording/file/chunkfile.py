@@ -19,7 +19,7 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
-from rtloop.recording.container import (
+from rtloop.recording.file.container import (
     CHUNK_HEAD,
     MAGIC,
     indexed_span,

@@ -16,10 +16,10 @@ from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
 from rtloop.errors import LOW_SPACE, OutputError
-from rtloop.recording import format
-from rtloop.recording.chunkfile import ChunkFile, Content
-from rtloop.recording.container import PREFIX, pack_message, pack_records
-from rtloop.recording.contents import Message
+from rtloop.recording.file import format
+from rtloop.recording.file.chunkfile import ChunkFile, Content
+from rtloop.recording.file.container import PREFIX, pack_message, pack_records
+from rtloop.recording.file.contents import Message
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 

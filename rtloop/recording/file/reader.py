@@ -18,12 +18,13 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rtloop.recording import format
-from rtloop.recording.account import Account
-from rtloop.recording.checked import Malformed, event_from
-from rtloop.recording.chunks import Entry, Source, indexed_chunks, scanned_chunks
-from rtloop.recording.container import DamagedChunk, unpack_chunk
-from rtloop.recording.contents import (
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file import format
+from rtloop.recording.file.account import Account
+from rtloop.recording.file.checked import Malformed, event_from
+from rtloop.recording.file.chunks import Entry, Source, indexed_chunks, scanned_chunks
+from rtloop.recording.file.container import DamagedChunk, unpack_chunk
+from rtloop.recording.file.contents import (
     Message,
     is_ticks,
     may_hold,
@@ -32,10 +33,9 @@ from rtloop.recording.contents import (
     read_chunk,
     split_messages,
 )
-from rtloop.recording.errors import RecordingError
-from rtloop.recording.events import FINAL, Event
-from rtloop.recording.header import read_header
-from rtloop.recording.ticks import LARGEST, TickLayout, Ticks
+from rtloop.recording.file.events import FINAL, Event
+from rtloop.recording.file.header import read_header
+from rtloop.recording.file.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3

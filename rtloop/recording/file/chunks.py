@@ -9,7 +9,8 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from rtloop.recording.container import (
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.container import (
     CHUNK_HEAD,
     CHUNK_MARK,
     CHUNK_MARK_OFFSET,
@@ -22,7 +23,6 @@ from rtloop.recording.container import (
     parse_chunk_head,
     parse_summary,
 )
-from rtloop.recording.errors import RecordingError
 
 SEARCH_BYTES = 1 << 20
 INDEX_HEAD_BYTES = PREFIX.size + 6

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from rtloop.recording import format
-from rtloop.recording.chunks import Entry, Source
-from rtloop.recording.container import MESSAGE_HEAD, PREFIX, DamagedChunk, parse_chunk_head, split_records
+from rtloop.recording.file import format
+from rtloop.recording.file.chunks import Entry, Source
+from rtloop.recording.file.container import MESSAGE_HEAD, PREFIX, DamagedChunk, parse_chunk_head, split_records
 
 
 class Message(NamedTuple):

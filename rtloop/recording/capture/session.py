@@ -15,9 +15,12 @@ from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
-from rtloop.recording.buffer import TickBuffer
-from rtloop.recording.contents import Message
-from rtloop.recording.events import (
+from rtloop.recording.capture.buffer import TickBuffer
+from rtloop.recording.capture.files import Files, Options
+from rtloop.recording.capture.pending import Entry, Pending, tick_of
+from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import (
     FINISHED,
     GAP,
     RECORDING_FAILED,
@@ -26,9 +29,6 @@ from rtloop.recording.events import (
     event_of,
     recorder_event,
 )
-from rtloop.recording.files import Files, Options
-from rtloop.recording.pending import Entry, Pending, tick_of
-from rtloop.recording.rings import RingReader
 from rtloop.signals import TICK
 
 FLUSH_S = 0.5

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError
-from rtloop.recording.bands import Band, Mark, Progress, drawn_signals, marks, read_bands, title
+from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load, unit_of
-from rtloop.recording.parts import Files
+from rtloop.recording.views.bands import Band, Mark, Progress, drawn_signals, marks, read_bands, title
 
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000

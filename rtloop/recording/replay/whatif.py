@@ -19,9 +19,9 @@ from rtloop.law.law import set_mode
 from rtloop.law.layout import Records, initial_state
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
-from rtloop.recording.outcome import Differences, Performance
-from rtloop.recording.replay import LAW_COMMANDS, check_layout, consecutive, law_of, recorded_commands
-from rtloop.recording.rerun import Law, Rerun, Rows, Source, Tape
+from rtloop.recording.replay.outcome import Differences, Performance
+from rtloop.recording.replay.replay import LAW_COMMANDS, check_layout, consecutive, law_of, recorded_commands
+from rtloop.recording.replay.rerun import Law, Rerun, Rows, Source, Tape
 from rtloop.signals import Mode
 
 Progress = Callable[[int], None]

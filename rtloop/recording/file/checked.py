@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
 from rtloop.law.reference import Generator
-from rtloop.recording.events import FINAL, GAP, RECORDER, RECORDING_FAILED, RECORDING_RESUMED, Event, known
-from rtloop.recording.format import FORMAT
+from rtloop.recording.file.events import FINAL, GAP, RECORDER, RECORDING_FAILED, RECORDING_RESUMED, Event, known
+from rtloop.recording.file.format import FORMAT
 from rtloop.signals import Mode
 
 HIGHEST_RATE_HZ, LOWEST_RATE_HZ = 1e6, 1e-3

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtloop.recording import format
-from rtloop.recording.checked import Malformed, header_from, require_columns
-from rtloop.recording.chunks import Entry, Source
-from rtloop.recording.container import MAGIC, DamagedChunk, pack_records, unpack_chunk
-from rtloop.recording.contents import read_chunk, split_messages
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file import format
+from rtloop.recording.file.checked import Malformed, header_from, require_columns
+from rtloop.recording.file.chunks import Entry, Source
+from rtloop.recording.file.container import MAGIC, DamagedChunk, pack_records, unpack_chunk
+from rtloop.recording.file.contents import read_chunk, split_messages
 
 
 def read_header(path: Path, source: Source, entries: Sequence[Entry]) -> dict[str, Any]:

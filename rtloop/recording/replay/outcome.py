@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rtloop import signals
-from rtloop.recording.rerun import Rows
-from rtloop.recording.steps import StepMetrics, step_metrics
+from rtloop.recording.replay.rerun import Rows
+from rtloop.recording.views.steps import StepMetrics, step_metrics
 from rtloop.signals import PER_AXIS, TRIP_MASK, Mode
 
 JUDGED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)

@@ -1,0 +1,1 @@
+"""From the rings to a file, in a process of its own."""

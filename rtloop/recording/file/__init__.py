@@ -1,0 +1,1 @@
+"""The container: what is written, read, checked and repaired."""

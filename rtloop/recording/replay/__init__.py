@@ -1,0 +1,1 @@
+"""A recording executed again, and compared in bytes."""
