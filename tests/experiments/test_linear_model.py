@@ -10,9 +10,9 @@ from scipy import signal
 
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import load
-from rtloop.experiments.harmonic import hysteresis_db
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.promised import Promised
+from rtloop.experiments.procedures.harmonic import hysteresis_db
+from rtloop.experiments.procedures.promised import Promised
 
 RATE_HZ = 10_000.0
 OMEGA, ZETA, KI = 2 * np.pi * 300.0, 0.02, 60.0

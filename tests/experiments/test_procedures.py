@@ -16,12 +16,12 @@ from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptio
 from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import about, derived
-from rtloop.experiments.harmonic import bandwidth
+from rtloop.experiments.procedures.harmonic import bandwidth
+from rtloop.experiments.procedures.robustness import Outcome, range_about_zero, stable_range, to_next
+from rtloop.experiments.procedures.step_response import fitted_ringing
 from rtloop.experiments.registry import EXPERIMENTS, chosen, parameters
 from rtloop.experiments.report import report, take
-from rtloop.experiments.robustness import Outcome, range_about_zero, stable_range, to_next
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.step_response import fitted_ringing
 from rtloop.experiments.verdict import Row
 from tests.recording.real_loop import record
 

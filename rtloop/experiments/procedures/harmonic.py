@@ -19,7 +19,7 @@ from hil.options import Numbers, Options
 from rtloop.configuration.file import ModeName
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
-from rtloop.experiments.promised import REFERENCE_HZ, Promised
+from rtloop.experiments.procedures.promised import REFERENCE_HZ, Promised
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
