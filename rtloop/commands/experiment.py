@@ -15,7 +15,7 @@ import click
 
 from drivers.errors import DriverError
 from hil.options import RigOptions
-from rtloop.commands.run import recording_path, recover_leftovers
+from rtloop.commands.run import recover_leftovers
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
@@ -30,6 +30,7 @@ from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
 from rtloop.recording.errors import RecordingError
 from rtloop.supervision.interruption import Interruption
+from rtloop.supervision.naming import recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.experiments import Progress, print_report
 from rtloop.terminal.progress import StatusLine

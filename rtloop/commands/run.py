@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,12 @@ import click
 from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import load
-from rtloop.configuration.prepare import Prepared, prepare
-from rtloop.errors import LoopFault, OutputError, RtloopError
+from rtloop.configuration.prepare import prepare
+from rtloop.errors import LoopFault, RtloopError
 from rtloop.recording.file.recover import leftovers, recover
 from rtloop.recording.views.summary import summarise
 from rtloop.supervision.interruption import Interruption
+from rtloop.supervision.naming import recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.progress import Counter
 from rtloop.terminal.run import RunView, print_run
@@ -81,21 +81,6 @@ def run_summary(warnings: list[str], result: RunResult) -> dict[str, Any]:
     summary["warnings"] = warnings
     summary.setdefault("trips", [])
     return summary
-
-
-def recording_path(prepared: Prepared, out: Path | None) -> Path:
-    """A new path in the recordings' folder, which is made. Raises OutputError."""
-    folder = out or Path(prepared.configuration.recording.folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot make the folder for recordings: {error.strerror}") from None
-    stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
-    for number in range(1, 1000):
-        path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")
-        if not path.exists() and not path.with_name(path.name + ".part").exists():
-            return path
-    raise OutputError(f"{folder}: no free name for {stem}.mcap")
 
 
 def recover_leftovers(folder: Path) -> None:

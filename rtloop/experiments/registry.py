@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from hil.options import Options
 from rtloop.configuration.file import describe
 from rtloop.errors import ConfigError
-from rtloop.experiments import (
+from rtloop.experiments.procedure import Experiment
+from rtloop.experiments.procedures import (
     characterise,
     compensation,
     disturbance,
@@ -20,7 +21,6 @@ from rtloop.experiments import (
     step_response,
     steps,
 )
-from rtloop.experiments.procedure import Experiment
 
 MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness)
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}

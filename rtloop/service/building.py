@@ -58,7 +58,7 @@ class Builder:
         )
 
     def prepare(self, configuration: Configuration) -> Prepared:
-        """As `rtloop.configuration.prepare.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
+        """As `configuration.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
         with self._lock:
             self._start()
             if not self._ready:

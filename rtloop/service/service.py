@@ -23,7 +23,6 @@ import numpy as np
 
 from drivers.errors import DriverError
 from rtloop import signals
-from rtloop.commands.run import recording_path
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.memory import Word
@@ -36,6 +35,7 @@ from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
+from rtloop.supervision.naming import recording_path
 from rtloop.supervision.paths import block_path
 from rtloop.supervision.recording_state import recording_fault, recording_state
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor

@@ -1,0 +1,24 @@
+"""What a recording is called."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rtloop.configuration.prepare import Prepared
+from rtloop.errors import OutputError
+
+
+def recording_path(prepared: Prepared, out: Path | None) -> Path:
+    """A new path in the recordings' folder, which is made. Raises OutputError."""
+    folder = out or Path(prepared.configuration.recording.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot make the folder for recordings: {error.strerror}") from None
+    stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
+    for number in range(1, 1000):
+        path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")
+        if not path.exists() and not path.with_name(path.name + ".part").exists():
+            return path
+    raise OutputError(f"{folder}: no free name for {stem}.mcap")
