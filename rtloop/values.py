@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.law.hysteresis import PlayModel
-
 
 def fields_of(value: Any) -> dict[str, Any]:
     """A dataclass's fields as they are."""
@@ -17,9 +15,12 @@ def fields_of(value: Any) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite."""
-    if isinstance(value, PlayModel):
-        return {"thresholds_v": plain(value.thresholds), "weights_um_per_v": plain(value.weights)}
+    """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite.
+
+    What has `for_json` says itself what it is there.
+    """
+    if hasattr(value, "for_json"):
+        return plain(value.for_json())
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         return plain(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
     if is_dataclass(value) and not isinstance(value, type):

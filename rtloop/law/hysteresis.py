@@ -30,6 +30,10 @@ class PlayModel:
     thresholds: Real
     weights: Real
 
+    def for_json(self) -> dict[str, Real]:
+        """With the names that a configuration has for it."""
+        return {"thresholds_v": self.thresholds, "weights_um_per_v": self.weights}
+
     def inverse(self) -> PlayModel:
         """The inverse operator, itself a Prandtl-Ishlinskii model; a first threshold above 0 is ignored.
 
