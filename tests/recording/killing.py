@@ -32,9 +32,9 @@ def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.002)
-    block = _block_of(pids["recording.recorder"])
+    block = _block_of(pids["capture.recorder"])
     time.sleep(after_s)
-    for pid in (process.pid, pids["recording.recorder"], pids["engine.process"]):
+    for pid in (process.pid, pids["capture.recorder"], pids["engine.process"]):
         os.kill(pid, signal.SIGKILL)
     process.communicate()
     while any(_alive(pid) for pid in pids.values()):

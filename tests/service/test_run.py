@@ -46,7 +46,7 @@ def children(process: subprocess.Popen[str]) -> dict[str, int]:
     while len(found) < 2 and time.monotonic() < deadline:
         for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
             command = Path(f"/proc/{child}/cmdline").read_bytes().decode()
-            for name in ("engine.process", "recording.recorder"):
+            for name in ("engine.process", "capture.recorder"):
                 if name in command:
                     found[name] = int(child)
         time.sleep(0.01)
@@ -137,7 +137,7 @@ def test_a_killed_loop_is_parked_and_said(tmp_path: Path) -> None:
 
 def test_a_killed_recorder_is_replaced_and_nothing_is_lost(tmp_path: Path) -> None:
     process = start("run", PAPER, "--out", tmp_path, "--duration", "6", "--json")
-    recorder = children(process)["recording.recorder"]
+    recorder = children(process)["capture.recorder"]
     wait_for_ticks(tmp_path)
     os.kill(recorder, signal.SIGKILL)
     code, summary, err = finish(process)
