@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from rtloop.configuration.axis import TableOptions
-from rtloop.configuration.file import InputFileError, load
+from rtloop.configuration.file import load
 from rtloop.configuration.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
+from rtloop.configuration.text_files import InputFileError
 from rtloop.design.identification.identified import read_feedforward
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, RtloopError

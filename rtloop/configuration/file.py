@@ -19,8 +19,8 @@ from drivers.registry import driver_class
 from hil.options import LARGEST_INTEGER, Options
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
 from rtloop.configuration.service import ServiceOptions
-from rtloop.configuration.text_files import MAX_TEXT_BYTES, parse_toml, read_regular
-from rtloop.errors import ConfigError, RtloopError
+from rtloop.configuration.text_files import parse_toml, read_text
+from rtloop.errors import ConfigError
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -125,22 +125,10 @@ class Configuration:
         }
 
 
-class InputFileError(RtloopError):
-    """The file is missing or unreadable."""
-
-    exit_code = 66
-
-
 def load(path: str | Path) -> Configuration:
     """Read and check a file. Raises InputFileError, or ConfigError with all faults."""
     path = Path(path)
-    try:
-        text = read_regular(path, MAX_TEXT_BYTES).decode()
-    except OSError as error:
-        raise InputFileError(f"{path}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise InputFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
-    return parse(text, path.stem, path.parent, str(path))
+    return parse(read_text(path), path.stem, path.parent, str(path))
 
 
 def parse(text: str, name: str, folder: Path, source: str) -> Configuration:

@@ -10,6 +10,15 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from rtloop.errors import RtloopError
+
+
+class InputFileError(RtloopError):
+    """The file is missing or unreadable."""
+
+    exit_code = 66
+
+
 MAX_TEXT_BYTES = 1 << 20
 """Of a configuration or a specification."""
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -19,6 +28,16 @@ _QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
 def read_regular(path: Path, limit_bytes: int) -> bytes:
     """All of a regular file. Raises OSError for another kind of file and for one that is larger."""
     return _contents(os.open(path, _READ), limit_bytes)
+
+
+def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
+    """A text in UTF-8. Raises `refused`, which names the file, where it cannot be read or is none."""
+    try:
+        return read_regular(path, MAX_TEXT_BYTES).decode()
+    except OSError as error:
+        raise refused(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise refused(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
 
 
 def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from rtloop import __version__
 from rtloop.configuration.axis import FeedforwardOptions
 from rtloop.configuration.file import describe
-from rtloop.configuration.text_files import MAX_TEXT_BYTES, parse_toml, read_regular
+from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.identify_dynamics import DynamicsFit
 from rtloop.design.identification.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.measured import Measured, UnsuitableData
@@ -82,13 +82,7 @@ def read_feedforward(path: Path, axis: str | None = None) -> FeedforwardOptions:
 
     Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
     """
-    try:
-        content = read_regular(path, MAX_TEXT_BYTES).decode()
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
-    return feedforward_of(content, str(path), axis)
+    return feedforward_of(read_text(path, RecordingError), str(path), axis)
 
 
 def feedforward_of(content: str, source: str, axis: str | None = None) -> FeedforwardOptions:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from rtloop.configuration.file import InputFileError, describe
-from rtloop.configuration.text_files import MAX_TEXT_BYTES, parse_toml, read_regular
+from rtloop.configuration.file import describe
+from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.errors import ConfigError
 
@@ -23,12 +23,7 @@ class SpecificationFile(NamedTuple):
 
 def load_specification(path: Path) -> SpecificationFile:
     """Read and check. Raises InputFileError, or ConfigError with all faults."""
-    try:
-        text = read_regular(path, MAX_TEXT_BYTES).decode()
-    except OSError as error:
-        raise InputFileError(f"{path}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise InputFileError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
+    text = read_text(path)
     try:
         raw = parse_toml(text)
     except ValueError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import Field
 from hil.linear import Real
 from hil.options import Numbers, Options
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.procedure import Experiment, Run, Segment, hold
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
@@ -71,7 +71,8 @@ def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
     answer = taken.model.closed_answer((error + position)[start:]) if taken.model else None
     modelled: list[Step] = []
     if answer is not None:
-        modelled = _steps(taken, reference, *(np.concatenate([np.zeros(start), one]) for one in answer))
+        answer = np.concatenate([np.zeros((2, start)), answer], axis=1)
+        modelled = _steps(taken, reference, *answer)
     model = [float(value) for value in np.median([one.numbers for one in modelled], axis=0)] if modelled else [None] * 4
     settling_near = max(SETTLING_NEAR_MS, SETTLING_NEAR * (model[1] or 0.0))
     rows = [
@@ -88,7 +89,7 @@ def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
         },
         "zoom_ms": 1e3 * np.arange(shown) / taken.rate_hz,
         "zooms": _laid_over(taken, position, shown),
-        "model": _laid_over(taken, np.concatenate([np.zeros(start), answer[0]]), shown)[0] if answer else None,
+        "model": None if answer is None else _laid_over(taken, answer[0], shown)[0],
         "asked_ms": taken.asked.settling_ms,
         "claimed": taken.asked.claims.get("settling_ms"),
     }
@@ -101,26 +102,32 @@ def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
 
 def _steps(taken: Taken, reference: Real, position: Real, command: Real) -> list[Step]:
     """Of every level that differs from the one before."""
-    found, before = [], 0.0
-    for segment in taken.labelled("level"):
-        start, end, level = segment.start_tick, segment.start_tick + segment.ticks, segment.values["level_um"]
+    found = []
+    for segment, before, level in _changes(taken):
+        start, end = segment.start_tick, segment.start_tick + segment.ticks
         metrics = step_metrics(reference[start - 1 : end], position[start - 1 : end], taken.rate_hz)
         if metrics is not None:
             moved = (command[start:end] - command[start - 1]) / (level - before)
             found.append(Step(before, level, metrics, float(moved.max())))
-        before = level
     return found
 
 
 def _laid_over(taken: Taken, position: Real, ticks: int) -> list[Real]:
     """The first ticks of every step, divided by its height."""
-    found, before = [], 0.0
+    return [
+        (position[segment.start_tick : segment.start_tick + ticks] - before) / (level - before)
+        for segment, before, level in _changes(taken)
+    ]
+
+
+def _changes(taken: Taken) -> Iterator[tuple[Segment, float, float]]:
+    """Every level that differs from the one before, with both in µm."""
+    before = 0.0
     for segment in taken.labelled("level"):
         level = segment.values["level_um"]
         if level != before:
-            found.append((position[segment.start_tick : segment.start_tick + ticks] - before) / (level - before))
+            yield segment, before, level
         before = level
-    return found
 
 
 def _table(found: Sequence[Step]) -> Table:
