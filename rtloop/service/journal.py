@@ -41,8 +41,11 @@ class Journal(logging.Handler):
     def _write(self) -> None:
         while True:
             line = self._lines.get()
-            if self._lost:
-                line, self._lost = f"{line}\n({self._lost} lines were lost here: nobody read them)", 0
+            self.acquire()  # the lock that `handle` holds around `emit`
+            lost, self._lost = self._lost, 0
+            self.release()
+            if lost:
+                line = f"{line}\n({lost} lines were lost here: nobody read them)"
             data = line.encode(errors="replace") + b"\n"
             try:
                 while data:
