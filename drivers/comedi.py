@@ -17,12 +17,12 @@ from llvmlite import ir
 from numba import types
 from pydantic import Field, model_validator
 
-from drivers.base import Channel, Driver, Facts, Pointers, Wiring
-from drivers.comedi_board import Board, Kind
-from drivers.errors import DriverError
-from hil.compiled import cfunc, intrinsic
-from hil.options import Options
-from hil.pointers import SIGNATURE, address_pointer, carray
+from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
+from rtloop.drivers.comedi_board import Board, Kind
+from rtloop.drivers.errors import DriverError
+from rtloop.hil.native.compiled import cfunc, intrinsic
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.hil.options import Options
 
 LINE = np.dtype(
     [(name, np.uint32) for name in ("subdevice", "channel", "range", "aref")]

@@ -12,7 +12,7 @@ from ctypes import c_char_p, c_double, c_int, c_uint, c_void_p
 from enum import IntEnum
 from typing import Any
 
-from drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.errors import DriverError, MissingExtra
 
 
 class Kind(IntEnum):

@@ -1,6 +1,6 @@
 """The conformance suite of drivers: what the loop relies on, as tests that a backend's own suite inherits.
 
-    from drivers.contract import DriverContract
+    from rtloop.drivers.contract import DriverContract
 
     class TestMyCard(DriverContract):
         def driver(self):
@@ -16,8 +16,8 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from drivers.base import ABI_VERSION, Channel, Driver, Facts, Pointers
-from drivers.registry import kinds
+from rtloop.drivers.base import ABI_VERSION, Channel, Driver, Facts, Pointers
+from rtloop.drivers.registry import kinds
 
 _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
 _UNTOUCHED = -123456.789

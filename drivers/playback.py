@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Pointers
-from hil.compiled import cfunc
-from hil.pointers import SIGNATURE, address_pointer, carray
+from rtloop.drivers.base import Pointers
+from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 
 CONTEXT = np.dtype([(name, np.int64) for name in ("rows", "columns", "row", "address", "refusals")])
 EXHAUSTED = 1

@@ -10,8 +10,8 @@ import ctypes
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
-from drivers.base import Driver, Facts, Pointers
-from drivers.errors import DriverError
+from rtloop.drivers.base import Driver, Facts, Pointers
+from rtloop.drivers.errors import DriverError
 
 FAILED = -1
 _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))

@@ -5,15 +5,15 @@ from __future__ import annotations
 from importlib import import_module
 from importlib.metadata import entry_points
 
-from drivers.base import Driver
-from drivers.errors import MissingExtra
+from rtloop.drivers.base import Driver
+from rtloop.drivers.errors import MissingExtra
 
 GROUP = "rtloop.drivers"
 BUILT_IN = {
-    "can": "drivers.can.driver:CanDriver",
-    "comedi": "drivers.comedi:ComediDriver",
-    "shm": "drivers.shm:ShmDriver",
-    "sim": "drivers.sim:SimDriver",
+    "can": "rtloop.drivers.can.driver:CanDriver",
+    "comedi": "rtloop.drivers.comedi:ComediDriver",
+    "shm": "rtloop.drivers.shm:ShmDriver",
+    "sim": "rtloop.drivers.sim:SimDriver",
 }
 
 

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
-from drivers.errors import DriverError
-from hil import board
-from hil.atomics import load_acquire, store_release
-from hil.board import FIFO, HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, WRITTEN, BoardMemory, latest_sample
-from hil.compiled import cfunc
-from hil.monotonic import monotonic_ns
-from hil.options import BoardOptions
-from hil.pointers import SIGNATURE, address_pointer, carray
-from hil.trusted import open_file
+from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
+from rtloop.drivers.errors import DriverError
+from rtloop.hil import board
+from rtloop.hil.board import FIFO, HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, WRITTEN, BoardMemory, latest_sample
+from rtloop.hil.native.atomics import load_acquire, store_release
+from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.monotonic import monotonic_ns
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.hil.options import BoardOptions
+from rtloop.hil.trusted import open_file
 
 CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "fifo", "adc_codes")]

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drivers.base import Channel, Driver, Facts, Pointers, Wiring
-from hil.compiled import cfunc
-from hil.options import ConverterOptions, RigOptions
-from hil.pointers import SIGNATURE, address_pointer, carray
-from hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
+from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
+from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.hil.options import ConverterOptions, RigOptions
+from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
 CONTEXT = np.dtype([("count", np.uint32), ("coefficients", np.int64), ("state", np.int64)], align=True)
 OBSERVED_PER_AXIS = 2

@@ -2,6 +2,6 @@
 
     drive [V] ─► DAC ─► latency ─► hysteresis ─► creep ─► (+ disturbance) ─► dynamics ─► sensor ─► ADC ─► reading [V]
 
-Each stage is a module: its equation, its fields in the rig's two records, its kernel. `hil.rig` puts them together.
+Each stage is a module: its equation, its fields in the two records of a rig, its kernel; `rig` puts them together.
 The hysteresis is written independently of any controller's inverse, so that no mistake can cancel itself out.
 """

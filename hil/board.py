@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.atomics import fence_acquire, fence_release, load_acquire, store_release
-from hil.compiled import jit
-from hil.monotonic import monotonic_ns, sleep_until
-from hil.noise import seed_word
-from hil.options import BoardOptions
-from hil.rig import advance, build_rig, sample
-from hil.trusted import open_file
+from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.monotonic import monotonic_ns, sleep_until
+from rtloop.hil.options import BoardOptions
+from rtloop.hil.rig import advance, build_rig, sample
+from rtloop.hil.stages.noise import seed_word
+from rtloop.hil.trusted import open_file
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
 VERSION = 2

@@ -1,6 +1,6 @@
 """What a user may say about the rig: pydantic models with units in their names, nothing unknown, nothing infinite.
 
-They hold what can be judged without computing. `hil.rig.build_rig` judges the rest: repeated poles, improper
+They hold what can be judged without computing. `rtloop.hil.rig.build_rig` judges the rest: repeated poles, improper
 dynamics, names of axes.
 """
 
@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from hil.converters import MAX_LATENCY
-from hil.creep import MAX_LAGS
-from hil.hysteresis import MAX_PLAYS
+from rtloop.hil.stages.converters import MAX_LATENCY
+from rtloop.hil.stages.creep import MAX_LAGS
+from rtloop.hil.stages.hysteresis import MAX_PLAYS
 
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 Root = Annotated[tuple[float, float], Field(strict=False)]

@@ -15,10 +15,10 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from hil import converters, creep, disturbance, dynamics, hysteresis, noise, sensor
-from hil.compiled import jit
-from hil.linear import modal_sum
-from hil.options import DynamicsOptions, PlantOptions, RigOptions
+from rtloop.hil.modal import modal_sum
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.options import DynamicsOptions, PlantOptions, RigOptions
+from rtloop.hil.stages import converters, creep, disturbance, dynamics, hysteresis, noise, sensor
 
 _STAGES = (converters, hysteresis, creep, disturbance, dynamics, sensor, noise)
 

@@ -9,7 +9,7 @@
     ├── NoDesign          1  no controller does what is asked
     └── LoopFault         1  the loop tripped, lost data or failed
 
-Recordings that cannot be read have `rtloop.recording.errors.RecordingError` (66), drivers `drivers.errors` (69).
+Recordings that cannot be read have `rtloop.recording.errors.RecordingError` (66), drivers `rtloop.drivers.errors` (69).
 """
 
 from __future__ import annotations

@@ -9,12 +9,12 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel
 
-from hil.options import RigOptions
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import ChannelOptions, LoopOptions, RecordingOptions, load, parse
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import InputFileError
 from rtloop.errors import ConfigError
+from rtloop.hil.options import RigOptions
 from rtloop.signals import Mode
 from tests.paper_configuration import CONTROLLER, PAPER, RATE, REFERENCE, TEXT, UNSTABLE, built, entry, faults
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.sim import SimDriver
+from rtloop.drivers.sim import SimDriver
 from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 
-from drivers.can.extra import can
-from drivers.can.options import BusOptions
-from drivers.errors import DriverError
+from rtloop.drivers.can.extra import can
+from rtloop.drivers.can.options import BusOptions
+from rtloop.drivers.errors import DriverError
 
 FAILURES = (can.CanError, OSError)
 """What python-can's interfaces raise while they work."""

@@ -11,14 +11,14 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 
-from drivers.base import Channel, Facts, Wiring, require_channels
-from drivers.can.bus import FAILURES, described, open_bus, require_interface
-from drivers.can.extra import can
-from drivers.can.frames import exchange, load_frames
-from drivers.can.options import CanOptions
-from drivers.can.stream import AnswerStream
-from drivers.errors import DriverError
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Facts, Wiring, require_channels
+from rtloop.drivers.can.bus import FAILURES, described, open_bus, require_interface
+from rtloop.drivers.can.extra import can
+from rtloop.drivers.can.frames import exchange, load_frames
+from rtloop.drivers.can.options import CanOptions
+from rtloop.drivers.can.stream import AnswerStream
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.python import PythonDriver
 
 OBSERVED = (
     "can_lost_samples", "can_reordered_samples", "can_duplicated_samples", "can_invalid_frames", "can_held_ticks"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.errors import MissingExtra
+from rtloop.drivers.errors import MissingExtra
 
 try:
     import can

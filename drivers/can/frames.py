@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from drivers.can.bits import FD_LENGTHS, frame_s
-from drivers.can.extra import UnsupportedDatabaseFormatError, can, load_file
-from drivers.can.options import BusOptions
+from rtloop.drivers.can.bits import FD_LENGTHS, frame_s
+from rtloop.drivers.can.extra import UnsupportedDatabaseFormatError, can, load_file
+from rtloop.drivers.can.options import BusOptions
 
 DBC = Path(__file__).with_name("rtloop.dbc")
 HIGHEST_STANDARD_ID = 0x7FF

@@ -13,14 +13,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from drivers.can.bus import FAILURES, described, open_bus, require_interface
-from drivers.can.driver import LISTEN_S
-from drivers.can.extra import can
-from drivers.can.frames import Frame, exchange, load_frames
-from drivers.can.options import CanOptions
-from drivers.errors import DriverError
-from hil.compiled import jit
-from hil.rig import advance, build_rig, sample
+from rtloop.drivers.can.bus import FAILURES, described, open_bus, require_interface
+from rtloop.drivers.can.driver import LISTEN_S
+from rtloop.drivers.can.extra import can
+from rtloop.drivers.can.frames import Frame, exchange, load_frames
+from rtloop.drivers.can.options import CanOptions
+from rtloop.drivers.errors import DriverError
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.rig import advance, build_rig, sample
 
 RIG_RATE_HZ = 20_000.0
 IDLE_S, RAMP_S = 0.01, 0.001

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from hil.options import Options, RigOptions
+from rtloop.hil.options import Options, RigOptions
 
 
 class BusOptions(Options):

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from hil.linear import Complex, Real
+from rtloop.hil.modal import Complex, Real
 from rtloop.linear.discretise import DiscreteController, held
 from rtloop.linear.realisation import System, beside_imaginary_axis, realise
 from rtloop.linear.transfer import Transfer

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hil.linear import Complex, Real
 from rtloop.analysis.closed_loop import Loop
+from rtloop.hil.modal import Complex, Real
 
 
 class Margins(NamedTuple):

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from hil.linear import Real
 from rtloop.analysis.closed_loop import Loop
+from rtloop.hil.modal import Real
 
 COUNT = 1 << 16
 """Samples of a response; the first 1/64 of continuous time is sampled 64 times as densely once more."""

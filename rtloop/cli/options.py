@@ -23,7 +23,7 @@ def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
 
     @wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> None:
-        from drivers.errors import DriverError
+        from rtloop.drivers.errors import DriverError
         from rtloop.errors import ConfigError, RtloopError, UnavailableError
 
         try:

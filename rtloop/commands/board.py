@@ -8,13 +8,13 @@ from pathlib import Path
 
 import click
 
-from drivers.can.options import CanOptions
-from drivers.shm import ShmOptions
-from hil.board import serve
 from rtloop.configuration.file import Configuration, load
+from rtloop.drivers.can.options import CanOptions
+from rtloop.drivers.shm import ShmOptions
 from rtloop.engine.plan import Pacing
 from rtloop.engine.realtime import prepare_realtime
 from rtloop.errors import ConfigError, UnavailableError
+from rtloop.hil.board import serve
 from rtloop.service.notify import Notifier
 
 BOARD_PRIORITY = 85
@@ -51,7 +51,7 @@ def serve_node(config: Path) -> int:
     if not isinstance(options, CanOptions):
         kind = configuration.driver_kind
         raise ConfigError(str(config), [f"driver.kind: {kind!r}; --can is the node of kind 'can'"])
-    from drivers.can.node import serve as serve_can
+    from rtloop.drivers.can.node import serve as serve_can
 
     axes = _axes_by_output(configuration)
     stopped = _stop_signals()

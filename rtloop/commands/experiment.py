@@ -13,14 +13,13 @@ from typing import Any, NamedTuple
 
 import click
 
-from drivers.errors import DriverError
-from hil.options import RigOptions
 from rtloop.commands.run import recover_leftovers
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
 from rtloop.experiments.page import page
@@ -28,6 +27,7 @@ from rtloop.experiments.procedure import Experiment, Run
 from rtloop.experiments.registry import chosen, parameters
 from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
+from rtloop.hil.options import RigOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.naming import recording_path

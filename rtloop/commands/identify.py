@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.configuration.file import load as load_configuration
 from rtloop.design.identification.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
 from rtloop.design.identification.identified import (
@@ -27,6 +26,7 @@ from rtloop.design.identification.identify_hysteresis import Placement, Weights,
 from rtloop.design.identification.measured import Measured, UnsuitableData, measured
 from rtloop.design.identification.prediction_error import LARGEST_ORDER
 from rtloop.errors import ConfigError
+from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import compensated, residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.base import Driver
-from drivers.registry import driver_class
 from rtloop.configuration import file as config
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Driver
+from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
 from rtloop.law.layout import Records
 from rtloop.recording.load import Recording, load

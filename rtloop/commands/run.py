@@ -9,11 +9,11 @@ from typing import Any
 
 import click
 
-from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
+from rtloop.hil.native.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.recording.file.recover import leftovers, recover
 from rtloop.recording.views.summary import summarise
 from rtloop.supervision.interruption import Interruption

@@ -19,11 +19,11 @@ from typing import Any
 import click
 import numpy as np
 
-from drivers.base import Channel, index_of
 from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
 from rtloop.configuration.file import Configuration, ModeName, load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.doctor.loopback import Pair, measure
+from rtloop.drivers.base import Channel, index_of
 from rtloop.errors import LoopFault
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording

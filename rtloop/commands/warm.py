@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.hil.native.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
 KEPT_CACHES = 8
 
@@ -31,13 +31,13 @@ def _rehearse_others() -> None:
     """What recorder, service and board compile for themselves."""
     import numpy as np
 
-    import drivers.comedi  # noqa: F401  (compiled where it is imported)
-    from drivers.shm import ShmOptions
-    from hil.board import serve
+    import rtloop.drivers.comedi  # noqa: F401  (compiled where it is imported)
+    from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.commands import send, withdraw
     from rtloop.engine.memory import SharedBlock, Sizes
     from rtloop.engine.messages import MESSAGE, Kind, message
     from rtloop.engine.ring import drain
+    from rtloop.hil.board import serve
     from rtloop.recording.capture.recorder import Recorder
 
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from hil.options import Factor, Numbers, Options, Root
+from rtloop.hil.options import Factor, Numbers, Options, Root
 from rtloop.law.hysteresis import PlayModel, play_model
 from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
 from rtloop.linear.transfer import Transfer

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from hil.options import RigOptions
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import AxisCheck, Prepared
 from rtloop.configuration.references import extent, volts
 from rtloop.engine.messages import ALL_AXES, Kind
+from rtloop.hil.options import RigOptions
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.law.reference import Generator
 from rtloop.signals import Mode

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Channel
 from rtloop.configuration.axis import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
+from rtloop.drivers.base import Channel
 from rtloop.law.layout import BLOCK, COEFFICIENTS, LANES, MAX_ORDER, Records, records
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import blocks, row_bands

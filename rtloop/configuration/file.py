@@ -13,14 +13,14 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from drivers.base import Wiring
-from drivers.errors import DriverError
-from drivers.registry import driver_class
-from hil.options import LARGEST_INTEGER, Options
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import parse_toml, read_text
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
+from rtloop.hil.options import LARGEST_INTEGER, Options
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6

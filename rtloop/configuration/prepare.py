@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from drivers.base import Channel, Driver, Facts, index_of
-from drivers.errors import DriverError
-from drivers.registry import driver_class
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_continuous, analyse_discrete
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import axis_coefficients, joined
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
+from rtloop.drivers.base import Channel, Driver, Facts, index_of
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.registry import driver_class
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Channel, index_of
 from rtloop.configuration.axis import (
     ChirpOptions,
     HoldOptions,
@@ -19,6 +18,7 @@ from rtloop.configuration.axis import (
     TableOptions,
 )
 from rtloop.configuration.text_files import read_below, read_regular
+from rtloop.drivers.base import Channel, index_of
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 

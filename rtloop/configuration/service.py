@@ -6,8 +6,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from drivers.can.options import BusOptions
-from hil.options import Options
+from rtloop.drivers.can.options import BusOptions
+from rtloop.hil.options import Options
 
 
 class DepolariseOptions(Options):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-from hil.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
 from rtloop.engine.plan import Pacing
+from rtloop.hil.native.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
 LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 

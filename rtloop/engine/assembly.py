@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.base import Facts, Pointers, index_of
+from rtloop.drivers.base import Facts, Pointers, index_of
 from rtloop.engine.clock import Clock
 from rtloop.engine.context import LOOP
 from rtloop.engine.loop import Outcome, run_ticks

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hil.atomics import load_acquire
-from hil.compiled import cfunc
-from hil.pointers import SIGNATURE, address_pointer, carray
+from rtloop.hil.native.atomics import load_acquire
+from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 
 CLOCK_MONOTONIC = 1
 TIMER_ABSTIME = 1

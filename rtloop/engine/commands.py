@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.atomics import exchanged, load_acquire, store_release
-from hil.compiled import guarded, jit, seldom, seldom_guarded
 from rtloop.engine.context import (
     axes_of,
     coefficients_of,
@@ -26,6 +24,8 @@ from rtloop.engine.context import (
 from rtloop.engine.memory import COMMAND_SLOTS, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
+from rtloop.hil.native.atomics import exchanged, load_acquire, store_release
+from rtloop.hil.native.compiled import guarded, jit, seldom, seldom_guarded
 from rtloop.law.filters import fill_prefilter_anew
 from rtloop.law.law import counts_fit, reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS

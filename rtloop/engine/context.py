@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.compiled import jit
-from hil.pointers import address_pointer, carray
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.pointers import address_pointer, carray
 from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
 from rtloop.law.reference import GENERATOR
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hil.compiled import jit
-from hil.pointers import call
 from rtloop.engine.clock import clock_context, paced_clock
 from rtloop.engine.plan import Pacing
 from rtloop.engine.realtime import freeze_garbage_collection, prepare_realtime
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.pointers import call
 
 START_DELAY_NS = 20_000_000
 

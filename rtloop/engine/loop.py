@@ -12,9 +12,6 @@ from enum import IntEnum
 
 import numpy as np
 
-from hil.atomics import load_acquire
-from hil.compiled import jit, seldom
-from hil.pointers import call
 from rtloop.engine.commands import apply_commands, publish_event
 from rtloop.engine.context import (
     axes_of,
@@ -33,6 +30,9 @@ from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
 from rtloop.engine.trips import publish_trip
+from rtloop.hil.native.atomics import load_acquire
+from rtloop.hil.native.compiled import jit, seldom
+from rtloop.hil.native.pointers import call
 from rtloop.law.law import counts_fit, evaluate, set_mode, update
 from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
 from rtloop.law.reference import reference_sample

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Driver, Facts, Wiring
-from drivers.registry import driver_class
+from rtloop.drivers.base import Driver, Facts, Wiring
+from rtloop.drivers.registry import driver_class
 from rtloop.engine.memory import Sizes
 from rtloop.law.layout import snapshot_bytes
 from rtloop.signals import Mode, columns

@@ -17,8 +17,8 @@ import sys
 import time
 from typing import Any
 
-from drivers.base import Driver, Facts, Pointers
-from drivers.errors import DriverError
+from rtloop.drivers.base import Driver, Facts, Pointers
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.assembly import UNLIMITED, Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, paced_clock, unpaced_clock
 from rtloop.engine.loop import WRITE_FAILED, Outcome

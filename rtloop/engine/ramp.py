@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Driver, Pointers, index_of
-from drivers.errors import DriverError
+from rtloop.drivers.base import Driver, Pointers, index_of
+from rtloop.drivers.errors import DriverError
 
 Volts = npt.NDArray[np.float64]
 _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.base import Channel, Wiring
+from rtloop.drivers.base import Channel, Wiring
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, paced_now, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.atomics import fence_acquire, fence_release, load_acquire, store_release
-from hil.compiled import jit
+from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
+from rtloop.hil.native.compiled import jit
 
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 ONE = np.uint64(1)

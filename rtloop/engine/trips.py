@@ -5,10 +5,10 @@ The conditions are those of `rtloop.law.safety` and `rtloop.law.watch`, on the s
 
 from __future__ import annotations
 
-from hil.compiled import seldom
 from rtloop.engine.commands import publish_event
 from rtloop.engine.context import axes_of, coefficients_of, conditions_of, floats
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
+from rtloop.hil.native.compiled import seldom
 from rtloop.signals import Flag
 
 TRIPPED, LOOP = int(Kind.TRIPPED), int(Origin.LOOP)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hil.atomics import load_acquire, store_release
-from hil.compiled import jit
+from rtloop.hil.native.atomics import load_acquire, store_release
+from rtloop.hil.native.compiled import jit
 
 
 @jit

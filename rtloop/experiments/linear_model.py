@@ -12,11 +12,11 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from hil.linear import Complex, Real
 from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
 from rtloop.analysis.loop_analysis import lightest_pair, resonance_shift_tolerated, with_resonance_shifted
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions, PrefilterOptions
+from rtloop.hil.modal import Complex, Real
 from rtloop.linear.discretise import DiscreteController, discretise
 
 GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)

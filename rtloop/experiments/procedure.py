@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hil.options import Options
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, ModeName
 from rtloop.errors import ConfigError
+from rtloop.hil.options import Options
 
 if TYPE_CHECKING:
     from rtloop.experiments.setting import Setting
@@ -93,7 +93,7 @@ class Run:
     label: str
     timeline: Timeline
     plant: Mapping[str, Any] = field(default_factory=dict)
-    """Changes to the simulated plant, section by section (`hil.options.PlantOptions`)."""
+    """Changes to the simulated plant, section by section (`rtloop.hil.options.PlantOptions`)."""
     may_trip: bool = False
     """A trip is a result and not a failure."""
 

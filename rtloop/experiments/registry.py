@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 from pydantic import ValidationError
 
-from hil.options import Options
 from rtloop.configuration.file import describe
 from rtloop.errors import ConfigError
 from rtloop.experiments.procedure import Experiment
@@ -21,6 +20,7 @@ from rtloop.experiments.procedures import (
     step_response,
     steps,
 )
+from rtloop.hil.options import Options
 
 MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness)
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.configuration.axis import AxisOptions
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.synthesis.specification import SpecificationOptions
@@ -18,6 +17,7 @@ from rtloop.experiments.derive import about
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
 from rtloop.experiments.verdict import Row
+from rtloop.hil.modal import Real
 from rtloop.law.hysteresis import PlayModel
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.linear import Real
+from rtloop.hil.modal import Real
 
 
 def envelope(signal: Real, rate_hz: float, stretches: int = 1500) -> tuple[Real, Real]:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hil.linear import Real
+from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import loading_curve, loading_slopes, model_output
 from rtloop.law.hysteresis import PlayModel
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hil.linear import Real
+from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import turning_points
 
 BINS = 1000

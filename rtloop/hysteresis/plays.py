@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from hil.linear import Real
+from rtloop.hil.modal import Real
 from rtloop.law.hysteresis import PlayModel
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil.compiled import inlined, jit, seldom
+from rtloop.hil.native.compiled import inlined, jit, seldom
 from rtloop.law.hysteresis import total
 from rtloop.law.layout import ANEW, BLOCK, LANES
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hil.compiled import inlined, jit
+from rtloop.hil.native.compiled import inlined, jit
 from rtloop.law.layout import LANES, MAX_PLAYS
 
 Real = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ that no controller meets a large error as a step. Another controller continues f
 
 from __future__ import annotations
 
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
 from rtloop.law.filters import (
     controller_enter,
     controller_output,

@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from hil.compiled import guarded
+from rtloop.hil.native.compiled import guarded
 
 GENERATOR_PARAMETERS = 8
 

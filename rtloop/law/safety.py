@@ -5,7 +5,7 @@ An interlock is a pure function of recorded inputs, so a replay trips at the sam
 
 from __future__ import annotations
 
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
 from rtloop.signals import Flag
 
 USABLE_MAGNITUDE = 1e9

@@ -5,7 +5,7 @@ Like all interlocks they look at recorded inputs and at the law's own state, and
 
 from __future__ import annotations
 
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
 from rtloop.signals import Flag, Mode
 
 CLOSED_LOOP = int(Mode.CLOSED_LOOP)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
-from hil.linear import Real
+from rtloop.hil.modal import Real
 from rtloop.linear.realisation import Form, System, blocks
 
 

@@ -1,6 +1,6 @@
 """Exact discretisation for an input that is held between samples, or that runs straight from one to the next.
 
-`hil.linear.Modal.zero_order_hold` does the first for a sum of modes; here are the second, and both for matrices.
+`rtloop.hil.modal.Modal.zero_order_hold` does the first for a sum of modes; here are the second, and both for matrices.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from hil.linear import Complex, Modal
+from rtloop.hil.modal import Complex, Modal
 from rtloop.linear.realisation import System
 
 

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hil.linear import Complex, Modal, Real, RepeatedPoles, modal_sum
+from rtloop.hil.modal import Complex, Modal, Real, RepeatedPoles, modal_sum
 
 MOST_CANCELLATION = 1e4
 """A sum of modes whose terms exceed their sum by more than this, somewhere, loses four of sixteen digits: cascade."""

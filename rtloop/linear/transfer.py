@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hil.linear import Complex, conjugate_pairs
+from rtloop.hil.modal import Complex, conjugate_pairs
 from rtloop.linear.realisation import System
 from rtloop.linear.zeros import zeros_and_gain
 

@@ -20,10 +20,10 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from drivers.errors import DriverError
 from rtloop.configuration.axis import TableOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.references import read_samples
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.commands import QueueFull
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
 from rtloop.service.bodies import (

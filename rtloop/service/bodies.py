@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field
 
-from hil.options import LARGEST_INTEGER
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
+from rtloop.hil.options import LARGEST_INTEGER
 
 MAX_BODY_BYTES = 4 << 20
 MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096

@@ -18,9 +18,9 @@ import threading
 import time
 from typing import IO, Any
 
-from drivers.errors import DriverError
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
 
 BUILD_S = 10.0

@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from drivers.errors import DriverError, MissingExtra
 from rtloop import errors, signals
+from rtloop.drivers.errors import DriverError, MissingExtra
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.service.desk import Refused, asked_by
@@ -37,8 +37,8 @@ def supervised_by_can(service: Service) -> Iterator[None]:
         return
     where = f"{service.config}: service.can"
     try:
-        from drivers.can.bus import open_bus, require_interface
-        from drivers.can.frames import load_frames
+        from rtloop.drivers.can.bus import open_bus, require_interface
+        from rtloop.drivers.can.frames import load_frames
 
         require_interface(options)
         frames = load_frames(options)

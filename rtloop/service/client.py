@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from hil.trusted import Untrusted, owners
 from rtloop.errors import RefusedError, RtloopError, UnavailableError
+from rtloop.hil.trusted import Untrusted, owners
 from rtloop.supervision.paths import refusal
 
 TIMEOUT_S = 20.0

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import uvicorn
 
-from hil.trusted import Untrusted, open_folder
 from rtloop.errors import UnavailableError
+from rtloop.hil.trusted import Untrusted, open_folder
 from rtloop.service.api import application
 from rtloop.service.building import builder_ended
 from rtloop.service.can_bus import supervised_by_can

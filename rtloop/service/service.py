@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DriverError
 from rtloop import signals
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError

@@ -10,8 +10,8 @@ import time
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from hil.compiled import cpu_identity
 from rtloop.configuration.prepare import Prepared
+from rtloop.hil.native.compiled import cpu_identity
 from rtloop.law.layout import layout_description
 
 FORMAT = 1

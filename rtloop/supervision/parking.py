@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Driver
-from drivers.errors import DriverError
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Driver
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
 from rtloop.errors import UnavailableError

@@ -1,6 +1,6 @@
 """Where a service keeps its socket and its shared block, which holds the last drive, so that others find them.
 
-What lies there is believed, and killed and driven by: nobody else may have put it there (`hil.trusted`).
+What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.hil.trusted`).
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from hil.trusted import Untrusted, open_file, open_folder
 from rtloop.configuration.file import Configuration
 from rtloop.errors import OutputError, RefusedError, UnavailableError
+from rtloop.hil.trusted import Untrusted, open_file, open_folder
 
 FOLDER_MODE = 0o750
 """Members of the group get to the socket."""

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DriverError
 from rtloop.configuration.prepare import Prepared
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain

@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drivers.errors import DriverError
-from drivers.registry import driver_class, kinds
 from rtloop import signals
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.registry import driver_class, kinds
 from rtloop.errors import RtloopError
 from rtloop.recording.load import load
 from rtloop.recording.views.steps import step_metrics

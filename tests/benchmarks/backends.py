@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.base import Driver, Pointers, Wiring
-from drivers.errors import DriverError
-from drivers.playback import TIMING_COLUMNS, Playback
-from drivers.registry import driver_class
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Driver, Pointers, Wiring
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.playback import TIMING_COLUMNS, Playback
+from rtloop.drivers.registry import driver_class
 from rtloop.errors import RtloopError
 from tests.benchmarks.board import board, on_a_board, served
 from tests.benchmarks.configurations import RIG, SINE, STEPS, at_rate, changed, write

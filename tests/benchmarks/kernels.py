@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, Records, initial_state, records
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column

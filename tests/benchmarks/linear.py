@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from drivers.sim import SimDriver
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.sim import SimDriver
 from rtloop.engine.plan import Plan
 from rtloop.signals import ERROR, FLAGS, POSITION, REFERENCE, axis_column
 from tests.benchmarks.configurations import PAPER, RIG, STEPS, TEXT, changed

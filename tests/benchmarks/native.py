@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.rig import COEFFICIENTS as RIG_COEFFICIENTS
-from hil.rig import STATE as RIG_STATE
+from rtloop.hil.rig import COEFFICIENTS as RIG_COEFFICIENTS
+from rtloop.hil.rig import STATE as RIG_STATE
 from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
 from rtloop.law.reference import GENERATOR
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hil.compiled import jit
-from hil.pointers import call
 from rtloop.engine.assembly import Assembly, LawArrays, law_at_rest
 from rtloop.engine.memory import SharedBlock, Word
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.pointers import call
 from rtloop.law.law import evaluate, update
 from rtloop.law.layout import CONDITIONS, records
 from rtloop.signals import Mode

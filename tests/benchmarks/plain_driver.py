@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from drivers.base import Channel, Facts
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Facts
+from rtloop.drivers.python import PythonDriver
 
 NAME = "rtloop_bench_driver"
 LAG = 0.05

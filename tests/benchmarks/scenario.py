@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.base import Wiring
-from hil.rig import build_rig
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Wiring
 from rtloop.engine.assembly import Assembly, LawArrays, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Plan
+from rtloop.hil.rig import build_rig
 from rtloop.law.layout import Records
 from tests.benchmarks import native
 from tests.benchmarks.configurations import PAPER

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import types
 
-from drivers.base import Channel, Facts, Pointers
-from hil.compiled import cfunc
-from hil.pointers import SIGNATURE, address_pointer, carray
+from rtloop.drivers.base import Channel, Facts, Pointers
 from rtloop.engine.clock import CLOCK_MONOTONIC, CONTEXT, SECOND_NS, Clock, clock_context, paced_now
+from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 
 TAPE = np.dtype([("address", np.int64), ("count", np.int64), ("index", np.int64), ("written_v", np.float64)])
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
+from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 
 RATE_HZ = 10_000
 SINE_S, DWELL_S, STEPS_S = 25.0, 0.2, 0.6

@@ -10,10 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.compiled import jit
-from hil.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
-from hil.hysteresis import step as hysteresis_step
-from hil.options import (
+from rtloop.design.identification.identify_dynamics import DynamicsFit, identify_dynamics
+from rtloop.design.identification.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.prediction_error import Excitation
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.options import (
     ConverterOptions,
     DynamicsOptions,
     HysteresisOptions,
@@ -21,11 +23,9 @@ from hil.options import (
     RigOptions,
     SensorOptions,
 )
-from hil.rig import advance, build_rig, sample, zeros_poles_gain
-from rtloop.design.identification.identify_dynamics import DynamicsFit, identify_dynamics
-from rtloop.design.identification.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.identification.measured import Measured
-from rtloop.design.identification.prediction_error import Excitation
+from rtloop.hil.rig import advance, build_rig, sample, zeros_poles_gain
+from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
+from rtloop.hil.stages.hysteresis import step as hysteresis_step
 from rtloop.hysteresis.compensation import residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel

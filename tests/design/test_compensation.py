@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
+from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.hysteresis.compensation import compensated, residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel

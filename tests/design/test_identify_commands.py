@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 import rtloop
-from hil.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.cli import main
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from tests.design.rigs import slow_sine
 from tests.law.oracle import Hysteresis
 from tests.recording.real_loop import record

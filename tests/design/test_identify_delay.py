@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
-from hil.rig import build_rig
 from rtloop.design.identification.identify_dynamics import identify_dynamics
 from rtloop.design.identification.prediction_error import Excitation
+from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
+from rtloop.hil.rig import build_rig
 from tests.design.rigs import _record
 
 PERIOD_S, GAIN_UM_PER_V = 1e-4, 2.0

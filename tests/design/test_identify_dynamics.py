@@ -6,7 +6,6 @@ import mpmath
 import numpy as np
 import pytest
 
-from hil.linear import Modal, modal_sum
 from rtloop.design.identification.frequency_response import agreement, frequency_response
 from rtloop.design.identification.identify_dynamics import identify_dynamics
 from rtloop.design.identification.innovations import Innovations
@@ -15,6 +14,7 @@ from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.identification.prediction_error import Excitation, excited_order
 from rtloop.design.identification.residuals import residual_tests
 from rtloop.design.paper import PAPER_D
+from rtloop.hil.modal import Modal, modal_sum
 from tests.design.rigs import EQ_4, FAST_S, chirp_drive, closeness, drawn, excited, identified, step_drive
 
 PAIR_AND_REAL = Innovations(

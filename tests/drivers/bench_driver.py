@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.base import Channel, Driver, Facts, Wiring
-from drivers.contract import DriverContract
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Driver, Facts, Wiring
+from rtloop.drivers.contract import DriverContract
+from rtloop.drivers.python import PythonDriver
 
 WIRING = {"x": Wiring("ai0", "ao0")}
 

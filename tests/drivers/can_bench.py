@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from drivers.can.options import CanOptions
+from rtloop.drivers.can.options import CanOptions
 from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]

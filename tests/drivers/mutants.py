@@ -7,9 +7,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.base import ABI_VERSION, Channel, Facts, Pointers, Wiring
-from drivers.errors import DriverError
-from hil.options import Options
+from rtloop.drivers.base import ABI_VERSION, Channel, Facts, Pointers, Wiring
+from rtloop.drivers.errors import DriverError
+from rtloop.hil.options import Options
 from tests.drivers.bench_driver import LoopBack
 
 
@@ -32,7 +32,7 @@ class ChangesItsFacts(LoopBack):
 class CalledOtherwiseThanItsEntryPoint(LoopBack):
     """What is registered there is called `sim`."""
 
-    __module__, __qualname__ = "drivers.sim", "SimDriver"
+    __module__, __qualname__ = "rtloop.drivers.sim", "SimDriver"
 
 
 class WithoutAName(LoopBack):

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from drivers.base import Wiring
-from drivers.shm import ShmDriver, ShmOptions
-from hil import board
-from hil.board import BoardMemory
 from rtloop.cli import main
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.shm import ShmDriver, ShmOptions
+from rtloop.hil import board
+from rtloop.hil.board import BoardMemory
 from tests.drivers.comedi_board import new_board, stub_library
 from tests.drivers.test_comedi_contract import comedi
 

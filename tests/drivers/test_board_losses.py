@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hil.board import DROPPED, REPEATED, BoardMemory, serve
-from hil.options import BoardOptions
+from rtloop.hil.board import DROPPED, REPEATED, BoardMemory, serve
+from rtloop.hil.options import BoardOptions
 
 RATE_HZ = 20_000.0
 SLICES = 3

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import rtloop
-from hil import board
 from rtloop.configuration.file import parse
 from rtloop.errors import ConfigError
+from rtloop.hil import board
 from rtloop.recording.replay.replay import replay
 from tests.faults.account import account
 from tests.faults.bench import Bench

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can.bits import FD_LENGTHS, classic_frame_bits, fd_frame_bits
-from drivers.can.frames import DBC, exchange, load_frames
-from drivers.can.options import BusOptions
+from rtloop.drivers.can.bits import FD_LENGTHS, classic_frame_bits, fd_frame_bits
+from rtloop.drivers.can.frames import DBC, exchange, load_frames
+from rtloop.drivers.can.options import BusOptions
 from tests.drivers import can_oracle as oracle
 
 NASTY = st.sampled_from([0x00, 0xFF, 0x0F, 0xF0, 0x1E, 0xE1, 0x3C, 0xC3, 0x78, 0x87, 0x07, 0xF8])

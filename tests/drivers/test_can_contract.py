@@ -16,11 +16,11 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.base import Driver, Wiring
-from drivers.can.driver import CanDriver
-from drivers.can.node import serve
-from drivers.contract import Calls, DriverContract
-from drivers.errors import DriverError
+from rtloop.drivers.base import Driver, Wiring
+from rtloop.drivers.can.driver import CanDriver
+from rtloop.drivers.can.node import serve
+from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.errors import DriverError
 from tests.drivers.can_bench import ENVIRONMENT, free_port, options_on
 from tests.faults.evidence import wait_for
 
@@ -30,8 +30,8 @@ WATCHDOG_MS = 300.0
 WITNESS = struct.Struct("<qdq")
 PROGRAM = """
 import mmap, sys
-from drivers.can.bus import open_bus
-from drivers.can.node import RigNode
+from rtloop.drivers.can.bus import open_bus
+from rtloop.drivers.can.node import RigNode
 from tests.drivers.can_bench import options_on
 from tests.drivers.test_can_contract import WATCHDOG_MS, WITNESS
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import Wiring
-from drivers.can.bus import open_bus
-from drivers.can.driver import OBSERVED, CanDriver
-from drivers.can.node import RigNode
-from drivers.can.options import CanOptions
-from drivers.can.stream import AnswerStream
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.can.bus import open_bus
+from rtloop.drivers.can.driver import OBSERVED, CanDriver
+from rtloop.drivers.can.node import RigNode
+from rtloop.drivers.can.options import CanOptions
+from rtloop.drivers.can.stream import AnswerStream
 from rtloop.signals import Flag
 from tests.drivers.faulty_bus import FaultyBus
 from tests.engine.harness import AXIS, LoopBench, text

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.can import node as node_module
-from drivers.can.frames import exchange, load_frames
-from drivers.can.node import RigNode
+from rtloop.drivers.can import node as node_module
+from rtloop.drivers.can.frames import exchange, load_frames
+from rtloop.drivers.can.node import RigNode
 from tests.drivers.can_bench import options_on
 
 PERIOD_S, WATCHDOG_MS, SLEW_V_PER_S = 0.001, 50.0, 100.0

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from drivers.base import Driver, Wiring
-from drivers.comedi import ComediDriver, ComediOptions
-from drivers.contract import Calls, DriverContract
-from drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.base import Driver, Wiring
+from rtloop.drivers.comedi import ComediDriver, ComediOptions
+from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.errors import DriverError, MissingExtra
 from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
 
 ONE = {"x": Wiring("ai0", "ao0")}

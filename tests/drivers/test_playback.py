@@ -6,7 +6,7 @@ import ctypes
 
 import numpy as np
 
-from drivers.playback import TIMING_COLUMNS, Playback
+from rtloop.drivers.playback import TIMING_COLUMNS, Playback
 
 FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
 VALUES = 5

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers import contract
-from drivers.contract import Calls
-from drivers.errors import DriverError
+from rtloop.drivers import contract
+from rtloop.drivers.contract import Calls
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.plan import require_facts
 from tests.drivers.bench_driver import LoopBack, LoopBackContract
 from tests.drivers.mutants import (

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DriverError, MissingExtra
-from drivers.registry import driver_class, kinds
-from drivers.sim import SimDriver
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.registry import driver_class, kinds
+from rtloop.drivers.sim import SimDriver
 from rtloop.errors import ConfigError
 from tests.engine.harness import AXIS, text
 
@@ -21,8 +21,8 @@ absent = acme_absent:Driver
 nameless = acme_card:Nothing
 """
 MODULE = """
-from drivers.base import Channel, Facts, Options
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Facts, Options
+from rtloop.drivers.python import PythonDriver
 
 
 class AcmeOptions(Options):

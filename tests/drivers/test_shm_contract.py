@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.base import Driver, Wiring
-from drivers.contract import Calls, DriverContract
-from drivers.errors import DriverError
-from drivers.shm import ShmDriver, ShmOptions
-from hil.board import LSB_V, BoardMemory
+from rtloop.drivers.base import Driver, Wiring
+from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.shm import ShmDriver, ShmOptions
+from rtloop.hil.board import LSB_V, BoardMemory
 
 ROOT = Path(__file__).resolve().parents[2]
 ONE = {"x": Wiring("adc0", "dac0")}
@@ -25,8 +25,8 @@ TIMEOUT_S = 60.0
 PROGRAM = """
 import sys
 from pathlib import Path
-from hil.board import serve
-from hil.options import BoardOptions
+from rtloop.hil.board import serve
+from rtloop.hil.options import BoardOptions
 serve(Path(sys.argv[1]), BoardOptions(), ["x"], 1000.0, lambda: False)
 """
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import pytest
 
-from drivers.base import Driver, Wiring
-from drivers.contract import Calls, DriverContract
-from drivers.sim import SimDriver
-from hil.options import RigOptions
+from rtloop.drivers.base import Driver, Wiring
+from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.sim import SimDriver
+from rtloop.hil.options import RigOptions
 
 ONE = {"x": Wiring("adc0", "dac0")}
 THREE = {"z": Wiring("adc2", "dac2"), "x": Wiring("adc0", "dac0"), "y": Wiring("adc1", "dac1")}

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import rtloop
-from drivers.base import Driver, Wiring
-from drivers.contract import DriverContract
-from drivers.registry import driver_class
+from rtloop.drivers.base import Driver, Wiring
+from rtloop.drivers.contract import DriverContract
+from rtloop.drivers.registry import driver_class
 from tests.drivers.installing import install
 from tests.one_axis import one_axis
 

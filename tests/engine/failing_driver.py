@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from drivers.base import Channel, Facts, Wiring
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Facts, Wiring
+from rtloop.drivers.python import PythonDriver
 
 
 class ScriptedDriver(PythonDriver):

@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray
 
-from drivers.base import Driver
-from hil.compiled import cfunc
-from hil.pointers import SIGNATURE, address_pointer
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Driver
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import Clock, clock_context, unpaced_clock
 from rtloop.engine.commands import send
@@ -23,6 +21,8 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
+from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer
 
 FOR_EVER = 1 << 40
 

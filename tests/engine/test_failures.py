@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.playback import Playback
+from rtloop.drivers.playback import Playback
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import Kind

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 import pytest
 
-from hil.atomics import load_acquire
 from rtloop.engine.ring import ONE, Ring, claim, drain, publish
+from rtloop.hil.native.atomics import load_acquire
 
 COLUMNS = 40
 

@@ -31,8 +31,7 @@ EDIT = ("rtloop/law/filters.py", "state.tap_index = ANEW", "state.tap_index = -2
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    for package in ("hil", "drivers", "rtloop"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "rtloop", tmp_path / "rtloop", ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
 
 
@@ -60,7 +59,7 @@ def test_an_edited_law_runs(project):
 def test_this_test_can_fail(project):
     """With a cache that does not look at the sources the edited law is the old one."""
     blind = 'def source_digest() -> str:\n    return "blind"\n\n\ndef unused() -> str:'
-    edit(project, "hil/compiled.py", "def source_digest() -> str:", blind)
+    edit(project, "rtloop/hil/native/compiled.py", "def source_digest() -> str:", blind)
     assert run(project) == {"tap_index": -1, "from_cache": False}
     edit(project, *EDIT)
     assert run(project) == {"tap_index": -1, "from_cache": True}

@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hil import board
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import RtloopError
+from rtloop.hil import board
 from rtloop.service.client import Client
 from tests.faults import plain_card
 from tests.faults.configuration import ROOT, on_a_board, on_a_card

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil import board
-from hil.board import LSB_V, BoardMemory
+from rtloop.hil import board
+from rtloop.hil.board import LSB_V, BoardMemory
 from tests.faults import plain_card
 from tests.faults.configuration import SLEW_V_PER_S
 

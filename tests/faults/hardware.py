@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import signal
 
-from hil import board
-from hil.board import LSB_V
+from rtloop.hil import board
+from rtloop.hil.board import LSB_V
 from tests.faults import plain_card
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for

@@ -12,13 +12,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivers.base import Driver
-from drivers.errors import DriverError
-from hil.board import LSB_V
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Driver
+from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.ramp import ramp
+from rtloop.hil.board import LSB_V
 from rtloop.supervision.parking import park
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for

@@ -21,8 +21,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from hil import board
 from rtloop.errors import RtloopError
+from rtloop.hil import board
 from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ
 from tests.faults.evidence import step_bound_v, wait_for

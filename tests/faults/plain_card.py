@@ -10,9 +10,9 @@ import time
 
 import numpy as np
 
-from drivers.base import Channel, Facts
-from drivers.python import PythonDriver
-from hil.options import Options
+from rtloop.drivers.base import Channel, Facts
+from rtloop.drivers.python import PythonDriver
+from rtloop.hil.options import Options
 
 NONE, NAN, RAISE_IN_READ, RAISE_IN_WRITE, BLOCK_50_MS, BLOCK, ENABLE_OPEN = range(7)
 MEMORY = np.dtype(

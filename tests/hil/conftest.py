@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from hil.compiled import jit
-from hil.options import ConverterOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
-from hil.rig import advance, build_rig, sample
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.options import ConverterOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
+from rtloop.hil.rig import advance, build_rig, sample
 
 IDEAL: dict[str, Any] = {
     "hysteresis": HysteresisOptions(truth="custom", thresholds_v=(0.0,), weights_um_per_v=(1.0,)),

@@ -11,8 +11,8 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.options import CreepOptions, DynamicsOptions, SensorOptions
-from hil.rig import build_rig
+from rtloop.hil.options import CreepOptions, DynamicsOptions, SensorOptions
+from rtloop.hil.rig import build_rig
 
 # Eq (5), highest power of s first.
 GAIN = -20.7

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.hysteresis import play
-from hil.options import DynamicsOptions, HysteresisOptions
+from rtloop.hil.options import DynamicsOptions, HysteresisOptions
+from rtloop.hil.stages.hysteresis import play
 
 # Eq (4): thresholds r_i [V] and weights p_i [µm/V].
 R = np.array([0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9])

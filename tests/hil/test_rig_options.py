@@ -7,8 +7,8 @@ import tomllib
 import pytest
 from pydantic import ValidationError
 
-from hil.options import PlantOptions, RigOptions
-from hil.rig import build_rig
+from rtloop.hil.options import PlantOptions, RigOptions
+from rtloop.hil.rig import build_rig
 
 EVERYTHING = """
 seed = 3

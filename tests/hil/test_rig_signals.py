@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.compiled import jit
-from hil.converters import convert, span
-from hil.noise import draw, seed_word
-from hil.options import ConverterOptions, DynamicsOptions, PlantOptions, RigOptions, SensorOptions
-from hil.rig import build_rig
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.options import ConverterOptions, DynamicsOptions, PlantOptions, RigOptions, SensorOptions
+from rtloop.hil.rig import build_rig
+from rtloop.hil.stages.converters import convert, span
+from rtloop.hil.stages.noise import draw, seed_word
 
 RIGID = DynamicsOptions(form="zpk", gain=1.0)
 WORDS = 2**64

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from hil.options import (
+from rtloop.hil.options import (
     CreepOptions,
     DisturbanceOptions,
     DynamicsOptions,
@@ -19,13 +19,13 @@ from hil.options import (
     RigOptions,
     SensorOptions,
 )
-from hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
+from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
 EXERCISE = """
 import hashlib
 import numpy as np
-from hil.options import CreepOptions, PlantOptions, RigOptions, SensorOptions
-from hil.rig import advance, build_rig, sample
+from rtloop.hil.options import CreepOptions, PlantOptions, RigOptions, SensorOptions
+from rtloop.hil.rig import advance, build_rig, sample
 
 plant = PlantOptions(
     creep=CreepOptions(gains=(0.1,), time_constants_s=(0.05,)),

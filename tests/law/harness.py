@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from drivers.base import Channel
-from hil.compiled import jit
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import axis_coefficients
+from rtloop.drivers.base import Channel
+from rtloop.hil.native.compiled import jit
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, Records, initial_state, records
 from rtloop.linear.discretise import discretise

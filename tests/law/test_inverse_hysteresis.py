@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import Channel
+from rtloop.drivers.base import Channel
 from rtloop.signals import Flag, Mode
 from tests.law.harness import EXACT, LawBench, coefficients_of
 from tests.law.oracle import G, Hysteresis, P, R, Z, sine

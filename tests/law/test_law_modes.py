@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from drivers.base import Channel
+from rtloop.drivers.base import Channel
 from rtloop.signals import Flag, Mode
 from tests.law.harness import EQ_4, EQ_20, PERIOD_S, LawBench, coefficients_of
 from tests.law.oracle import Hysteresis, P, R, sine

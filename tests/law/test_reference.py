@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from drivers.base import Channel
-from hil.compiled import jit
 from rtloop.configuration.axis import ReferenceOptions
 from rtloop.configuration.references import TableOfSamples, extent, generator_values
+from rtloop.drivers.base import Channel
+from rtloop.hil.native.compiled import jit
 from rtloop.law.reference import GENERATOR, reference_sample
 
 RATE_HZ, START = 10_000.0, 137

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, records
 from rtloop.signals import Mode

@@ -126,7 +126,7 @@ def conformance() -> str:
 
 
 def permission() -> str:
-    code = "from drivers.comedi_board import Board\nBoard('libcomedi.so.0', '/dev/comedi0')"
+    code = "from rtloop.drivers.comedi_board import Board\nBoard('libcomedi.so.0', '/dev/comedi0')"
     stranger = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups")
     done = subprocess.run([*stranger, BIN / "python", "-c", code], capture_output=True, text=True)
     said = done.stderr.strip().splitlines()[-1]

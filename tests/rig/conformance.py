@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import pytest
 
-from drivers.base import Driver, Wiring
-from drivers.comedi import ComediDriver, ComediOptions
-from drivers.contract import DriverContract
-from drivers.errors import DriverError
+from rtloop.drivers.base import Driver, Wiring
+from rtloop.drivers.comedi import ComediDriver, ComediOptions
+from rtloop.drivers.contract import DriverContract
+from rtloop.drivers.errors import DriverError
 
 LIBRARY = ctypes.CDLL("libcomedi.so.0")
 LIBRARY.comedi_open.restype = ctypes.c_void_p

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-import drivers.sim  # noqa: F401  (compiled where it is imported: not as a user who has no place for it)
-from drivers.base import Wiring
-from drivers.shm import ShmDriver, ShmOptions
-from hil import board
-from hil.compiled import _owned_folder
-from hil.options import BoardOptions
+import rtloop.drivers.sim  # noqa: F401  (compiled where it is imported: not as a user who has no place for it)
 from rtloop.configuration.file import load
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.engine.memory import SharedBlock, Sizes
+from rtloop.hil import board
+from rtloop.hil.native.compiled import _owned_folder
+from rtloop.hil.options import BoardOptions
 from rtloop.service.client import Client
 from rtloop.service.daemon import _bind
 from rtloop.supervision import parking

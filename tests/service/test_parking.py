@@ -15,8 +15,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from drivers.base import Channel, Facts
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Facts
+from rtloop.drivers.python import PythonDriver
 from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import UnavailableError
 from rtloop.supervision import parking

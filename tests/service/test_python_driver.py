@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 DRIVER = '''
 """A first-order plant of 4.3 µm/V behind 10 µm/V, in plain Python."""
 
-from drivers.base import Channel, Facts
-from drivers.python import PythonDriver
+from rtloop.drivers.base import Channel, Facts
+from rtloop.drivers.python import PythonDriver
 
 
 class LagDriver(PythonDriver):

@@ -20,8 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hil.board import LSB_V, BoardMemory
 from rtloop.configuration.file import load
+from rtloop.hil.board import LSB_V, BoardMemory
 
 UNIT, BOARD = "rtloop@board.service", "rtloop-board@board.service"
 RTLOOP = "/opt/rtloop/bin/rtloop"

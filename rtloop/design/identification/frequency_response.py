@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import csd, welch
 
-from hil.linear import Complex, Real
 from rtloop.design.identification.innovations import Innovations
 from rtloop.design.identification.measured import UnsuitableData
+from rtloop.hil.modal import Complex, Real
 
 LEAST_COHERENCE = 0.95
 SEGMENT_S = 0.8

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.design.identification.markov import ARX_ORDER, lagged
 from rtloop.design.identification.prediction_error import WORTH, Excitation, model_at_gap
+from rtloop.hil.modal import Real
 
 MOST_TICKS = 3
 LEAST_SHARE = 0.25

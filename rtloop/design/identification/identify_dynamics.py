@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.design.identification.identify_delay import delayed, first_part, held_out_from, identified_delay
 from rtloop.design.identification.innovations import Innovations
 from rtloop.design.identification.inverse_hold import held_from
@@ -32,6 +31,7 @@ from rtloop.design.identification.prediction_error import (
     rms_error,
 )
 from rtloop.design.identification.residuals import ResidualTests, residual_tests
+from rtloop.hil.modal import Real
 from rtloop.linear.realisation import system_of
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain

@@ -19,8 +19,8 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from hil.linear import Real
 from rtloop.design.identification.measured import Measured, UnsuitableData
+from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output, play_outputs, turning_points
 from rtloop.law.hysteresis import PlayModel

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter, sosfilt, zpk2sos
 
-from hil.linear import Complex, Modal, Real
+from rtloop.hil.modal import Complex, Modal, Real
 
 
 @dataclass(frozen=True)

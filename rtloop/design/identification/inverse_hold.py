@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.linear import Complex, Modal, Real
+from rtloop.hil.modal import Complex, Modal, Real
 
 
 def continuous_modes(discrete: Modal, period_s: float) -> Modal:

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.linalg import hankel
 from scipy.signal import lfilter
 
-from hil.linear import Complex, Real
 from rtloop.design.identification.innovations import Innovations
+from rtloop.hil.modal import Complex, Real
 
 ARX_ORDER = 40
 HANKEL_ROWS = 150

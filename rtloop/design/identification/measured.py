@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.errors import RtloopError
+from rtloop.hil.modal import Real
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
 from rtloop.signals import trip_causes

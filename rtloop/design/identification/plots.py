@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.identification.identify_dynamics import DynamicsFit, Excitation
 from rtloop.design.identification.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.measured import Measured
 from rtloop.errors import MissingExtra, OutputError
+from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import Residual, compensated
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from hil.linear import Real
 from rtloop.design.identification.innovations import Innovations
 from rtloop.design.identification.markov import CLEAR, HANKEL_ROWS, LIKELY, Guesses, impulse_response, with_residues
 from rtloop.design.identification.measured import noise_of
+from rtloop.hil.modal import Real
 
 LARGEST_ORDER = 14
 WORTH = 0.01

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.design.synthesis.augment import GeneralisedPlant
+from rtloop.hil.modal import Real
 
 SMALL = 1e-10
 """A singular value is zero below this, relative to the largest of the same rows, each brought to length 1."""

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from hil.linear import Complex, Real
 from rtloop.analysis.closed_loop import realised
 from rtloop.design.synthesis.weights import Weights
+from rtloop.hil.modal import Complex, Real
 from rtloop.linear.transfer import Transfer
 
 

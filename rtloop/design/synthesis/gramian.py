@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag, solve_continuous_lyapunov
 
-from hil.linear import Complex, Modal, Real
+from rtloop.hil.modal import Complex, Modal, Real
 from rtloop.linear.realisation import System
 
 

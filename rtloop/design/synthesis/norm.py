@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.design.synthesis.augment import Matrices
+from rtloop.hil.modal import Real
 
 
 class Peak(NamedTuple):

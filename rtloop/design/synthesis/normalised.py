@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from hil.linear import Real
 from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices
+from rtloop.hil.modal import Real
 
 
 class Normalised(NamedTuple):

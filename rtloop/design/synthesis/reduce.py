@@ -15,8 +15,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hil.linear import Modal, Real, RepeatedPoles, modal_sum
 from rtloop.design.synthesis.gramian import modal_root, modal_vectors, real_modal_system, system_roots
+from rtloop.hil.modal import Modal, Real, RepeatedPoles, modal_sum
 from rtloop.linear.realisation import System, beside_imaginary_axis, cascade, scaled
 from rtloop.linear.transfer import Transfer
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import matrix_balance, schur
 
-from hil.linear import Real
+from rtloop.hil.modal import Real
 
 Fault = Literal["imaginary axis", "no graph", "indefinite"]
 

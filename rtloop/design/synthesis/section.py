@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from hil.linear import Complex, RepeatedPoles, modal_sum
 from rtloop import __version__
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.toml_text import roots, section
+from rtloop.hil.modal import Complex, RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
 
 STAND_IN_UM_PER_V = 4.3

@@ -11,7 +11,6 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from hil.options import Options
 from rtloop.configuration.axis import ModelOptions, TransferOptions
 from rtloop.design.synthesis.weights import (
     DisturbanceRule,
@@ -20,6 +19,7 @@ from rtloop.design.synthesis.weights import (
     disturbance_weight,
     tracking_weight,
 )
+from rtloop.hil.options import Options
 from rtloop.linear.transfer import Transfer
 
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.analysis.closed_loop import realised
 from rtloop.design.synthesis.at_rate import LARGEST_SENSITIVITY, dead_time, runs, within_rate
 from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices, augmented
@@ -21,6 +20,7 @@ from rtloop.design.synthesis.normalised import normalised
 from rtloop.design.synthesis.reduce import ReductionMethod, hankel_singular_values, reduce_order
 from rtloop.design.synthesis.specification import DesignOptions, weights_of
 from rtloop.design.synthesis.weights import Weights
+from rtloop.hil.modal import Real
 from rtloop.linear.transfer import Transfer
 
 

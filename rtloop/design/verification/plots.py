@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.step_response import step_response
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import MissingExtra
+from rtloop.hil.modal import Real
 from rtloop.linear.transfer import Transfer
 
 PAPER_TIME, RUN_TIME, TEMPLATE = "tab:blue", "tab:red", "0.35"

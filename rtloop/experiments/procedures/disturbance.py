@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from hil.linear import Real
-from hil.options import Numbers, Options
 from rtloop.design.verification.judgement import Limit
 from rtloop.experiments.lockin import tone
 from rtloop.experiments.procedure import Experiment, Run, hold
@@ -22,6 +20,8 @@ from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken, whole
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis, Row, Table
+from rtloop.hil.modal import Real
+from rtloop.hil.options import Numbers, Options
 
 REST_S, STEP_S, SHOWN_S, SETTLE_S = 0.2, 1.0, 0.15, 0.5
 LEAST_S = 0.5

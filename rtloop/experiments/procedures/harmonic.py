@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from hil.linear import Real
-from hil.options import Numbers, Options
 from rtloop.configuration.file import ModeName
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
@@ -24,6 +22,8 @@ from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.hil.modal import Real
+from rtloop.hil.options import Numbers, Options
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.linear import Real
 from rtloop.experiments.linear_model import LinearModel
+from rtloop.hil.modal import Real
 
 REFERENCE_HZ = 595.5
 """Resonance of an axis without a model, or of one without resonance: some frequency must be looked at."""

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from hil.options import Numbers, Options
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.hil.options import Numbers, Options
 
 REST_S = 0.1
 RINGS_UM = 0.5

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from hil.options import Numbers, Options
 from rtloop.experiments.lockin import response
 from rtloop.experiments.procedure import Experiment, Run, hold, sine
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.hil.options import Numbers, Options
 
 REST_S = 0.1
 LEAST_S = 0.5

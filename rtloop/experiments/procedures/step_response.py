@@ -9,8 +9,6 @@ import numpy as np
 from pydantic import Field
 from scipy.optimize import least_squares
 
-from hil.linear import Real
-from hil.options import Options
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.procedure import Experiment, Run, hold
@@ -18,6 +16,8 @@ from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken, whole
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.verdict import Analysis
+from rtloop.hil.modal import Real
+from rtloop.hil.options import Options
 from rtloop.hysteresis.plays import loading_curve
 
 REST_S, SHOWN_S, SHOWN_PERIODS = 0.1, 0.1, 9.0

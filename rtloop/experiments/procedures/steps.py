@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from hil.linear import Real
-from hil.options import Numbers, Options
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment, Run, Segment, hold
 from rtloop.experiments.setting import Setting
@@ -17,6 +15,8 @@ from rtloop.experiments.taken import Taken
 from rtloop.experiments.theme import Ink
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.hil.modal import Real
+from rtloop.hil.options import Numbers, Options
 from rtloop.recording.views.steps import StepMetrics, step_metrics
 
 REST_S, SHOWN_SETTLINGS = 0.1, 5.0

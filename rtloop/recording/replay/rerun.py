@@ -7,9 +7,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drivers.base import Channel, Facts, Pointers, Wiring
-from drivers.playback import TIMING_COLUMNS, Playback
 from rtloop import signals
+from rtloop.drivers.base import Channel, Facts, Pointers, Wiring
+from rtloop.drivers.playback import TIMING_COLUMNS, Playback
 from rtloop.engine.assembly import Assembly, LawArrays
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.base import Driver, Pointers
 from rtloop import signals
+from rtloop.drivers.base import Driver, Pointers
 from rtloop.law.law import set_mode
 from rtloop.law.layout import Records, initial_state
 from rtloop.recording.errors import RecordingError

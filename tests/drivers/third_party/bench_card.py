@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.base import Channel, Facts, Wiring
-from drivers.python import PythonDriver
-from hil.options import RigOptions
-from hil.rig import advance, build_rig, sample
+from rtloop.drivers.base import Channel, Facts, Wiring
+from rtloop.drivers.python import PythonDriver
+from rtloop.hil.options import RigOptions
+from rtloop.hil.rig import advance, build_rig, sample
 
 
 class BenchCard(PythonDriver):

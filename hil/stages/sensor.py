@@ -1,4 +1,4 @@
-"""The displacement sensor: offset, noise, resolution, volts. Its bandwidth is one of the modes of `hil.dynamics`.
+"""The displacement sensor: offset, noise, resolution, volts. Its bandwidth is one of the modes of `dynamics`.
 
     reading = resolution · rint((position + offset + noise) / resolution)        V = reading / um_per_v
 
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil import noise
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.stages import noise
 
 COEFFICIENTS = [
     ("sensor_um_per_v", "f8"),

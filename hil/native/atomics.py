@@ -11,7 +11,7 @@ from typing import Any
 from numba import types
 from numba.core import cgutils
 
-from hil.compiled import intrinsic
+from rtloop.hil.native.compiled import intrinsic
 
 WORD = types.uint64
 ALIGNMENT = 8

@@ -10,7 +10,7 @@ analytical model for the output of the inverse compensation". This module must n
 
 from __future__ import annotations
 
-from hil.compiled import inlined, jit
+from rtloop.hil.native.compiled import inlined, jit
 
 MAX_PLAYS = 64
 

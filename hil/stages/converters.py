@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from hil.compiled import jit
+from rtloop.hil.native.compiled import jit
 
 MAX_LATENCY = 16
 

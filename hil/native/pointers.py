@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import carray as _carray  # pyright: ignore[reportPrivateImportUsage]
 from numba import types
 
-from hil.compiled import intrinsic
+from rtloop.hil.native.compiled import intrinsic
 
 carray: Any = _carray
 """numba's array view of a pointer."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from hil.compiled import jit
-from hil.pointers import address_pointer, carray
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.pointers import address_pointer, carray
 
 CLOCK_MONOTONIC = 1
 TIMER_ABSTIME = 1

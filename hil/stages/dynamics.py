@@ -6,7 +6,7 @@
 Both outputs share D's modes; the second has one more. Each mode is discretised exactly for an input held over a
 period: a conjugate pair is one complex mode z⁺ = λz + u whose output is Re(w z), a real pole the same with Im λ = 0.
 
-D(s) is eq (5) of the paper (named in `hil.hysteresis`), from its printed factors: expanded polynomials would lose
+D(s) is eq (5) of the paper (named in `hysteresis`), from its printed factors: expanded polynomials would lose
 it. D(0) is 1.01086 there, although the text calls it normalised, and stays so.
 """
 
@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from hil.compiled import inlined, jit
-from hil.linear import CLUSTER, Modal, RepeatedPoles, modal_sum
+from rtloop.hil.modal import CLUSTER, Modal, RepeatedPoles, modal_sum
+from rtloop.hil.native.compiled import inlined, jit
 
 MAX_MODES = 16
 
@@ -157,7 +157,7 @@ def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
 def observe(coefficients, state):
     """True and sensed position [µm] at this instant, the input of the period that ends here still applied.
 
-    Four modes at a time, as in `hil.hysteresis`; the weights beyond the last mode are 0.
+    Four modes at a time, as in `hysteresis`; the weights beyond the last mode are 0.
     """
     real, imag = state.modes_real, state.modes_imag
     t_real, t_imag, s_real, s_imag = (

@@ -24,10 +24,10 @@ import numba
 import numba.extending
 from numba import config as numba_config
 
-from hil.trusted import open_folder
+from rtloop.hil.trusted import open_folder
 
-SOURCE_ROOT = Path(__file__).resolve().parent.parent
-KERNELS = ("hil", "drivers", "rtloop/law", "rtloop/engine", "rtloop/signals.py")
+PACKAGE = Path(__file__).parents[2]
+KERNELS = ("hil", "drivers", "law", "engine", "signals.py")
 """Where compiled code, and what it is made from, may stand."""
 
 
@@ -35,9 +35,9 @@ def source_digest() -> str:
     """Hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
     digest = hashlib.sha256()
     for place in KERNELS:
-        found = SOURCE_ROOT / place
+        found = PACKAGE / place
         for path in sorted(found.rglob("*.py")) if found.is_dir() else [found]:
-            digest.update(path.relative_to(SOURCE_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     for fact in (numba.__version__, llvmlite.__version__, platform.python_version(), cpu_identity()):
         digest.update(fact.encode() + b"\0")
     return digest.hexdigest()[:24]

@@ -1,0 +1,1 @@
+"""The stages between a drive and a reading, one module each: equation, fields of its records, kernel."""
