@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import ast
+import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
+import pytest
+
 import rtloop
-from rtloop.hil.native.compiled import KERNELS
+from rtloop.hil.native import compiled
+from rtloop.hil.native.compiled import KERNELS, OPTIONS, source_digest
 
 PACKAGE = Path(rtloop.__file__).parent
 COMPILERS = {"jit", "cfunc", "inlined", "seldom", "intrinsic", "guarded", "seldom_guarded"}
@@ -31,7 +36,21 @@ def compiles(path: Path) -> bool:
 
 
 def seen(path: Path) -> bool:
-    return any(PACKAGE / place in (path, *path.parents) for place in KERNELS)
+    """Whether the digest that names the cache covers a file."""
+    return path.name != OPTIONS and any(PACKAGE / place in (path, *path.parents) for place in KERNELS)
+
+
+def names_in(nodes: Iterable[ast.AST]) -> set[str]:
+    return {name.id for node in nodes for name in ast.walk(node) if isinstance(name, ast.Name)}
+
+
+def made_from(path: Path) -> set[str]:
+    """Names in a file's kernels, and in the values that the file computes when it is imported."""
+    tree = ast.parse(path.read_text())
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    kernels = [function for function in functions if COMPILERS & names_in(function.decorator_list)]
+    values = [node.value for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and node.value]
+    return names_in([*kernels, *values])
 
 
 def test_kernels_stand_where_the_cache_looks() -> None:
@@ -40,12 +59,28 @@ def test_kernels_stand_where_the_cache_looks() -> None:
     assert all(seen(path) for path in found)
 
 
-def test_kernels_import_nothing_of_the_project_from_elsewhere() -> None:
-    """What a kernel is made from, too, must be in the digest."""
-    for path in sources():
-        if not compiles(path):
-            continue
-        for module in (node.module or "" for node in imported(path)):
-            if module.startswith("rtloop."):
-                place = PACKAGE.joinpath(*module.split(".")[1:])
-                assert seen(place if place.is_dir() else place.with_suffix(".py")), (path, module)
+def test_kernels_are_made_from_nothing_that_stands_elsewhere() -> None:
+    """Neither a function nor a constant: what a kernel is made from must be in the digest, too."""
+    for path in filter(compiles, sources()):
+        made = made_from(path)
+        assert made
+        for node in imported(path):
+            if not (node.module or "").startswith("rtloop."):
+                continue
+            place = PACKAGE.joinpath(*str(node.module).split(".")[1:])
+            if not seen(place if place.is_dir() else place.with_suffix(".py")):
+                assert not made & {alias.asname or alias.name for alias in node.names}, (path, node.module)
+
+
+@pytest.mark.parametrize(
+    ("name", "recompiles"), [("hil/options.py", False), ("configuration/axis.py", False), ("law/law.py", True)]
+)
+def test_what_an_edit_makes_anew(name, recompiles, tmp_path, monkeypatch) -> None:
+    for place in (*KERNELS, "configuration/axis.py"):
+        copied = shutil.copytree if (PACKAGE / place).is_dir() else shutil.copy
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        copied(PACKAGE / place, tmp_path / place)
+    monkeypatch.setattr(compiled, "PACKAGE", tmp_path)
+    before = source_digest()
+    (tmp_path / name).write_text((tmp_path / name).read_text() + '"""An edited text."""\n')
+    assert (source_digest() != before) == recompiles

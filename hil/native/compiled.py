@@ -29,6 +29,8 @@ from rtloop.hil.trusted import open_folder
 PACKAGE = Path(__file__).parents[2]
 KERNELS = ("hil", "drivers", "law", "engine", "signals.py")
 """Where compiled code, and what it is made from, may stand."""
+OPTIONS = "options.py"
+"""Files there that hold what a user may say: no kernel is made from one, and an edited text in one compiles nothing."""
 
 
 def source_digest() -> str:
@@ -37,6 +39,8 @@ def source_digest() -> str:
     for place in KERNELS:
         found = PACKAGE / place
         for path in sorted(found.rglob("*.py")) if found.is_dir() else [found]:
+            if path.name == OPTIONS:
+                continue
             digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     for fact in (numba.__version__, llvmlite.__version__, platform.python_version(), cpu_identity()):
         digest.update(fact.encode() + b"\0")

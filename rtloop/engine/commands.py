@@ -50,12 +50,12 @@ class QueueFull(RuntimeError):
 
 def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
     """Put one MESSAGE record into the queue; its position. Single producer. Raises QueueFull."""
-    head, tail = int(block.words[HEAD]), int(block.words[TAIL])
+    head, tail = block.load(Word.COMMANDS_HEAD), block.load(Word.COMMANDS_TAIL)
     slots = block["commands"]
     if head - tail >= (slots.size if urgent else COMMAND_SLOTS):
         raise QueueFull(f"{head - tail} commands are waiting for the loop")
     slots[head % slots.size] = command[0]
-    _offer(block.words, block["commands_marks"], head)
+    _offer(block["words"], block["commands_marks"], head)
     return head
 
 

@@ -22,6 +22,8 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
+from rtloop.hil.native.atomics import load_acquire, store_release
+from rtloop.hil.native.compiled import guarded
 
 DIRECTORY_BYTES = 8192
 _LOCK = "hhqqi4x"
@@ -133,10 +135,13 @@ class SharedBlock:
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
         return self._arrays[name]
 
-    @property
-    def words(self) -> np.ndarray[Any, Any]:
-        """The control words, indexed by Word."""
-        return self._arrays["words"]
+    def load(self, word: Word) -> int:
+        """A control word; what its writer wrote before it is seen after it, on any processor."""
+        return int(_load(self._arrays["words"], int(word)))
+
+    def store(self, word: Word, value: int) -> None:
+        """Set a control word; who loads it sees what was written before it, on any processor."""
+        _store(self._arrays["words"], int(word), np.uint64(value))
 
     @property
     def fault(self) -> str | None:
@@ -154,7 +159,7 @@ class SharedBlock:
 
         The kernel drops the claim with the first descriptor of the file that the process closes: keep the block.
         """
-        self.words[Word.LOOP_PID] = os.getpid()
+        self.store(Word.LOOP_PID, os.getpid())
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
 
     def driven_by(self) -> int | None:
@@ -183,6 +188,16 @@ class SharedBlock:
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
+
+
+@guarded
+def _load(words, index):
+    return load_acquire(words, index)
+
+
+@guarded
+def _store(words, index, value):
+    store_release(words, index, value)
 
 
 def ring_ticks(rate_hz: float) -> int:

@@ -77,7 +77,7 @@ def main() -> int:
                 driver.close()
         except DriverError as error:
             code, state = _failed(error), ProcessState.FAILED
-        block.words[Word.LOOP_STATE] = state
+        block.store(Word.LOOP_STATE, state)
     return code
 
 
@@ -114,7 +114,7 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcom
     else:
         die_with_parent()
         ring = block.ring("ticks")
-        clock = unpaced_clock(context, ring.head, block.words, Word.RECORDER_CURSOR, ring.marks.size // 2)
+        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size // 2)
     pointers = _opened(driver)
     ramp_to_safe(driver, pointers, found_v(driver, None), plan.trip_slew_v_per_s)  # as somebody who died left them
     assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
@@ -124,23 +124,23 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcom
     granted = realtime["scheduler"] == "SCHED_FIFO" and realtime["mlock"]
     if plan.pacing.require_realtime and plan.pacing.paced and not granted:
         raise RefusedError(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
-    block.words[Word.LOOP_STATE] = ProcessState.READY
+    block.store(Word.LOOP_STATE, ProcessState.READY)
     report("ready", realtime=realtime)
-    while not block.words[Word.GO]:
-        if block.words[Word.STOP]:
+    while not block.load(Word.GO):
+        if block.load(Word.STOP):
             return Outcome.STOPPED
-        if time.monotonic_ns() - int(block.words[Word.HEARTBEAT_NS]) > plan.pacing.heartbeat_timeout_s * 1e9:
+        if time.monotonic_ns() - block.load(Word.HEARTBEAT_NS) > plan.pacing.heartbeat_timeout_s * 1e9:
             return Outcome.HEARTBEAT_LOST
         time.sleep(GO_POLL_S)
     if plan.pacing.paced:
         context.start_ns = time.monotonic_ns() + START_DELAY_NS
-        block.words[Word.START_UNIX_NS] = time.time_ns() + START_DELAY_NS
-    block.words[Word.LOOP_STATE] = ProcessState.RUNNING
+        block.store(Word.START_UNIX_NS, time.time_ns() + START_DELAY_NS)
+    block.store(Word.LOOP_STATE, ProcessState.RUNNING)
     try:
         outcome = assembly.run(UNLIMITED if plan.ticks is None else plan.ticks)
-        block.words[Word.FINISHED_TICKS] = assembly.loop.tick
+        block.store(Word.FINISHED_TICKS, assembly.loop.tick)
         if outcome is Outcome.DONE:
-            block.words[Word.STOP] = 1  # ramp down, after the ticks that are recorded
+            block.store(Word.STOP, 1)  # ramp down, after the ticks that are recorded
             assembly.run(UNLIMITED)
         return outcome
     finally:

@@ -28,6 +28,6 @@ def rehearse() -> None:
                 np.zeros(1, GENERATOR), np.zeros(0), nothing, ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
     driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
     ring = block.ring("ticks")
-    clock = unpaced_clock(context, ring.head, block.words, Word.RECORDER_CURSOR, ring.marks.size)
+    clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)
     assert paced_now.address
     Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan)).run(REHEARSED_TICKS)

@@ -257,7 +257,7 @@ class Service:
             self.notifier.limit_watchdog()
         if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):
             return
-        if supervisor.ticks > self._told_ticks or supervisor.ended or supervisor.block.words[Word.STOP]:
+        if supervisor.ticks > self._told_ticks or supervisor.ended or supervisor.block.load(Word.STOP):
             self.notifier.send(WATCHDOG=1)
         self._told_ticks = supervisor.ticks
         rows = supervisor.newest(int(min(supervisor.prepared.plan.pacing.rate_hz, 20000)))

@@ -62,10 +62,10 @@ def _last_block(path: Path) -> Iterator[SharedBlock | None]:
 def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:
     """Wait until nobody drives any more. Raises UnavailableError while a service is alive, DriverError."""
     ramp_s = float(np.max(np.abs(block["last_drive_v"]))) / slew_v_per_s
-    beat_ns = int(block.words[Word.HEARTBEAT_NS])
+    beat_ns = block.load(Word.HEARTBEAT_NS)
     kill_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driven_by()) is not None:
-        if int(block.words[Word.HEARTBEAT_NS]) != beat_ns:
+        if block.load(Word.HEARTBEAT_NS) != beat_ns:
             raise UnavailableError(f"process {pid} drives the outputs and its service is alive; stop that instead")
         if time.monotonic() > kill_s + KILL_S:
             raise DriverError(f"process {pid} drives the outputs and cannot be killed")

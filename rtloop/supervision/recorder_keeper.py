@@ -54,7 +54,7 @@ class RecorderKeeper:
     @property
     def state(self) -> int:
         """Of the present recorder, a ProcessState."""
-        return int(self._block.words[Word.RECORDER_STATE])
+        return self._block.load(Word.RECORDER_STATE)
 
     @property
     def exit_code(self) -> int | None:
@@ -104,16 +104,16 @@ class RecorderKeeper:
             if self.state == ProcessState.READY:
                 self._order()
             return
-        words = self._block.words
-        behind = int(self._block["ticks_head"][0]) != int(words[Word.RECORDER_CURSOR])
-        stuck = self._watch.stalled(int(words[Word.RECORDER_CURSOR]), time.monotonic()) and behind
+        taken = self._block.load(Word.RECORDER_CURSOR)
+        behind = int(self._block["ticks_head"][0]) != taken
+        stuck = self._watch.stalled(taken, time.monotonic()) and behind
         if (self.exit_code is not None or stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
             if not self._child.end():
                 return  # it hangs in the kernel, where its file is: it may yet go on
             self.notes.append(f"the recorder {reason} and was replaced")
             self.replacements += 1
-            words[Word.RECORDER_STATE] = ProcessState.STARTING
+            self._block.store(Word.RECORDER_STATE, ProcessState.STARTING)
             self._child, self._ordered = Child(MODULE, self._block.fd), False
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 

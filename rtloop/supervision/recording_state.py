@@ -19,8 +19,7 @@ def recording_state(block: SharedBlock) -> dict[str, Any]:
     `ticks_lost` counts all ticks of the loop that are in no file. It is 0 for a run that is recorded as a whole.
     """
     failure, flushed, lost, cursor = (
-        int(block.words[word])
-        for word in (Word.RECORDER_FAILURE, Word.FLUSHED_TICKS, Word.LOST_TICKS, Word.RECORDER_CURSOR)
+        block.load(word) for word in (Word.RECORDER_FAILURE, Word.FLUSHED_TICKS, Word.LOST_TICKS, Word.RECORDER_CURSOR)
     )
     reason, since_tick = None, None
     if failure:

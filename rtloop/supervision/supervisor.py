@@ -111,7 +111,7 @@ class Supervisor:
 
     def stop(self) -> None:
         """Ask the loop to ramp down and end."""
-        self.block.words[Word.STOP] = 1
+        self.block.store(Word.STOP, 1)
 
     @property
     def ticks(self) -> int:
@@ -173,7 +173,7 @@ class Supervisor:
             if self.recorder.failure is not None:
                 raise self.recorder.failure
             time.sleep(START_POLL_S)
-        self.block.words[Word.GO] = 1
+        self.block.store(Word.GO, 1)
         self.startup_s = seconds_since_start()
 
     def poll(self) -> RunResult | None:
@@ -201,7 +201,7 @@ class Supervisor:
     def _beat(self) -> None:
         while not self._closed.is_set():
             if time.monotonic() - self._watched_s < WATCHED_S:
-                self.block.words[Word.HEARTBEAT_NS] = time.monotonic_ns()
+                self.block.store(Word.HEARTBEAT_NS, time.monotonic_ns())
             self._closed.wait(HEARTBEAT_PERIOD_S)
 
     def _collect(self) -> None:
@@ -210,9 +210,9 @@ class Supervisor:
 
     def _loop_stalled(self) -> bool:
         """Whether ticks stand still although they are paced; the loop's process is then killed."""
-        running = self.block.words[Word.LOOP_STATE] == ProcessState.RUNNING
+        running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (
-            running and self.prepared.plan.pacing.paced and self.ticks and not self.block.words[Word.FINISHED_TICKS]
+            running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
         ):
             return False
         if not self._stall.stalled(self.ticks, time.monotonic()):
@@ -252,11 +252,10 @@ class Supervisor:
 
     def _end(self) -> None:
         """Park first, if the loop died; then let the recorder finish."""
-        words = self.block.words
-        if words[Word.LOOP_STATE] not in (ProcessState.FINISHED, ProcessState.FAILED):
+        if self.block.load(Word.LOOP_STATE) not in (ProcessState.FINISHED, ProcessState.FAILED):
             died = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
             self.error = f"the loop's process {died}; {self._park()}"
-            words[Word.LOOP_STATE] = ProcessState.FAILED
+            self.block.store(Word.LOOP_STATE, ProcessState.FAILED)
         self.ended = True
         self.recorder.finish()
 

@@ -68,7 +68,7 @@ class Whole:
     def __init__(self, adc_v: np.ndarray[Any, Any]) -> None:
         plan, self._ticks = paper_plan(), 0
         self.law, self._tape, self._block = law_at_rest(plan), Tape(adc_v), SharedBlock.create(plan.sizes)
-        self._block.words[Word.HEARTBEAT_NS] = FAR_AWAY_NS
+        self._block.store(Word.HEARTBEAT_NS, FAR_AWAY_NS)
         clock, self._kept = due_clock(plan.pacing.rate_hz)
         pointers = self._tape.pointers()
         self._assembly = Assembly(plan, self._block, self._tape.facts, pointers, clock, self.law)

@@ -59,7 +59,7 @@ class PythonLoop:
         self.law = law_at_rest(plan)
         self._driver = plan.driver()
         self._clock = clock_context(plan.pacing.rate_hz)
-        head, words = self.block.ring("ticks").head, self.block.words
+        head, words = self.block.ring("ticks").head, self.block["words"]
         clock = unpaced_clock(self._clock, head, words, Word.RECORDER_CURSOR, NO_RECORDER)
         self._assembly = Assembly(plan, self.block, self._driver.facts, self._driver.open(), clock, self.law)
         self._assembly.run(0)
@@ -93,7 +93,7 @@ class NativeLoop:
             "rig_state": rig_state,
             "generators": plan.generators.copy(),
             "table": self.block["table"],
-            "words": self.block.words,
+            "words": self.block["words"],
             "head": ring.head,
             "marks": ring.marks,
             "slots": ring.slots,

@@ -94,7 +94,7 @@ class LoopBench:
         self._context = clock_context(self.plan.pacing.rate_hz)
         ticks = self.block.ring("ticks")
         self._chunk = ticks.marks.size // 2
-        own = unpaced_clock(self._context, ticks.head, self.block.words, Word.RECORDER_CURSOR, self._chunk)
+        own = unpaced_clock(self._context, ticks.head, self.block["words"], Word.RECORDER_CURSOR, self._chunk)
         self.law = law_at_rest(self.plan)
         self._script = clock
         facts = self.driver.facts
@@ -111,7 +111,7 @@ class LoopBench:
         while self.assembly.loop.tick < end and self.outcome is Outcome.DONE:
             self.outcome = self.assembly.run(min(end, int(self.assembly.loop.tick) + self._chunk))
             rows.append(self.drain("ticks"))
-            self.block.words[Word.RECORDER_CURSOR] = self._cursors["ticks"]
+            self.block.store(Word.RECORDER_CURSOR, self._cursors["ticks"])
         return np.concatenate(rows)
 
     def drain(self, name: str) -> npt.NDArray[Any]:

@@ -33,7 +33,7 @@ def fail_at(tick: int):
 def test_stop_word_parks():
     bench = LoopBench(RAW)
     bench.run(100)
-    bench.block.words[Word.STOP] = 1
+    bench.block.store(Word.STOP, 1)
     rows = bench.run(FOR_EVER)
     assert bench.outcome is Outcome.STOPPED
     np.testing.assert_allclose(bench.column(rows, "x_drive_v"), RAMP, rtol=0, atol=1e-12)
@@ -52,7 +52,7 @@ def test_ticks_after_the_limit_are_run_but_not_recorded():
     plan = LoopBench(RAW).plan
     bench = LoopBench(replace(plan, ticks=50))
     assert bench.run(50).shape[0] == 50
-    bench.block.words[Word.STOP] = 1
+    bench.block.store(Word.STOP, 1)
     assert bench.run(FOR_EVER).shape[0] == 0
     assert bench.outcome is Outcome.STOPPED
     assert bench.block["last_drive_v"][0] == 0.0
@@ -146,7 +146,7 @@ def test_a_lost_heartbeat_parks():
     monotonic_ns = 6e9 + (ticks - 100) * 1e5
     grid = ticks * 1e5
     bench = LoopBench(RAW, clock=ScriptedClock(np.column_stack([grid, grid, 0 * grid, monotonic_ns])))
-    bench.block.words[Word.HEARTBEAT_NS] = 5_000_000_000
+    bench.block.store(Word.HEARTBEAT_NS, 5_000_000_000)
     rows = bench.run(FOR_EVER)
     assert bench.outcome is Outcome.HEARTBEAT_LOST
     flags = bench.column(rows, "flags").astype(int)

@@ -18,11 +18,11 @@ SIZES = Sizes(columns=21, axes=1, rate_hz=10_000, snapshot_bytes=1000, table_sam
 def test_a_second_mapping_sees_what_the_first_writes():
     block = SharedBlock.create(SIZES)
     other = SharedBlock(os.dup(block.fd))
-    block.words[Word.STOP] = 3
+    block.store(Word.STOP, 3)
     block["last_drive_v"][0] = -2.5
     block.ring("ticks").slots[-1, -1] = 7.0
     block["commands"]["values"][255, 11] = 1.5
-    assert other.words[Word.STOP] == 3
+    assert other.load(Word.STOP) == 3
     assert other["last_drive_v"].tolist() == [-2.5]
     assert other.ring("ticks").slots[-1, -1] == 7.0
     assert other["commands"]["values"][255, 11] == 1.5

@@ -67,15 +67,15 @@ def test_exactly_one_of_loop_and_producer_gets_each_command():
     if pid == 0:
         while os.getppid() == producer:
             bench.assembly.run(int(bench.assembly.loop.tick) + 1)
-            bench.block.words[Word.RECORDER_CURSOR] = bench.assembly.loop.tick
+            bench.block.store(Word.RECORDER_CURSOR, bench.assembly.loop.tick)
         os._exit(0)
     withdrawn = 0
     try:
         for number in range(TRIES):
-            while number - int(bench.block.words[Word.COMMANDS_TAIL]) > COMMAND_SLOTS // 2:
+            while number - bench.block.load(Word.COMMANDS_TAIL) > COMMAND_SLOTS // 2:
                 os.sched_yield()
             withdrawn += withdraw(bench.block, send(bench.block, hold(0.0)))
-        while bench.block.words[Word.COMMANDS_TAIL] != TRIES:
+        while bench.block.load(Word.COMMANDS_TAIL) != TRIES:
             os.sched_yield()
     finally:
         os.kill(pid, signal.SIGKILL)

@@ -66,7 +66,7 @@ class Bench(Evidence):
     def __exit__(self, *_: object) -> None:
         for block in self.blocks:
             for word in (Word.LOOP_PID, Word.RECORDER_PID):
-                if pid := int(block.words[word]):
+                if pid := block.load(word):
                     self._end_child(pid)
         for process in self._started:
             if process.poll() is None:
@@ -112,7 +112,7 @@ class Bench(Evidence):
         assert self.service is not None
         if role == "service":
             return self.service.pid
-        return int(self.blocks[-1].words[Word.LOOP_PID if role == "rt" else Word.RECORDER_PID])
+        return self.blocks[-1].load(Word.LOOP_PID if role == "rt" else Word.RECORDER_PID)
 
     def _end_child(self, pid: int) -> None:
         """End a loop or recorder of ours that still lives; its number may belong to somebody else by now."""

@@ -29,7 +29,7 @@ def stepping_clock(folder: Path) -> dict[str, str]:
 
 
 def steps(bench: Bench) -> Measured:
-    first = int(bench.blocks[-1].words[Word.START_UNIX_NS])
+    first = bench.blocks[-1].load(Word.START_UNIX_NS)
     ticks = bench.ticks
     bench.strike()
     wait_for(lambda: bench.ticks > ticks + 12_000, "three seconds")

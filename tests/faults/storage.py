@@ -105,20 +105,20 @@ def resumed(bench: Bench, measured: Measured) -> Measured:
 
 def ring_overrun(bench: Bench) -> Measured:
     """Every recorder that comes is stopped at once, until the ring has gone round."""
-    words, stopped = bench.blocks[-1].words, set[int]()
+    block, stopped = bench.blocks[-1], set[int]()
     bench.strike()
     until_s = time.monotonic() + ROUNDS * len(bench.blocks[-1]["ticks_slots"]) / BOARD_RATE_HZ
     while time.monotonic() < until_s:
-        pid = int(words[Word.RECORDER_PID])
+        pid = block.load(Word.RECORDER_PID)
         if pid and pid not in stopped:
             stopped.add(pid)
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGSTOP)
         time.sleep(0.002)
-    last = int(words[Word.RECORDER_PID])
+    last = block.load(Word.RECORDER_PID)
     with suppress(ProcessLookupError):
         os.kill(last, signal.SIGCONT)
-    wait_for(lambda: int(words[Word.RECORDER_CURSOR]) > bench.ticks - 4000, "a recorder that keeps up")
+    wait_for(lambda: block.load(Word.RECORDER_CURSOR) > bench.ticks - 4000, "a recorder that keeps up")
     assert bench.status()["state"] == "running"
     return Measured(lost_allowed=True, exit_code=1, note=f"{len(stopped)} recorders stopped in a row")
 

@@ -17,7 +17,6 @@ import numpy as np
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.ring import claim, publish
-from rtloop.recording.capture.recorder import load_word
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import event_of, recorder_event
 from rtloop.recording.file.format import EVENTS, LAW, chunk_rows
@@ -128,8 +127,8 @@ class HandMadeLoop:
     def __init__(self, rate_hz: float = RATE_HZ) -> None:
         self.block = SharedBlock.create(Sizes(len(COLUMNS), len(AXES), rate_hz, SNAPSHOT_BYTES, 1))
         os.set_inheritable(self.block.fd, True)
-        self.block.words[Word.START_UNIX_NS] = START_UNIX_NS
-        self.block.words[Word.LOOP_STATE] = ProcessState.RUNNING
+        self.block.store(Word.START_UNIX_NS, START_UNIX_NS)
+        self.block.store(Word.LOOP_STATE, ProcessState.RUNNING)
 
     def put(self, ring_name: str, payload: Any) -> None:
         """Publish one slot."""
@@ -151,7 +150,7 @@ class HandMadeLoop:
     @property
     def cursor(self) -> int:
         """What the recorder has taken."""
-        return int(load_word(self.block.words, int(Word.RECORDER_CURSOR)))
+        return self.block.load(Word.RECORDER_CURSOR)
 
     def command(self, tick: int, mode: Mode) -> None:
         """The event of a change of mode."""
@@ -164,7 +163,7 @@ class HandMadeLoop:
 
     def end(self, state: ProcessState = ProcessState.FINISHED) -> None:
         """Say that the loop is over."""
-        self.block.words[Word.LOOP_STATE] = state
+        self.block.store(Word.LOOP_STATE, state)
 
 
 class RecorderProcess:
@@ -176,7 +175,7 @@ class RecorderProcess:
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, pass_fds=[loop.block.fd]
         )
-        self.wait_until(lambda: loop.block.words[Word.RECORDER_STATE] == ProcessState.READY)
+        self.wait_until(lambda: loop.block.load(Word.RECORDER_STATE) == ProcessState.READY)
 
     def start(self, path: Path, header: dict[str, Any] | None = None, **options: Any) -> None:
         """Give the recorder its file."""

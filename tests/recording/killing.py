@@ -39,7 +39,7 @@ def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
     process.communicate()
     while any(_alive(pid) for pid in pids.values()):
         time.sleep(0.002)
-    return Killed(parts[0], int(block["ticks_head"][0]), int(block.words[Word.RECORDER_CURSOR]))
+    return Killed(parts[0], int(block["ticks_head"][0]), block.load(Word.RECORDER_CURSOR))
 
 
 def recovered_ticks(killed: Killed) -> int:

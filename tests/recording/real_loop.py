@@ -59,10 +59,10 @@ class RealLoop:
         plan = self.prepared.plan
         self.block = SharedBlock.create(plan.sizes)
         os.set_inheritable(self.block.fd, True)
-        self.block.words[Word.LOOP_STATE] = ProcessState.RUNNING
+        self.block.store(Word.LOOP_STATE, ProcessState.RUNNING)
         self._context = clock_context(plan.pacing.rate_hz)
         head = self.block.ring("ticks").head
-        clock = unpaced_clock(self._context, head, self.block.words, Word.RECORDER_CURSOR, UNLIMITED_SLACK)
+        clock = unpaced_clock(self._context, head, self.block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
         self._driver = plan.driver()
         facts, law = self._driver.facts, law_at_rest(plan)
         self._assembly = Assembly(plan, self.block, facts, self._driver.open(), clock, law)
@@ -83,7 +83,7 @@ class RealLoop:
 
     def end(self) -> None:
         """Say that the loop is over."""
-        self.block.words[Word.LOOP_STATE] = ProcessState.FINISHED
+        self.block.store(Word.LOOP_STATE, ProcessState.FINISHED)
 
 
 def record(path: Path, text: str, ticks: int, **options: float) -> list[Path]:

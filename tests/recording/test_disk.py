@@ -266,14 +266,14 @@ def test_a_small_disk_that_is_made_larger(tmp_path: Path):
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", small], capture_output=True).returncode:
         pytest.skip("mounting a small disk is not permitted here")
     loop = HandMadeLoop()
-    recorder, rows, words = RecorderProcess(loop), make_rows(45_000), loop.block.words
+    recorder, rows, block = RecorderProcess(loop), make_rows(45_000), loop.block
     try:
         recorder.start(small / "run.mcap")
         loop.run(rows[:25_000], slack=20_000, snapshot_every=5_000)
-        recorder.wait_until(lambda: words[Word.RECORDER_STATE] == ProcessState.FAILED)
+        recorder.wait_until(lambda: block.load(Word.RECORDER_STATE) == ProcessState.FAILED)
         subprocess.run(["mount", "-o", "remount,size=64m", small], check=True)
         loop.run(rows[25_000:35_000], slack=20_000, snapshot_every=5_000)
-        recorder.wait_until(lambda: words[Word.RECORDER_STATE] == ProcessState.RUNNING)
+        recorder.wait_until(lambda: block.load(Word.RECORDER_STATE) == ProcessState.RUNNING)
         loop.run(rows[35_000:], slack=20_000, snapshot_every=5_000)
         loop.end()
         code, totals = recorder.result()

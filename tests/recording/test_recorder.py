@@ -54,7 +54,7 @@ def test_records_everything_in_order(loop: HandMadeLoop, recorder: RecorderProce
         assert [event["kind"] for event in reader.events] == ["set_mode", "tripped", "finished"]
         assert [s.data for s in reader.snapshots()] == [snapshot(k).tobytes() for k in (0, 10_000, 20_000)]
     assert os.listdir(tmp_path) == ["run.mcap"]
-    assert loop.block.words[Word.RECORDER_STATE] == ProcessState.FINISHED
+    assert loop.block.load(Word.RECORDER_STATE) == ProcessState.FINISHED
     assert loop.cursor == len(rows)
 
 

@@ -115,4 +115,4 @@ def test_a_gap_is_passed_by_the_next_snapshot_and_said(tmp_path: Path):
 def _cursor(recorder: RecorderProcess) -> int:
     from rtloop.engine.memory import Word
 
-    return int(recorder.loop.block.words[Word.RECORDER_CURSOR])
+    return recorder.loop.block.load(Word.RECORDER_CURSOR)

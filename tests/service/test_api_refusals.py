@@ -41,11 +41,11 @@ from tests.service.http import GOOD_CONTROLLER, answer, exchange
     ("/mode", {"mode": "off", "more": 1}),
 ])  # fmt: skip
 def test_what_is_outside_the_envelope_changes_nothing(bench: Bench, path: str, body: dict[str, Any]):
-    commands = int(bench.blocks[-1].words[Word.COMMANDS_HEAD])
+    commands = bench.blocks[-1].load(Word.COMMANDS_HEAD)
     code, said = answer(bench, "POST", path, body)
     assert code == 422, said
     assert said["error"][0].isalnum(), said  # it begins with a key
-    assert int(bench.blocks[-1].words[Word.COMMANDS_HEAD]) == commands
+    assert bench.blocks[-1].load(Word.COMMANDS_HEAD) == commands
 
 
 @pytest.mark.parametrize(
@@ -115,13 +115,13 @@ def test_numbers_that_nothing_can_be_made_of(bench: Bench, path: str, body: dict
 def test_hostile_requests_are_refused_and_change_nothing(bench: Bench):
     refused = 0
     for path, body in hostile(seed=1, count=120):
-        commands = int(bench.blocks[-1].words[Word.COMMANDS_HEAD])
+        commands = bench.blocks[-1].load(Word.COMMANDS_HEAD)
         code, said = exchange(bench.client.path, "POST", path, body)
         assert code in (200, 413, 422), (path, body[:300], said)
         if code != 200:
             refused += 1
             assert len(json.loads(said)["error"]) < 2000
-            assert int(bench.blocks[-1].words[Word.COMMANDS_HEAD]) == commands
+            assert bench.blocks[-1].load(Word.COMMANDS_HEAD) == commands
     assert refused > 80
     assert "Traceback" not in bench.log()
     bench.client.post("/reload")  # back to the file, whatever was taken

@@ -75,7 +75,7 @@ def test_a_number_in_the_block_is_not_believed(block, monkeypatch):
     monkeypatch.setattr(parking, "MARGIN_S", 0.05)
     with subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE) as other:
         with a_loop(block) as loop:
-            block.words[Word.LOOP_PID] = other.pid
+            block.store(Word.LOOP_PID, other.pid)
             loop.send_signal(signal.SIGSTOP)
             parking._await_end(block, 0.05, 1000.0)
         assert loop.returncode == -signal.SIGKILL
@@ -89,7 +89,7 @@ def test_a_service_that_is_alive_is_left_alone(block):
 
     def beat():
         while not ended.wait(0.005):
-            block.words[Word.HEARTBEAT_NS] = time.monotonic_ns()
+            block.store(Word.HEARTBEAT_NS, time.monotonic_ns())
 
     beating = threading.Thread(target=beat)
     beating.start()

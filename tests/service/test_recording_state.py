@@ -16,7 +16,7 @@ def block(executed: int, **words: int) -> SharedBlock:
     made = HandMadeLoop().block
     made["ticks_head"][0] = executed
     for name, value in words.items():
-        made.words[Word[name]] = value
+        made.store(Word[name], value)
     return made
 
 
@@ -42,7 +42,7 @@ def test_a_failure(number: int, reason: str):
     assert (said["state"], said["since_tick"], said["ticks_lost"]) == ("not recording", 15_000, 100 + 4_990)
     assert reason in said["reason"]
     fault = recording_fault(full)
-    full.words[Word.RECORDER_CURSOR] = 20_000
+    full.store(Word.RECORDER_CURSOR, 20_000)
     assert fault == recording_fault(full)  # the same words as long as it is the same fault
     assert reason in fault
     assert "15000" in fault

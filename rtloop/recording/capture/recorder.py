@@ -23,10 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
-from rtloop.engine.words import load_word, store_word
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.session import Options, Session
@@ -42,28 +39,20 @@ class Recorder:
     """Polls the rings of `block` into a Session until the loop has ended. Ready once constructed."""
 
     def __init__(self, block: SharedBlock) -> None:
-        self._words = block.words
-        self.set_word(Word.RECORDER_PID, os.getpid())
+        self.block = block
+        block.store(Word.RECORDER_PID, os.getpid())
         for name in ("ticks", "snapshots", "events"):
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
-
-    def word(self, index: Word) -> int:
-        """A control word of the block."""
-        return int(load_word(self._words, int(index)))
-
-    def set_word(self, index: Word, value: int) -> None:
-        """Set a control word of the block."""
-        store_word(self._words, int(index), np.uint64(value))
 
     def record(self, session: Session, pause_s: float) -> str:
         """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned"."""
         last_tick_s = time.monotonic()
         while True:
-            state = self.word(Word.LOOP_STATE)
+            state = self.block.load(Word.LOOP_STATE)
             drained = session.drain()
-            self.set_word(Word.RECORDER_CURSOR, session.cursor)
+            self.block.store(Word.RECORDER_CURSOR, session.cursor)
             session.write_due()
-            self.set_word(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
+            self.block.store(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
             if drained:
                 last_tick_s = time.monotonic()
             elif state in (ProcessState.FINISHED, ProcessState.FAILED):
@@ -104,20 +93,20 @@ def run(fd: int) -> int:
     except EOFError:
         return 0  # there was nothing to record
     recorder = Recorder(block)
-    recorder.set_word(Word.RECORDER_STATE, ProcessState.READY)
+    block.store(Word.RECORDER_STATE, ProcessState.READY)
     totals: dict[str, Any]
     try:
         command = _read_command()
         header = command["header"]
         session = Session(block, Path(command["path"]), header, Options(**command.get("options", {})))
-        recorder.set_word(Word.RECORDER_STATE, ProcessState.RUNNING)
+        block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
         result = recorder.record(session, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)
     except RtloopError as error:
         totals = {"complete": False, "error": str(error)}
     totals["cpu_s"] = round(time.process_time(), 3)
     good = totals["error"] is None
-    recorder.set_word(Word.RECORDER_STATE, ProcessState.FINISHED if good else ProcessState.FAILED)
+    block.store(Word.RECORDER_STATE, ProcessState.FINISHED if good else ProcessState.FAILED)
     with contextlib.suppress(BrokenPipeError):
         print(json.dumps(totals), flush=True)
     return 0 if good else 1

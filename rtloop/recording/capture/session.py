@@ -49,14 +49,14 @@ class Session:
         self._buffer = TickBuffer(header["columns"], header["rate_hz"])
         self._written_s = time.monotonic()
         self._ticks, self._snapshots, self._events = (
-            RingReader(block, name, int(block.words[word])) for name, word in FLUSHED.items()
+            RingReader(block, name, block.load(word)) for name, word in FLUSHED.items()
         )
         self._ahead: deque[bytes] = deque()
         self._pending = Pending(self._buffer, self._start_unix_ns)
         self.error: str | None = None
         self.failure: OutputError | None = None
         self._cut_tick = self.cursor
-        logged = self.cursor - int(block.words[Word.LOST_TICKS])
+        logged = self.cursor - block.load(Word.LOST_TICKS)
         self._files = Files(path, header, options, self._buffer.place(self.cursor), logged)
         try:
             self._files.begin(self._files.opened(header["created_unix_ns"] if header["paced"] else 0))
@@ -168,7 +168,7 @@ class Session:
         self.failure = failure
         self._files.leave_what_is_useless()
         self._account(self._files.next.tick)
-        self._block.words[Word.RECORDER_FAILURE] = failure.number or errno.EIO
+        self._block.store(Word.RECORDER_FAILURE, failure.number or errno.EIO)
 
     def _resume(self, tick: int) -> None:
         """Try to go on in another file from the snapshot of `tick` on; the rows before it are lost."""
@@ -186,14 +186,14 @@ class Session:
         self._buffer.drop(self._buffer.before(tick))
         self._cut_tick, self.failure = tick, None
         self._account(tick)
-        self._block.words[Word.RECORDER_FAILURE] = 0
+        self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _write_all(self) -> None:
         self._write(len(self._buffer), self._pending.take())
         if self.failure is None:  # else a recorder that comes after this one may still find it in the rings
             self._account(self._files.next.tick)
-            self._block.words[Word.FLUSHED_SNAPSHOTS] = self._snapshots.position - len(self._ahead)
-            self._block.words[Word.FLUSHED_EVENTS] = self._events.position
+            self._block.store(Word.FLUSHED_SNAPSHOTS, self._snapshots.position - len(self._ahead))
+            self._block.store(Word.FLUSHED_EVENTS, self._events.position)
 
     def _write(self, count: int, entries: list[Entry]) -> None:
         """Entries, then the first `count` rows. Where nothing can be written, rows are lost and events are kept."""
@@ -220,11 +220,11 @@ class Session:
 
     def _account(self, tick: int) -> None:
         """Ticks before `tick` are in a file, or lost."""
-        self._block.words[Word.FLUSHED_TICKS] = tick
-        self._block.words[Word.LOST_TICKS] = tick - self._files.logged
+        self._block.store(Word.FLUSHED_TICKS, tick)
+        self._block.store(Word.LOST_TICKS, tick - self._files.logged)
 
     def _start_unix_ns(self) -> int:
         """Virtual time starts at 0, so that two unpaced runs are logged alike."""
         if not self._header["paced"]:
             return 0
-        return int(self._block.words[Word.START_UNIX_NS]) or self._header["created_unix_ns"]
+        return self._block.load(Word.START_UNIX_NS) or self._header["created_unix_ns"]

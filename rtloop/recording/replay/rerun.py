@@ -92,7 +92,7 @@ class Rerun:
         self._slots = self._block["ticks_slots"]
         self._context = clock_context(header["rate_hz"])
         self._context.index = first_tick
-        head, words = self._block.ring("ticks").head, self._block.words
+        head, words = self._block.ring("ticks").head, self._block["words"]
         clock = unpaced_clock(self._context, head, words, Word.RECORDER_CURSOR, UNLIMITED_SLACK)
         self._assembly = Assembly(plan, self._block, source.facts, source.pointers(), clock, law)
         self._assembly.loop.next_snapshot = self._assembly.loop.snapshot_ticks = NEVER
