@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rtloop.service.api import application
+from rtloop.service.api.application import application
 
 PATIENCE_S = 20.0
 MANY = 60

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtloop.engine.memory import Word
-from rtloop.service.connections import BACKLOG, MAX_CONNECTIONS
+from rtloop.service.api.connections import BACKLOG, MAX_CONNECTIONS
 from tests.faults.bench import Bench
 from tests.service.hostile import EXPENSIVE, HUGE, hostile
 from tests.service.http import GOOD_CONTROLLER, answer, exchange

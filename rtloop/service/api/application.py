@@ -26,7 +26,7 @@ from rtloop.configuration.references import read_samples
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.commands import QueueFull
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
-from rtloop.service.bodies import (
+from rtloop.service.api.bodies import (
     MAX_BODY_BYTES,
     Body,
     ControllerBody,
@@ -36,9 +36,9 @@ from rtloop.service.bodies import (
     TuneBody,
     WaveformBody,
 )
+from rtloop.service.api.lanes import Busy, Lane, Lanes
+from rtloop.service.api.metrics import metrics_text
 from rtloop.service.desk import Refused, Taken
-from rtloop.service.lanes import Busy, Lane, Lanes
-from rtloop.service.metrics import metrics_text
 from rtloop.service.service import Service
 from rtloop.service.status import newest_signals, status
 

@@ -2,7 +2,7 @@
 
 A connection counts as idle until a whole request has come. An idle one is closed after IDLE_S; where there are
 MAX_CONNECTIONS, a new one takes the place of the oldest idle one. What is asked is answered or refused at once
-(`rtloop.service.lanes`), so that few are ever anything but idle.
+(`rtloop.service.api.lanes`), so that few are ever anything but idle.
 """
 
 from __future__ import annotations
