@@ -10,7 +10,8 @@ from rich.table import Table
 from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.verification.text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
 from rtloop.design.verification.verify import Verification
-from rtloop.terminal.table import console as _console
+from rtloop.terminal.table import console
+from rtloop.terminal.table import table as lines
 
 RED = {"MISSED", "NO"}
 
@@ -30,22 +31,24 @@ def print_synthesis(found: Synthesis, slicot: float | None) -> None:
 
 def print_verification(name: str, found: Verification) -> None:
     """Every table of one axis, and the answer."""
-    console = _console()
-    console.print(f"[bold]axis {name}[/]")
-    console.print(_table(HEADINGS, table(found)))
+    out = console()
+    out.print(f"[bold]axis {name}[/]")
+    out.print(_table(HEADINGS, table(found)))
     if found.robustness.shifts:
-        console.print("\nThe resonance may move by")
-        console.print(_table(("", ""), shifts(found)))
-    console.print()
-    console.print(_table(ROBUSTNESS_HEADINGS, robustness(found)))
-    console.print(NOTE)
-    console.print(f"\n[bold]{answer(found)}[/]")
+        out.print("\nThe resonance may move by")
+        out.print(_table(("", ""), shifts(found)))
+    out.print()
+    out.print(_table(ROBUSTNESS_HEADINGS, robustness(found)))
+    out.print(NOTE)
+    out.print(f"\n[bold]{answer(found)}[/]")
     for warning in found.warnings:
         click.echo(f"warning: {warning}", err=True)
 
 
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    shown = Table(*headings, box=None, show_header=any(headings), pad_edge=False, padding=(0, 3, 0, 0))
+    shown = lines(*headings)
+    for column in shown.columns:
+        column.justify = "left"
     for row in rows:
         shown.add_row(*(f"[red]{cell}[/]" if cell in RED else cell for cell in row))
     return shown

@@ -6,87 +6,82 @@ from typing import Any
 
 from rich.console import Console
 
-from rtloop.terminal.table import console as _console
-from rtloop.terminal.table import table as _table
+from rtloop.terminal.table import console, table
 
 
 def print_hysteresis(report: dict[str, Any]) -> None:
     """Thresholds and weights, quality, h/H."""
-    console = _console()
-    table = _table("operator", "threshold V", "weight µm/V")
+    out = console()
+    shown = table("operator", "threshold V", "weight µm/V")
     model = report["model"]
     for i, (r, p) in enumerate(zip(model["thresholds_v"], model["weights_um_per_v"], strict=True)):
-        table.add_row(str(i), f"{r:.4f}", f"{p:.4f}")
-    console.print(table)
-    console.print(
+        shown.add_row(str(i), f"{r:.4f}", f"{p:.4f}")
+    out.print(shown)
+    out.print(
         f"error {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
         f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm)"
     )
-    console.print(
-        f"h/H {_number(report['measured_h_percent'])} % measured, {_number(report['model_h_percent'])} % model"
-    )
-    console.print("sensor offset: " + ", ".join(f"{offset:.4g} µm" for offset in report["offsets_um"]))
+    out.print(f"h/H {_number(report['measured_h_percent'])} % measured, {_number(report['model_h_percent'])} % model")
+    out.print("sensor offset: " + ", ".join(f"{offset:.4g} µm" for offset in report["offsets_um"]))
     if not report["invertible"]:
-        console.print(
-            "[red]no inverse[/]: a partial sum of the weights is not above 0; --weights invertible keeps them so"
-        )
-    _print_files(console, report)
+        out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; --weights invertible keeps them so")
+    _print_files(out, report)
 
 
 def print_dynamics(report: dict[str, Any]) -> None:
     """Orders tried, modes with their uncertainty, what the residuals and a measured response say."""
-    console = _console()
-    table = _table("order", "error µm rms", "AIC", "validation µm rms")
+    out = console()
+    shown = table("order", "error µm rms", "AIC", "validation µm rms")
     for one in report["candidates"]:
         name = f"{one['order']}" + (" ←" if one["order"] == report["order"] else "")
-        table.add_row(
+        shown.add_row(
             name, f"{one['rms_error_um']:.5f}", f"{one['aic']:.4f}", _number(one["validation_rms_um"], "{:.5f}")
         )
-    console.print(table)
-    table = _table("mode", "Hz", "± (1σ)", "damping", "± (1σ)", "static share")
+    out.print(shown)
+    shown = table("mode", "Hz", "± (1σ)", "damping", "± (1σ)", "static share")
     for i, mode in enumerate(report["modes"]):
-        table.add_row(
+        shown.add_row(
             str(i), f"{mode['frequency_hz']:.3f}", f"{mode['frequency_std_hz']:.2g}", f"{mode['damping']:.5f}",
             f"{mode['damping_std']:.2g}", f"{mode['static_share']:.4f}",
         )  # fmt: skip
-    console.print(table)
+    out.print(shown)
     tests = report["tests"]
-    console.print(
+    out.print(
         f"static gain {report['static_gain']:.6g}, which belongs to the hysteresis (D(0) = 1); "
         f"delay {report['delay_ticks']} samples; fit {report['fit_percent']:.2f} %"
     )
-    console.print(
+    out.print(
         f"residuals: {'white' if tests['white'] else 'not white'} "
         f"(largest autocorrelation {tests['largest_autocorrelation']:.3f}), "
         f"{'independent of' if tests['independent'] else 'correlated with'} the input "
         f"({tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % bound)"
     )
-    _print_response(console, report["frequency_response"])
-    _print_files(console, report)
+    _print_response(out, report["frequency_response"])
+    _print_files(out, report)
 
 
 def print_compensation(report: dict[str, Any]) -> None:
     """ρ and ξ of eq (2), against simulation."""
-    console = _console()
-    table = _table("ρ", "value", "ξ µm", "sine µm", "random µm", "worst case µm")
+    out = console()
+    shown = table("ρ", "value", "ξ µm", "sine µm", "random µm", "worst case µm")
     for row in report["bounds"]:
         simulated = row["simulated_um"]
         values = (row["rho"], row["xi_um"], simulated["sine"], simulated["random"], simulated["worst_case"])
-        table.add_row(row["gain"].replace("_", " "), *(f"{value:.4f}" for value in values))
-    console.print(f"|v| ≤ {report['command_um']:g} µm: largest |Ω| = |y − ρ v|, bound ξ and simulated")
-    console.print(table)
-    console.print(
+        shown.add_row(row["gain"].replace("_", " "), *(f"{value:.4f}" for value in values))
+    out.print(f"|v| ≤ {report['command_um']:g} µm: largest |Ω| = |y − ρ v|, bound ξ and simulated")
+    out.print(shown)
+    out.print(
         f"as eq (3) is printed: {report['eq_3_um']:.4f} µm (no bound where the weights have both signs); "
         f"Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
     )
     if report["dead_band"] == "exact":
-        console.print("dead_band = 'exact' is not part of this: it leaves less")
-    _print_files(console, report)
+        out.print("dead_band = 'exact' is not part of this: it leaves less")
+    _print_files(out, report)
 
 
-def _print_response(console: Console, found: dict[str, Any] | None) -> None:
+def _print_response(out: Console, found: dict[str, Any] | None) -> None:
     if found:
-        console.print(
+        out.print(
             f"measured response, {found['from_hz']:.4g} to {found['to_hz']:.4g} Hz: median deviation "
             f"{100 * found['median_deviation']:.2f} %, largest {100 * found['largest_deviation']:.1f} % at "
             f"{found['largest_at_hz']:.4g} Hz; peak at {found['measured_peak_hz']:.4g} Hz, model "
@@ -94,10 +89,10 @@ def _print_response(console: Console, found: dict[str, Any] | None) -> None:
         )
 
 
-def _print_files(console: Console, report: dict[str, Any]) -> None:
+def _print_files(out: Console, report: dict[str, Any]) -> None:
     for key in ("output", "plot"):
         if report.get(key):
-            console.print(report[key], markup=False)
+            out.print(report[key], markup=False)
 
 
 def _number(value: float | None, form: str = "{:.2f}") -> str:

@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from rtloop.recording.replay.replay import ReplayReport
-from rtloop.terminal.table import console as _console
-from rtloop.terminal.table import table as _table
+from rtloop.terminal.table import console, table
 
 METRICS = (
     ("rms_error_um", "rms error µm"),
@@ -28,24 +27,22 @@ STEP_METRICS = (
 
 def print_replay(path: Path, report: ReplayReport) -> None:
     """The verdict, the gaps, what is not verified and what cannot be, the first difference."""
-    console = _console()
+    out = console()
     for gap in report.gaps:
-        console.print(f"gap: {gap['count']} ticks from tick {gap['first_tick']} on are not in the recording")
-    _print_problems(console, report.problems)
+        out.print(f"gap: {gap['count']} ticks from tick {gap['first_tick']} on are not in the recording")
+    _print_problems(out, report.problems)
     for entry in report.not_verified:
-        console.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
-    console.print(f"not judged: {'; '.join(report.not_judged)}")
+        out.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
+    out.print(f"not judged: {'; '.join(report.not_judged)}")
     checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
     name, found = _name(path), report.first_difference
     if report.identical:
-        console.print(f"[green]identical[/]: {name}: {checked} compared in bytes")
+        out.print(f"[green]identical[/]: {name}: {checked} compared in bytes")
     elif found is None:
-        console.print(f"[red]not verified as a whole[/]: {name}: no difference in {checked} compared in bytes")
+        out.print(f"[red]not verified as a whole[/]: {name}: no difference in {checked} compared in bytes")
     else:
         values = f"recorded {found['recorded']!r}, replayed {found['replayed']!r}"
-        console.print(
-            f"[red]different[/]: {name}: tick {found['tick']}, {found['signal']}: {values} ({checked} compared)"
-        )
+        out.print(f"[red]different[/]: {name}: tick {found['tick']}, {found['signal']}: {values} ({checked} compared)")
 
 
 def _range(entry: dict[str, Any]) -> str:
@@ -58,66 +55,66 @@ def _range(entry: dict[str, Any]) -> str:
 
 def print_differences(report: dict[str, Any]) -> None:
     """Largest and root mean square difference, signal by signal."""
-    console = _console()
+    out = console()
     law, recording = _name(report["config"]), _name(report["recording"])
-    console.print(f"the law of {law} on the inputs of {recording}: {report['ticks']:,} ticks")
-    table = _table("difference", "largest", "at tick", "rms")
+    out.print(f"the law of {law} on the inputs of {recording}: {report['ticks']:,} ticks")
+    shown = table("difference", "largest", "at tick", "rms")
     for name, difference in report["signals"].items():
-        table.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")
-    console.print(table)
-    _print_trip(console, "it would have tripped", report["trip"])
-    _print_problems(console, report["problems"])
+        shown.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")
+    out.print(shown)
+    _print_trip(out, "it would have tripped", report["trip"])
+    _print_problems(out, report["problems"])
 
 
 def print_resimulation(report: dict[str, Any]) -> None:
     """Recorded and resimulated, side by side."""
-    console = _console()
+    out = console()
     law = report["config"] or "the recorded law and rig"
-    console.print(f"the reference of {_name(report['recording'])} through {_name(law)}: {report['ticks']:,} ticks")
+    out.print(f"the reference of {_name(report['recording'])} through {_name(law)}: {report['ticks']:,} ticks")
     for axis in report["axes"]:
         before, after = axis["recorded"], axis["resimulated"]
-        table = _table(f"axis {axis['name']}", "recorded", "resimulated")
+        shown = table(f"axis {axis['name']}", "recorded", "resimulated")
         for key, label in METRICS:
-            table.add_row(label, _number(before[key]), _number(after[key]))
+            shown.add_row(label, _number(before[key]), _number(after[key]))
         if before["steps"] and after["steps"]:
             for key, label in STEP_METRICS:
-                table.add_row(label, _number(before["steps"][key]), _number(after["steps"][key]))
-        console.print(table)
+                shown.add_row(label, _number(before["steps"][key]), _number(after["steps"][key]))
+        out.print(shown)
     for name, trip in report["trips"].items():
-        _print_trip(console, f"{name}: tripped", trip)
-    _print_problems(console, report["problems"])
+        _print_trip(out, f"{name}: tripped", trip)
+    _print_problems(out, report["problems"])
 
 
 def print_recovery(report: dict[str, Any]) -> None:
     """What is in the recovered file, and what is missing."""
-    console = _console()
+    out = console()
     original, whole = _name(report["recording"]), report["complete"] and not report["gaps"] and not report["problems"]
     if whole:
-        console.print(f"{original} is whole, there was nothing to recover; {_name(report['output'])} is a copy")
+        out.print(f"{original} is whole, there was nothing to recover; {_name(report['output'])} is a copy")
         return
-    console.print(f"{_name(report['output'])}: {report['ticks']:,} ticks recovered from {original}")
+    out.print(f"{_name(report['output'])}: {report['ticks']:,} ticks recovered from {original}")
     for first, count in report["gaps"]:
-        console.print(f"missing: {count:,} ticks from tick {first} on")
-    _print_problems(console, report["problems"])
+        out.print(f"missing: {count:,} ticks from tick {first} on")
+    _print_problems(out, report["problems"])
     if not report["complete"]:
-        console.print("the end of the run is not in it: what came after its last tick is not known")
+        out.print("the end of the run is not in it: what came after its last tick is not known")
 
 
 def print_export(report: dict[str, Any]) -> None:
     """What was written where."""
-    console = _console()
-    console.print(f"{_name(report['output'])}: {report['ticks']:,} ticks, {report['bytes'] / 2**20:.1f} MiB")
-    _print_problems(console, report["problems"])
+    out = console()
+    out.print(f"{_name(report['output'])}: {report['ticks']:,} ticks, {report['bytes'] / 2**20:.1f} MiB")
+    _print_problems(out, report["problems"])
 
 
-def _print_trip(console: Console, what: str, trip: dict[str, Any] | None) -> None:
+def _print_trip(out: Console, what: str, trip: dict[str, Any] | None) -> None:
     if trip:
-        console.print(f"[red]{what}[/] at tick {trip['tick']}: {', '.join(trip['causes'])}")
+        out.print(f"[red]{what}[/] at tick {trip['tick']}: {', '.join(trip['causes'])}")
 
 
-def _print_problems(console: Console, problems: list[str]) -> None:
+def _print_problems(out: Console, problems: list[str]) -> None:
     for problem in problems:
-        console.print(f"[red]problem[/]: {_name(problem)}")
+        out.print(f"[red]problem[/]: {_name(problem)}")
 
 
 def _number(value: float | None) -> str:

@@ -23,7 +23,7 @@ from rtloop.recording.views.steps import step_metrics
 from rtloop.signals import Mode
 from rtloop.supervision.supervisor import Supervisor
 from rtloop.terminal.progress import StatusLine
-from rtloop.terminal.table import console
+from rtloop.terminal.table import console, table
 
 BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
@@ -75,39 +75,39 @@ def print_summary(summary: dict[str, Any]) -> None:
         out.print(f"nothing recorded in {escape(str(summary.get('recording')))}")
         return
     out.print(f"[bold]{escape(summary['recording'])}[/]  {_size(summary)}")
-    table = _table("", "", "")
+    shown = table("", "", "")
     expected = summary["ticks_expected"]
-    table.add_row(
+    shown.add_row(
         "ticks", f"{summary['ticks_logged']:,}", "of " + ("as many as came" if expected is None else f"{expected:,}")
     )
-    table.add_row("lost", str(summary["ticks_lost"]), "complete" if summary["complete"] else "[red]not complete[/]")
-    table.add_row("time", f"{summary['duration_s']:.3f} s", f"at {summary['rate_hz']:g} Hz")
+    shown.add_row("lost", str(summary["ticks_lost"]), "complete" if summary["complete"] else "[red]not complete[/]")
+    shown.add_row("time", f"{summary['duration_s']:.3f} s", f"at {summary['rate_hz']:g} Hz")
     if summary["paced"]:
         achieved = summary["achieved_rate_hz"]
         rate = "–" if achieved is None else f"{achieved:.1f} Hz"
-        table.add_row("achieved rate", rate, _scheduling(summary["realtime"] or {}))
-        table.add_row("periods missed", str(summary["periods_missed"]), "skipped by late ticks, never caught up")
-        table.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
+        shown.add_row("achieved rate", rate, _scheduling(summary["realtime"] or {}))
+        shown.add_row("periods missed", str(summary["periods_missed"]), "skipped by late ticks, never caught up")
+        shown.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
     else:
-        table.add_row("clock", "virtual", "unpaced: nothing was timed")
+        shown.add_row("clock", "virtual", "unpaced: nothing was timed")
     if any(summary["ticks_limited"].values()):
         counts = ", ".join(f"{name} {count:,}" for name, count in summary["ticks_limited"].items() if count)
-        table.add_row("limited", "", f"ticks by what: {counts}")
+        shown.add_row("limited", "", f"ticks by what: {counts}")
     if len(summary["parts"]) > 1:
-        table.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
+        shown.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
     for problem in summary["problems"]:
-        table.add_row("[red]problem[/]", "", escape(problem))
+        shown.add_row("[red]problem[/]", "", escape(problem))
     if summary["driver_error"]:
-        table.add_row("[red]driver[/]", "", escape(summary["driver_error"]))
+        shown.add_row("[red]driver[/]", "", escape(summary["driver_error"]))
     for trip in summary["trips"]:
         reason = escape(trip["reason"] or "")
-        table.add_row(
+        shown.add_row(
             "[red]trip[/]", f"tick {trip['tick']}", "; ".join(filter(None, [", ".join(trip["causes"]), reason]))
         )
-    out.print(table)
+    out.print(shown)
     if summary["lateness_us"] is not None:
         _print_timing(out, summary)
-    axes = _table("axis", "rms error µm", "largest drive V")
+    axes = table("axis", "rms error µm", "largest drive V")
     for axis in summary["axes"]:
         error = "–" if axis["rms_error_um"] is None else f"{axis['rms_error_um']:.4f}"
         axes.add_row(axis["name"], error, f"{axis['max_abs_drive_v']:.3f}")
@@ -115,10 +115,10 @@ def print_summary(summary: dict[str, Any]) -> None:
 
 
 def _print_timing(out: Console, summary: dict[str, Any]) -> None:
-    table = _table("µs", "p50", "p99", "p99.9", "max")
+    shown = table("µs", "p50", "p99", "p99.9", "max")
     for label, key in (("lateness", "lateness_us"), ("tick", "exec_us")):
-        table.add_row(label, *(f"{summary[key][name]:.2f}" for name in ("p50", "p99", "p999", "max")))
-    out.print(table)
+        shown.add_row(label, *(f"{summary[key][name]:.2f}" for name in ("p50", "p99", "p999", "max")))
+    out.print(shown)
     histogram = summary.get("lateness_histogram")
     if histogram:
         out.print(bars(histogram, "late by µs"))
@@ -129,36 +129,36 @@ def _print_timing(out: Console, summary: dict[str, Any]) -> None:
 
 def bars(histogram: list[dict[str, Any]], heading: str) -> Table:
     """Counts and shares per class, from the first class to the last that has any; a full bar is all of them."""
-    table = _table(heading, "ticks", "share", "")
-    table.columns[3].justify = "left"
+    shown = table(heading, "ticks", "share", "")
+    shown.columns[3].justify = "left"
     counts = np.array([entry["count"] for entry in histogram])
     edges = ["0", *(f"{entry['below_us']:g}" for entry in histogram[:-1]), ""]
     some = np.flatnonzero(counts)
     for k in range(some[0], some[-1] + 1) if some.size else ():
         label = f"{edges[k]} … {edges[k + 1]}" if edges[k + 1] else f"{edges[k]} and more"
         share = counts[k] / counts.sum()
-        table.add_row(label, f"{counts[k]:,}", f"{100 * share:.3g} %", "█" * round(BAR_WIDTH * share))
-    return table
+        shown.add_row(label, f"{counts[k]:,}", f"{100 * share:.3g} %", "█" * round(BAR_WIDTH * share))
+    return shown
 
 
 def _print_steps(prepared: Prepared, recording: str) -> None:
     """Step metrics where references were micrometres, beside what each axis's own specification asks for."""
     out, loaded = console(), load(recording)
-    table = _table("steps", "overshoot %", "settling ms (5 %)", "static error %")
+    shown = table("steps", "overshoot %", "settling ms (5 %)", "static error %")
     driven = np.isin(loaded["mode"], (Mode.FEEDFORWARD, Mode.CLOSED_LOOP))
     for axis in prepared.configuration.axes:
         name, rate_hz = axis.name, prepared.plan.pacing.rate_hz
         metrics = step_metrics(loaded[f"{name}_reference_um"][driven], loaded[f"{name}_position_um"][driven], rate_hz)
         if metrics is None:
             continue
-        table.add_row(f"{name}: median of {metrics.steps}", f"{metrics.overshoot_percent:.2f}",
+        shown.add_row(f"{name}: median of {metrics.steps}", f"{metrics.overshoot_percent:.2f}",
                       f"{metrics.settling_time_ms:.2f}", f"{metrics.static_error_percent:.3f}")  # fmt: skip
-        table.add_row(f"{name}: worst", f"{metrics.overshoot_percent_worst:.2f}",
+        shown.add_row(f"{name}: worst", f"{metrics.overshoot_percent_worst:.2f}",
                       f"{metrics.settling_time_ms_worst:.2f}", f"{metrics.static_error_percent_worst:.3f}")  # fmt: skip
         for label, values in _asked(prepared.configuration, axis):
-            table.add_row(label, *values)
-    if table.row_count:
-        out.print(table)
+            shown.add_row(label, *values)
+    if shown.row_count:
+        out.print(shown)
 
 
 def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[str, list[str]]]:
@@ -179,15 +179,15 @@ def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[st
 
 def print_drivers() -> None:
     """Every registered kind, as a table."""
-    table = _table("kind", "moves hardware", "clock", "highest rate", "defined in")
+    shown = table("kind", "moves hardware", "clock", "highest rate", "defined in")
     for found in known_drivers():
         if found["problem"]:
-            table.add_row(found["kind"], f"[red]{escape(found['problem'])}[/]", "", "", found["defined_in"])
+            shown.add_row(found["kind"], f"[red]{escape(found['problem'])}[/]", "", "", found["defined_in"])
             continue
         limit_hz = found["max_rate_hz"]
         rate = "any" if limit_hz is None else f"{limit_hz:g} Hz"
-        table.add_row(found["kind"], "yes" if found["real"] else "no", "rtloop's", rate, found["defined_in"])
-    console().print(table)
+        shown.add_row(found["kind"], "yes" if found["real"] else "no", "rtloop's", rate, found["defined_in"])
+    console().print(shown)
 
 
 def known_drivers() -> list[dict[str, Any]]:
@@ -214,10 +214,3 @@ def _size(summary: dict[str, Any]) -> str:
 def _scheduling(realtime: dict[str, Any]) -> str:
     memory = "memory locked" if realtime.get("mlock") else "memory not locked"
     return f"{realtime.get('scheduler')} {realtime.get('priority') or ''}, {memory}".replace(" ,", ",")
-
-
-def _table(*headings: str) -> Table:
-    table = Table(*headings, box=None, show_header=any(headings), pad_edge=False, padding=(0, 3, 0, 0))
-    for column in table.columns[1:]:
-        column.justify = "right" if any(headings) else "left"
-    return table

@@ -14,8 +14,8 @@ def console() -> Console:
 
 
 def table(*headings: str) -> Table:
-    """A table without lines: labels to the left, numbers to the right."""
-    empty = Table(*headings, box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    """A table without lines: labels to the left, numbers to the right; words alone where nothing is headed."""
+    empty = Table(*headings, box=None, show_header=any(headings), pad_edge=False, padding=(0, 3, 0, 0))
     for column in empty.columns[1:]:
-        column.justify = "right"
+        column.justify = "right" if any(headings) else "left"
     return empty
