@@ -14,22 +14,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import types
 
 from rtloop.hil.native.atomics import load_acquire
 from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.monotonic import SECOND_NS, monotonic_ns, sleep_for, sleep_until
 from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 
-CLOCK_MONOTONIC = 1
-TIMER_ABSTIME = 1
-SECOND_NS = 1_000_000_000
 BACKPRESSURE_NS = 50_000
-
-# libc by name and not by a ctypes pointer: a pointer held as a global would defeat the compilation cache
-_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
-_clock_nanosleep = types.ExternalFunction(
-    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
-)
 
 CONTEXT = np.dtype(
     [
@@ -60,8 +51,7 @@ class Clock(NamedTuple):
 def paced_now(context, timing):
     """ns since the start, by CLOCK_MONOTONIC."""
     clock = carray(context, 1, CONTEXT)[0]
-    _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
-    carray(timing, 4)[0] = float(clock.timespec[0] * SECOND_NS + clock.timespec[1] - clock.start_ns)
+    carray(timing, 4)[0] = float(monotonic_ns(clock.timespec_address) - clock.start_ns)
     return 0
 
 
@@ -70,24 +60,17 @@ def paced_wait(context, timing):
     """Sleep, then spin, until the next deadline of the grid."""
     clock = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
-    _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
-    now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    now_ns = monotonic_ns(clock.timespec_address)
     deadline_ns = clock.start_ns + np.int64(clock.index * clock.period_ns)
     missed = 0
     if now_ns > deadline_ns:
         missed = np.int64((now_ns - deadline_ns) / clock.period_ns)
         clock.index += missed
         deadline_ns = clock.start_ns + np.int64(clock.index * clock.period_ns)
-    sleep_until_ns = deadline_ns - clock.spin_ns
-    while now_ns < sleep_until_ns:
-        clock.timespec[0] = sleep_until_ns // SECOND_NS
-        clock.timespec[1] = sleep_until_ns % SECOND_NS
-        _clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, clock.timespec_address, 0)
-        _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
-        now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    while now_ns < deadline_ns - clock.spin_ns:
+        now_ns = sleep_until(deadline_ns - clock.spin_ns, clock.timespec_address)
     while now_ns < deadline_ns:
-        _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
-        now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+        now_ns = monotonic_ns(clock.timespec_address)
     clock.index += 1
     out[0] = float(deadline_ns - clock.start_ns)
     out[1] = float(now_ns - clock.start_ns)
@@ -103,9 +86,7 @@ def unpaced_wait(context, timing):
     head = carray(address_pointer(clock.head_address), 1, np.uint64)
     words = carray(address_pointer(clock.words_address), 64, np.uint64)
     while np.int64(head[0] - load_acquire(words, clock.cursor_word)) > clock.slack_ticks:
-        clock.timespec[0] = 0
-        clock.timespec[1] = BACKPRESSURE_NS
-        _clock_nanosleep(CLOCK_MONOTONIC, 0, clock.timespec_address, 0)
+        sleep_for(BACKPRESSURE_NS, clock.timespec_address)
     out = carray(timing, 4)
     out[0] = float(np.int64(clock.index * clock.period_ns))
     out[1] = np.nan

@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import types
 
 from rtloop.drivers.base import Channel, Facts, Pointers
-from rtloop.engine.clock import CLOCK_MONOTONIC, CONTEXT, SECOND_NS, Clock, clock_context, paced_now
+from rtloop.engine.clock import CONTEXT, Clock, clock_context, paced_now
 from rtloop.hil.native.compiled import cfunc
+from rtloop.hil.native.monotonic import monotonic_ns
 from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 
 TAPE = np.dtype([("address", np.int64), ("count", np.int64), ("index", np.int64), ("written_v", np.float64)])
-
-_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
 
 
 @cfunc(SIGNATURE)
@@ -41,8 +39,7 @@ def due_wait(context, timing):
     """The paced clock's reading without its wait: every tick is due when it is asked for."""
     clock = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
-    _clock_gettime(CLOCK_MONOTONIC, clock.timespec_address)
-    now_ns = clock.timespec[0] * SECOND_NS + clock.timespec[1]
+    now_ns = monotonic_ns(clock.timespec_address)
     out[0] = out[1] = float(now_ns - clock.start_ns)
     out[2] = 0.0
     out[3] = float(now_ns)

@@ -20,6 +20,7 @@ from rtloop.hil import board
 from rtloop.hil.board import BoardMemory
 from tests.drivers.comedi_board import new_board, stub_library
 from tests.drivers.test_comedi_contract import comedi
+from tests.one_axis import one_axis, wired
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """
@@ -29,15 +30,8 @@ mode = "raw"
 [driver]
 kind = "{kind}"
 {options}
-[driver.channels.x]
-input = "{input}"
-output = "{output}"
-um_per_v = 10.0
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [10.0]
+{channel}
+{axis}
 """
 HARDWARE, CONFIGURATION = 69, 78
 
@@ -165,7 +159,8 @@ def written(folder: Path, case: Case) -> tuple[Path, Path]:
         options = {"device": f'"{device}"', "library": f'"{stub_library()}"', **options}
     lines = "\n".join(f"{key} = {value}" for key, value in options.items())
     config = folder / "lab.toml"
-    config.write_text(CONFIG.format(kind=case.kind, options=lines, input=case.channels[0], output=case.channels[1]))
+    text = CONFIG.format(kind=case.kind, options=lines, channel=wired(*case.channels), axis=one_axis())
+    config.write_text(text)
     return config, device
 
 

@@ -12,27 +12,21 @@ from click.testing import CliRunner, Result
 from rtloop.cli import main
 from rtloop.doctor.loopback import measure
 from tests.drivers.comedi_board import new_board, output_v, stub_library
+from tests.one_axis import one_axis, wired
 
 DWELL, SETTLING = 100, 50
 LSB_V = 20.0 / 65535
-CONFIG = """
+CONFIG = f"""
 [loop]
 rate_hz = 1000
 [driver]
 kind = "comedi"
-device = "{device}"
-library = "{library}"
-[driver.channels.x]
-input = "ai0"
-output = "ao0"
-um_per_v = 10.0
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [10.0]
+device = "{{device}}"
+library = "{{library}}"
+{wired("ai0", "ao0")}
+{one_axis()}
 [axis.limits]
-drive_v = {drive_v}
+drive_v = {{drive_v}}
 """
 
 

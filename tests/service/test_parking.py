@@ -20,6 +20,7 @@ from rtloop.drivers.python import PythonDriver
 from rtloop.engine.memory import SharedBlock, Sizes, Word
 from rtloop.errors import UnavailableError
 from rtloop.supervision import parking
+from tests.one_axis import one_axis, wired
 
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
 CLAIM = """
@@ -192,20 +193,13 @@ class OwnWatchdog(Card):
 
 
 SLEW_V_PER_S, STEP_V, DRIVE_V = 50.0, 0.5, 6.5
-CONFIGURATION = """
+CONFIGURATION = f"""
 [loop]
 rate_hz = 100
 [driver]
 kind = "card"
-[driver.channels.x]
-input = "in"
-output = "out"
-um_per_v = 10.0
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
+{wired("in", "out")}
+{one_axis()}
 [axis.limits]
 trip_slew_v_per_s = 50.0
 """
