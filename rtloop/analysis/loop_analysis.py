@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.margins import margins
-from rtloop.analysis.search import reach
 from rtloop.analysis.step_response import step_metrics
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
@@ -54,13 +53,6 @@ class LoopAnalysis:
         return {name: _plain(value) for name, value in values.items()}
 
 
-class Tolerance(NamedTuple):
-    """How far the plant's resonance may move before the loop turns unstable, in percent of its frequency."""
-
-    down_percent: float
-    up_percent: float
-
-
 def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
     """C(s) and D(s) without sampling or delay. Raises ValueError for a plant with direct feedthrough."""
     return _analyse(continuous_loop(controller, plant), 0, times_s)
@@ -75,46 +67,6 @@ def analyse_discrete(
     a plant with direct feedthrough.
     """
     return _analyse(discrete_loop(controller, plant, delay_ticks), delay_ticks, times_s)
-
-
-def resonance_shift_tolerated(
-    controller: Transfer | DiscreteController, plant: Transfer, delay_ticks: int = 0, largest_percent: float = 50.0
-) -> Tolerance:
-    """By how much the plant's most lightly damped pair of poles may move, at constant damping ratio and static gain.
-
-    In continuous time for a Transfer, as it runs for a DiscreteController. (0, 0) if the loop is unstable as it
-    stands; `largest_percent` where no limit is met before it. The instability nearest to the nominal plant counts.
-    """
-
-    def stable(percent: float) -> bool:
-        shifted = with_resonance_shifted(plant, percent)
-        if isinstance(controller, Transfer):
-            return continuous_loop(controller, shifted).is_stable
-        return discrete_loop(controller, shifted, delay_ticks).is_stable
-
-    if not stable(0.0):
-        return Tolerance(0.0, 0.0)
-    return Tolerance(reach(lambda p: stable(-p), largest_percent), reach(stable, largest_percent))
-
-
-def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
-    """The plant with its most lightly damped pole pair's frequency changed, damping ratio and static gain kept.
-
-    Raises ValueError for a plant without complex poles.
-    """
-    lightest = lightest_pair(plant)
-    moved = (plant.poles == lightest) | (plant.poles == np.conj(lightest))
-    factor = 1 + percent / 100
-    gain = plant.gain * factor ** int(moved.sum())
-    return Transfer(plant.zeros, np.where(moved, factor * plant.poles, plant.poles), gain)
-
-
-def lightest_pair(plant: Transfer) -> complex:
-    """The pole of positive imaginary part with the least damping ratio. Raises ValueError where all poles are real."""
-    upper = plant.poles[plant.poles.imag > 0]
-    if not upper.size:
-        raise ValueError("plant: it has no complex poles; at least one resonance is needed")
-    return complex(upper[np.argmin(-upper.real / np.abs(upper))])
 
 
 def _analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float]) -> LoopAnalysis:

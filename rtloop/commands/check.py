@@ -11,13 +11,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rtloop.analysis.loop_analysis import LoopAnalysis, Tolerance, resonance_shift_tolerated
+from rtloop.analysis.loop_analysis import LoopAnalysis
+from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
 from rtloop.commands.design import verified
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import AxisCheck, Prepared, prepare
-from rtloop.design.verification.text import answer
+from rtloop.design.verification.text import answer, span
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
 from rtloop.terminal.table import console as _console
@@ -80,7 +81,7 @@ def _judged(prepared: Prepared, axis: AxisOptions) -> Verification | None:
     return verified(prepared.configuration, axis, None)[0]
 
 
-def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Tolerance]) -> None:
+def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) -> None:
     if check.discrete is None or check.comparison is None:
         console.print("no controller: feedforward, raw and off only")
         return
@@ -96,31 +97,31 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Tolerance]
     table = Table("on the model", "continuous C(s)", "as it runs C(z)", box=None, pad_edge=False, padding=(0, 3, 0, 0))
     for label, show in ROWS:
         table.add_row(label, show(check.continuous), show(check.running))
-    table.add_row("resonance may move by", *(_tolerance(shifts[key]) for key in ("continuous", "running")))
+    if shifts:
+        table.add_row("resonance may move by", *(span(shifts[key]) for key in ("continuous", "running")))
     console.print(table)
 
 
-def _shifts(check: AxisCheck, prepared: Prepared) -> dict[str, Tolerance]:
+def _shifts(check: AxisCheck, prepared: Prepared) -> dict[str, Range]:
     """Shift of the model's resonance that the loop survives."""
     if check.continuous is None or check.controller is None or check.discrete is None:
         return {}
     model = next(axis.model for axis in prepared.configuration.axes if axis.name == check.name)
     assert model is not None
     plant = model.transfer()
+    resonance = changes(plant).get("resonance")
+    if resonance is None:
+        return {}
     return {
-        "continuous": resonance_shift_tolerated(check.controller, plant),
-        "running": resonance_shift_tolerated(check.discrete, plant, model.delay_ticks),
+        "continuous": until_unstable(maker(check.controller), plant, resonance),
+        "running": until_unstable(maker(check.discrete, model.delay_ticks), plant, resonance),
     }
-
-
-def _tolerance(tolerance: Tolerance) -> str:
-    return f"−{abs(tolerance.down_percent):.2f} … +{tolerance.up_percent:.2f} %"
 
 
 def _report(
     prepared: Prepared,
     warnings: list[str],
-    shifts: dict[str, dict[str, Tolerance]],
+    shifts: dict[str, dict[str, Range]],
     judged: dict[str, Verification | None],
 ) -> dict[str, Any]:
     plan = prepared.plan

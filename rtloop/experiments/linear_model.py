@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
-from rtloop.analysis.loop_analysis import lightest_pair, resonance_shift_tolerated, with_resonance_shifted
+from rtloop.analysis.perturbation import Range, changes, lightest_pair, maker, until_unstable, with_resonance_shifted
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions, PrefilterOptions
 from rtloop.hil.modal import Complex, Real
@@ -122,12 +122,12 @@ class LinearModel:
         return discrete_loop(self._controller, shifted, self._delay_ticks).is_stable
 
     @cached_property
-    def tolerated(self) -> tuple[float, float] | None:
-        """Shifts of the resonance in percent, down and up, between which the loop is stable."""
+    def tolerated(self) -> Range | None:
+        """Shifts of the resonance within which the loop is stable."""
         if self._controller is None or not self.resonance_hz:
             return None
-        found = resonance_shift_tolerated(self._controller, self.dynamics, self._delay_ticks)
-        return -found.down_percent, found.up_percent
+        resonance = changes(self.dynamics)["resonance"]
+        return until_unstable(maker(self._controller, self._delay_ticks), self.dynamics, resonance)
 
 
 def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:

@@ -11,9 +11,8 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.loop_analysis import (
     analyse_continuous,
     analyse_discrete,
-    resonance_shift_tolerated,
-    with_resonance_shifted,
 )
+from rtloop.analysis.perturbation import changes, maker, until_unstable, with_resonance_shifted
 from rtloop.analysis.step_response import step_response
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.linear.discretise import discretise
@@ -57,10 +56,10 @@ def test_step_overshoot_of_d_eq_5() -> None:
 
 def test_resonance_shift_tolerated_by_the_paper() -> None:
     """Continuous: −3.9 … +2.4 %. Sampled with delay the loop is narrower upwards."""
-    assert resonance_shift_tolerated(PAPER_C, PAPER_D) == pytest.approx((3.9, 2.4), abs=0.05)
+    assert until_unstable(maker(PAPER_C), PAPER_D, changes(PAPER_D)["resonance"]) == pytest.approx((3.9, 2.4), abs=0.05)
     controller = discretise(PAPER_C, T, "matched")
     for ticks in (0, 1, 2):
-        down, up = resonance_shift_tolerated(controller, PAPER_D, ticks)
+        down, up = until_unstable(maker(controller, ticks), PAPER_D, changes(PAPER_D)["resonance"])
         assert up < 2.0
         assert down > 5.0
         assert analyse_discrete(controller, with_resonance_shifted(PAPER_D, up - 0.01), ticks).stable
@@ -150,7 +149,8 @@ def test_unstable_loop_is_reported_not_raised() -> None:
     assert math.isnan(analysis.settling_time_s)
     assert math.isnan(analysis.peak_command)
     assert json.loads(json.dumps(analysis.as_dict(), allow_nan=False))["settling_time_s"] is None
-    assert resonance_shift_tolerated(PAPER_C, with_resonance_shifted(PAPER_D, 5.0)) == (0.0, 0.0)
+    shifted = with_resonance_shifted(PAPER_D, 5.0)
+    assert until_unstable(maker(PAPER_C), shifted, changes(shifted)["resonance"]) == (0.0, 0.0)
 
 
 def test_undamped_plant_can_be_looked_at() -> None:

@@ -11,20 +11,13 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
+from rtloop.analysis.perturbation import changes as robust_changes
+from rtloop.analysis.perturbation import maker, until_unstable, with_damping_changed, with_gain_changed
 from rtloop.cli import main
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit, described, held_up_to, specified
-from rtloop.design.verification.robustness import changes as robust_changes
-from rtloop.design.verification.robustness import (
-    delay_margin_us,
-    delay_ticks_tolerated,
-    maker,
-    until_missed,
-    until_unstable,
-    with_damping_changed,
-    with_gain_changed,
-)
+from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from rtloop.analysis.perturbation import Range
 from rtloop.design.verification.judgement import Limit
-from rtloop.design.verification.robustness import Range
 from rtloop.design.verification.verify import Row, Verification
 
 HEADINGS = ("", "required", "continuous C(s)", "", "as it runs C(z)", "", "its source says")
@@ -81,7 +81,7 @@ def shifts(found: Verification) -> list[tuple[str, str]]:
 
 
 def span(found: Range | None) -> str:
-    """ "−3.9 … +2.4 %"; an end that was not found is left open."""
+    """Downwards … upwards; an end that was not found is left open."""
     if found is None:
         return "nothing is met"
     if found == Range(0.0, 0.0):

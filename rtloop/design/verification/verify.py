@@ -14,20 +14,13 @@ from typing import Any, NamedTuple
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.comparison import compare
+from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
 from rtloop.design.synthesis.augment import augmented
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions, weights_of
 from rtloop.design.synthesis.synthesise import weighted_norm
 from rtloop.design.synthesis.weights import Weights
 from rtloop.design.verification.judgement import Limit, described, limits, specified
-from rtloop.design.verification.robustness import (
-    Range,
-    changes,
-    delay_margin_us,
-    delay_ticks_tolerated,
-    maker,
-    until_missed,
-    until_unstable,
-)
+from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 
@@ -148,14 +141,15 @@ def _robustness(
     ranges: dict[str, dict[str, Range | None]] = {}
     shifts: dict[str, Range] = {}
     for name, change in changes(plant).items():
+        modelled = until_unstable(on_paper, plant, change)
         ranges[name] = {
-            "continuous": until_unstable(on_paper, plant, change),
+            "continuous": modelled,
             "running": until_unstable(runs, sensed, change),
             "running_missed": until_missed(runs, sensed, change, design.specification, met) if met else None,
         }
         if name == "resonance":
-            shifts = {str(ticks): until_unstable(maker(discrete, ticks), sensed, change) for ticks in DELAYS}
-            shifts = {"continuous": until_unstable(on_paper, plant, change), **shifts}
+            delayed = {str(ticks): until_unstable(maker(discrete, ticks), sensed, change) for ticks in DELAYS}
+            shifts = {"continuous": modelled, **delayed}
     more = delay_ticks_tolerated(discrete, sensed) - delay_ticks
     return Robustness(ranges, shifts, delay_margin_us(on_paper(plant)), more)
 

@@ -1,0 +1,113 @@
+"""How far a plant may move away from its model before something fails: resonance, damping, gain, one at a time.
+
+A change of gain stands for D(0), the sensor's scale and all hysteresis weights together: the slope of P∘P̂⁻¹ is a
+factor in the loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.search import reach
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.transfer import Transfer
+
+Maker = Callable[[Transfer], Loop]
+"""The loop of one controller with any plant."""
+
+
+class Range(NamedTuple):
+    """Percent downwards and upwards; `None` where the direction's end was reached without a failure."""
+
+    down: float | None
+    up: float | None
+
+
+class Change(NamedTuple):
+    """`apply(plant, percent)`; the search ends at `down` and `up` percent and takes steps of `step`."""
+
+    apply: Callable[[Transfer, float], Transfer]
+    down: float
+    up: float
+    step: float
+
+
+def maker(controller: Transfer | DiscreteController, delay_ticks: int = 0) -> Maker:
+    """Loops of one controller with any plant, in continuous time or as it runs."""
+    if isinstance(controller, Transfer):
+        return lambda plant: continuous_loop(controller, plant)
+    return lambda plant: discrete_loop(controller, plant, delay_ticks)
+
+
+def until_unstable(make: Maker, plant: Transfer, change: Change) -> Range:
+    """The range over which `make(plant)` stays stable; (0, 0) if it is not as it stands."""
+    return until_bad(lambda moved: make(moved).is_stable, plant, change)
+
+
+def until_bad(
+    good: Callable[[Transfer], bool], plant: Transfer, change: Change, coarse: float = 1.0, tolerance: float = 1e-4
+) -> Range:
+    """The range over which `good(plant)` holds; (0, 0) if it does not as it stands. Nearest failures count."""
+    if not good(plant):
+        return Range(0.0, 0.0)
+    ends = []
+    for sign, largest in ((-1, change.down), (1, change.up)):
+        found = reach(
+            lambda percent, sign=sign: good(change.apply(plant, sign * percent)),
+            largest, coarse * change.step, tolerance,
+        )  # fmt: skip
+        ends.append(None if found >= largest else found)
+    return Range(*ends)
+
+
+def with_gain_changed(plant: Transfer, percent: float) -> Transfer:
+    """The plant with another gain."""
+    return Transfer(plant.zeros, plant.poles, plant.gain * (1 + percent / 100))
+
+
+def with_damping_changed(plant: Transfer, percent: float) -> Transfer:
+    """The plant with the damping ratio of its most lightly damped pair of poles changed; |pole| and D(0) are kept."""
+    pair = lightest_pair(plant)
+    size, damping = abs(pair), -pair.real / abs(pair) * (1 + percent / 100)
+    moved = size * complex(-damping, math.sqrt(1 - damping**2))
+    poles = np.where(plant.poles == pair, moved, np.where(plant.poles == np.conj(pair), np.conj(moved), plant.poles))
+    return Transfer(plant.zeros, poles, plant.gain)
+
+
+def changes(plant: Transfer) -> dict[str, Change]:
+    """What may move: the resonance, if there is one, its damping, the gain."""
+    found = {"gain": Change(with_gain_changed, 99.9, 900.0, 10.0)}
+    if np.any(plant.poles.imag > 0):
+        pair = lightest_pair(plant)
+        most = 100 * (0.999 * abs(pair) / -pair.real - 1) if pair.real < 0 else 0.0
+        found = {
+            "resonance": Change(with_resonance_shifted, 50.0, 50.0, 0.25),
+            "damping": Change(with_damping_changed, 99.9, min(900.0, most), 10.0),
+            **found,
+        }
+    return found
+
+
+def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
+    """The plant with its most lightly damped pole pair's frequency changed, damping ratio and static gain kept.
+
+    Raises ValueError for a plant without complex poles.
+    """
+    lightest = lightest_pair(plant)
+    moved = (plant.poles == lightest) | (plant.poles == np.conj(lightest))
+    factor = 1 + percent / 100
+    gain = plant.gain * factor ** int(moved.sum())
+    return Transfer(plant.zeros, np.where(moved, factor * plant.poles, plant.poles), gain)
+
+
+def lightest_pair(plant: Transfer) -> complex:
+    """The pole of positive imaginary part with the least damping ratio. Raises ValueError where all poles are real."""
+    upper = plant.poles[plant.poles.imag > 0]
+    if not upper.size:
+        raise ValueError("plant: it has no complex poles; at least one resonance is needed")
+    return complex(upper[np.argmin(-upper.real / np.abs(upper))])
