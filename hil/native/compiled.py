@@ -22,10 +22,31 @@ import llvmlite
 import llvmlite.binding
 import numba
 import numba.extending
+import numba.np.linalg
 from numba import config as numba_config
 
 from rtloop.hil.trusted import open_folder
 
+
+def _load_arrays_without_blas() -> None:
+    """Load numba's array functions but not scipy.linalg, which they try to: a quarter of the start of a loop's process.
+
+    No kernel here uses linear algebra. Whose does finds it as ever: scipy is required, and imported where it is used.
+    """
+    asked = numba.np.linalg.ensure_blas
+    numba.np.linalg.ensure_blas = _absent  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        from numba.np import arraymath
+    finally:
+        numba.np.linalg.ensure_blas = asked
+    arraymath._HAVE_BLAS = True
+
+
+def _absent() -> None:
+    raise ImportError
+
+
+_load_arrays_without_blas()
 PACKAGE = Path(__file__).parents[2]
 KERNELS = ("hil", "drivers", "law", "engine", "signals.py")
 """Where compiled code, and what it is made from, may stand."""
