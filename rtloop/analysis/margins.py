@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.search import zero_between
 from rtloop.hil.modal import Complex, Real
 
 
@@ -39,12 +40,12 @@ def crossings(loop: Loop) -> list[float]:
     """Frequencies in Hz at which |L| = 1, rising."""
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
-    return [_between(lambda f: np.abs(loop.open(f)) - 1, *ends) for ends in changes]
+    return [zero_between(lambda f: np.abs(loop.open(f)) - 1, *ends) for ends in changes]
 
 
 def _gain_margin(loop: Loop, hz: Real, response: Complex) -> tuple[float, float]:
     """Where L is real, negative and above −1: inside the grid and at its ends, where symmetry makes L(z = ±1) real."""
-    found = [_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))]
+    found = [zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))]
     values = [(complex(loop.open(f)[0]), f) for f in found]
     values.append((complex(loop.static_gain), 0.0))
     if loop.period_s is not None:
@@ -57,16 +58,6 @@ def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
     """Neighbours on the grid between which `values` changes its sign."""
     at = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
     return [(float(hz[i]), float(hz[i + 1])) for i in at]
-
-
-def _between(function: Callable[[Real], Real], low: float, high: float) -> float:
-    """A zero of `function` between two points where its signs differ: the interval, cut into 32, ten times."""
-    for _ in range(10):
-        hz = np.linspace(low, high, 33)
-        negative = function(hz) < 0
-        i = int(np.argmax(negative[1:] != negative[0]))
-        low, high = float(hz[i]), float(hz[i + 1])
-    return 0.5 * (low + high)
 
 
 def _highest(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:

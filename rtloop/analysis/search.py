@@ -1,8 +1,12 @@
-"""How far something may go before it fails."""
+"""How far something may go before it fails, and where a function changes its sign."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+
+import numpy as np
+
+from rtloop.hil.modal import Real
 
 GROWTH = 1.1
 """Far from the model nobody asks to a quarter of a percent, and a loop that tolerates much would take minutes."""
@@ -25,3 +29,13 @@ def reach(holds: Callable[[float], bool], largest: float, step: float, tolerance
         middle = 0.5 * (low + high)
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
+
+
+def zero_between(function: Callable[[Real], Real], low: float, high: float) -> float:
+    """A zero of `function`, of many points at once, between two where its signs differ: cut in 32, ten times."""
+    for _ in range(10):
+        points = np.linspace(low, high, 33)
+        negative = function(points) < 0
+        i = int(np.argmax(negative[1:] != negative[0]))
+        low, high = float(points[i]), float(points[i + 1])
+    return 0.5 * (low + high)

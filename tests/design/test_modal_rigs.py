@@ -12,6 +12,7 @@ from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import prepare
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.experiments import theme
 from rtloop.experiments.derive import derived
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.experiments.report import report, take
@@ -41,7 +42,7 @@ def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
     assert all(abs(distances[name]) <= limit for name, limit in LIMITS.items()), distances
 
 
-def test_the_stage_of_ones_own_keeps_its_specification(tmp_path) -> None:
+def test_the_stage_of_ones_own_keeps_its_specification(tmp_path, monkeypatch) -> None:
     """deploy/own-stage*.toml, as docs/identification.md walks through them: every command ends with 0."""
     recordings = [
         record(tmp_path / f"{name}.mcap", (DEPLOY / f"{name}.toml").read_text(encoding="utf-8"), ticks)[0]
@@ -58,6 +59,7 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path) -> None:
     assert axis.interlocks.oscillation_swings > 0
     trips, _ = run(out, prepare(load(out)).checks[0].running)
     assert trips == []
+    monkeypatch.setattr(theme, "THEMES", {"light": theme.LIGHT})  # both are drawn where a report is looked at
     _experiments_speak_of_the_stage_alone(load(out), tmp_path)
 
 

@@ -10,6 +10,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import margins
+from rtloop.analysis.search import zero_between
 from rtloop.analysis.step_response import step_metrics
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 
@@ -86,11 +87,7 @@ def held_up_to(loop: Loop, level: float) -> float:
         return math.inf
     if above[0] == 0:
         return float(hz[0])
-    low, high = float(hz[above[0] - 1]), float(hz[above[0]])
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if loop.sensitivity(middle)[0] <= level else (low, middle)
-    return low
+    return zero_between(lambda f: loop.sensitivity(f) - level, float(hz[above[0] - 1]), float(hz[above[0]]))
 
 
 def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
