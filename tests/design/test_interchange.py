@@ -1,0 +1,83 @@
+"""Systems of python-control, out and in: the same responses, and a clear word for what cannot be taken over."""
+
+import sys
+
+import control
+import numpy as np
+import pytest
+
+from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
+from rtloop.design.identification.frequency_response import FrequencyResponse
+from rtloop.design.interchange import from_control, to_control
+from rtloop.design.paper import PAPER_C, PAPER_D
+from rtloop.errors import MissingExtra
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
+
+HZ = np.geomspace(0.1, 4900, 100)
+S = 2j * np.pi * HZ
+RUNNING = discretise(PAPER_C, 1e-4)
+GAIN, INTEGRATOR = Transfer.from_zpk([], [], 3.0), Transfer.from_zpk([], [0.0], 2.0)
+
+
+@pytest.mark.parametrize("system", [PAPER_C, PAPER_D, GAIN, INTEGRATOR])
+def test_a_system_in_s_goes_out_and_comes_back(system) -> None:
+    there = to_control(system)
+    assert there(S) == pytest.approx(system.response(S), rel=1e-11)
+    back = from_control(there)
+    assert back.response(S) == pytest.approx(system.response(S), rel=1e-9)
+    assert back.order == system.order
+
+
+def test_the_controller_that_runs_goes_out_at_its_period() -> None:
+    there = to_control(RUNNING)
+    assert there.dt == 1e-4
+    assert there(np.exp(S * 1e-4)) == pytest.approx(RUNNING.response(HZ), rel=1e-12)
+
+
+def test_a_loop_goes_out_cut_open_and_with_its_delay() -> None:
+    assert to_control(continuous_loop(PAPER_C, PAPER_D))(S) == pytest.approx(
+        PAPER_C.response(S) * PAPER_D.response(S), rel=1e-10
+    )
+    late, prompt = (to_control(discrete_loop(RUNNING, PAPER_D, ticks)) for ticks in (2, 0))
+    z = np.exp(S * 1e-4)
+    assert late(z) == pytest.approx(prompt(z) / z**2, rel=1e-8)
+
+
+def test_a_quotient_of_polynomials_comes_in() -> None:
+    found = from_control(control.tf([3.0, 6.0], [1.0, 2.0, 26.0]))
+    assert found.zeros == pytest.approx([-2.0])
+    assert sorted(found.poles, key=lambda pole: pole.imag) == pytest.approx([-1 - 5j, -1 + 5j])
+    assert found.gain == 3.0
+
+
+def test_a_measured_response_goes_out_and_comes_back() -> None:
+    measured = FrequencyResponse(HZ, PAPER_D.response(S), np.full(HZ.size, 0.99))
+    there = to_control(measured)
+    assert isinstance(there, control.FrequencyResponseData)
+    assert there.omega == pytest.approx(2 * np.pi * HZ)
+    back = from_control(there)
+    assert back.hz == pytest.approx(HZ, rel=1e-15)
+    assert back.response.tobytes() == measured.response.tobytes()
+    assert back.trusted.all()
+
+
+@pytest.mark.parametrize(
+    ("system", "said"),
+    [
+        (control.ss(-np.eye(2), np.eye(2), np.eye(2), 0 * np.eye(2)), "2 inputs and 2 outputs; one of each"),
+        (control.tf([1.0], [1.0, -0.5], 0.1), r"dt = 0.1: in discrete time; continuous time \(dt = 0\) is allowed"),
+        (control.tf([1.0, 0.0, 0.0], [1.0, 1.0]), "improper: 2 zeros but 1 poles"),
+        (PAPER_C, "Transfer: not a system that can be taken over; StateSpace, "),
+        (control.tf([np.nan], [1.0, 1.0]), "not finite"),
+    ],
+)
+def test_what_cannot_be_taken_over_is_named(system, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        from_control(system)
+
+
+def test_without_the_library(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'rtloop\[design\]'"):
+        to_control(PAPER_C)

@@ -1,0 +1,102 @@
+"""python-control and SLICOT as referees: margins, norms, sampling, reduction, of the paper's systems and random ones.
+
+γ of the synthesis has its own comparison with SLICOT in `test_hinf`.
+"""
+
+import control
+import numpy as np
+import pytest
+
+from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
+from rtloop.analysis.margins import margins
+from rtloop.design.interchange import from_control, to_control
+from rtloop.design.paper import PAPER_C, PAPER_D
+from rtloop.design.synthesis.augment import Matrices, augmented
+from rtloop.design.synthesis.hinf import synthesise_hinf
+from rtloop.design.synthesis.norm import hinf_norm
+from rtloop.design.synthesis.reduce import reduce_order
+from rtloop.design.synthesis.weights import PAPER_WEIGHTS
+from rtloop.linear.discretise import discretise, discretised
+from rtloop.linear.transfer import Transfer
+
+PERIOD_S = 1e-4
+ONE = control.ss([], [], [], [[1.0]])
+
+
+def drawn(seed: int, **kind: bool) -> control.StateSpace:
+    """A stable system of 2 to 8 states."""
+    np.random.seed(seed)  # python-control draws from numpy's own stream
+    return control.rss(2 + seed % 7, **kind)
+
+
+def summary(system: control.StateSpace) -> tuple[float, float, float, float]:
+    """As `margins` puts it: lowest crossover in Hz, smallest phase margin, smallest factor > 1, max |S|."""
+    gains, phases, moduli, _, crossovers, _ = control.stability_margins(system, returnall=True)
+    return (
+        min(crossovers, default=np.nan) / (2 * np.pi),
+        np.min(np.abs(phases), initial=np.inf),
+        min(gains[gains > 1], default=np.inf),
+        1 / min(moduli, default=np.inf),
+    )
+
+
+def ours(loop) -> tuple[float, float, float, float]:
+    found = margins(loop)
+    return found.crossover_hz, found.phase_margin_deg, found.gain_margin, found.max_sensitivity
+
+
+def test_the_papers_margins() -> None:
+    loop = continuous_loop(PAPER_C, PAPER_D)
+    assert ours(loop) == pytest.approx(summary(to_control(loop)), rel=1e-9)
+
+
+@pytest.mark.parametrize("delay_ticks", [0, 1, 3])
+def test_the_papers_margins_as_it_runs(delay_ticks) -> None:
+    """Sampled, python-control interpolates along a grid of frequencies; polynomials in z would be too bad for it."""
+    loop = discrete_loop(discretise(PAPER_C, PERIOD_S), PAPER_D, delay_ticks)
+    grid = control.frd(to_control(loop), np.geomspace(100.0, 5000.0, 3000))
+    assert ours(loop) == pytest.approx(summary(grid), rel=2e-5)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_margins_of_random_loops(seed) -> None:
+    controller, plant = from_control(drawn(seed)), from_control(drawn(seed + 100, strictly_proper=True))
+    loop = continuous_loop(controller, plant)
+    crossover, phase, gain, peak = summary(to_control(controller) * to_control(plant))
+    assert ours(loop)[3] >= (1 - 1e-9) * peak  # python-control looks for local minima of |1 + L|, and not at its ends
+    assert ours(loop)[:3] == pytest.approx((crossover, phase, gain), rel=1e-6, nan_ok=True)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_norms_of_random_systems(seed) -> None:
+    """SLICOT's AB13DD, to ten digits."""
+    system = drawn(seed)
+    found = hinf_norm(Matrices(system.A, system.B, system.C, system.D)).norm
+    assert found == pytest.approx(control.linfnorm(system)[0], rel=5e-6)
+
+
+def test_the_norm_of_the_papers_sensitivity() -> None:
+    loop = continuous_loop(PAPER_C, PAPER_D)
+    norm, omega = control.linfnorm(control.feedback(ONE, to_control(loop)))
+    assert norm == pytest.approx(1.66854, abs=1e-5)
+    assert margins(loop).max_sensitivity == pytest.approx(norm, rel=1e-9)
+    assert margins(loop).max_sensitivity_hz == pytest.approx(omega / (2 * np.pi), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", [None, *range(20)])
+def test_zero_order_hold(seed) -> None:
+    """From a state space; from expanded polynomials python-control itself is off by 0.01 to 2 % on eq (5)."""
+    plant = PAPER_D if seed is None else from_control(drawn(seed, strictly_proper=True))
+    period_s = PERIOD_S if seed is None else 0.05
+    there = control.c2d(to_control(plant), period_s, "zoh")
+    z = np.exp(2j * np.pi * np.geomspace(1e-4, 0.49, 200))
+    assert discretised(plant, period_s, "zoh").system.response(z) == pytest.approx(there(z), rel=1e-10)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [("truncate", "truncate"), ("residualise", "matchdc")])
+def test_reduction_of_the_papers_controller_to_order_5(ours, theirs) -> None:
+    found = synthesise_hinf(augmented(PAPER_D, PAPER_WEIGHTS)).controller
+    full = Transfer.from_state_space(found.a, found.b, found.c, found.d)
+    there = control.balred(to_control(full), 5, method=theirs)
+    s = 2j * np.pi * np.geomspace(0.01, 2e4, 400)
+    assert reduce_order(full, 5, ours).transfer.response(s) == pytest.approx(there(s), rel=1e-10)
