@@ -42,7 +42,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     warnings = [*prepared.warnings, *cautions(prepared)]
     if strict and warnings:
         raise ConfigError(str(config), warnings)
-    shifts = {check.name: _shifts(check, prepared) for check in prepared.checks}
+    shifts = {check.name: _shifts(check) for check in prepared.checks}
     judged = {axis.name: _judged(prepared, axis) for axis in prepared.configuration.axes}
     if as_json:
         click.echo(json.dumps(_report(prepared, warnings, shifts, judged)))
@@ -102,19 +102,16 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) ->
     console.print(table)
 
 
-def _shifts(check: AxisCheck, prepared: Prepared) -> dict[str, Range]:
+def _shifts(check: AxisCheck) -> dict[str, Range]:
     """Shift of the model's resonance that the loop survives."""
-    if check.continuous is None or check.controller is None or check.discrete is None:
+    if check.controller is None or check.discrete is None or check.plant is None or check.running is None:
         return {}
-    model = next(axis.model for axis in prepared.configuration.axes if axis.name == check.name)
-    assert model is not None
-    plant = model.transfer()
-    resonance = changes(plant).get("resonance")
+    resonance = changes(check.plant).get("resonance")
     if resonance is None:
         return {}
     return {
-        "continuous": until_unstable(maker(check.controller), plant, resonance),
-        "running": until_unstable(maker(check.discrete, model.delay_ticks), plant, resonance),
+        "continuous": until_unstable(maker(check.controller), check.plant, resonance),
+        "running": until_unstable(maker(check.discrete, check.running.delay_ticks), check.plant, resonance),
     }
 
 

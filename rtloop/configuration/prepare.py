@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +15,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import axis_coefficients, joined
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
-from rtloop.drivers.base import Channel, Driver, Facts, index_of
+from rtloop.drivers.base import Channel, Facts, index_of
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
@@ -41,6 +42,7 @@ class AxisCheck:
     controller: Transfer | None = None
     discrete: DiscreteController | None = None
     comparison: Comparison | None = None
+    plant: Transfer | None = None
     continuous: LoopAnalysis | None = None
     running: LoopAnalysis | None = None
 
@@ -61,25 +63,22 @@ class _Findings:
     faults: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    def attempt(self, where: str, build: Callable[[], Any]) -> Any:
-        """The result of `build`, or None with its ValueError as a fault at `where`."""
+    @contextmanager
+    def at(self, where: str) -> Iterator[None]:
+        """A ValueError raised within is a fault at `where`, and what follows goes on."""
         try:
-            return build()
+            yield
         except ValueError as error:
             self.faults.append(f"{where}{error}")
-            return None
 
 
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
     """Build law, references and schedule. Raises ConfigError with all faults, DriverError for a missing library."""
     findings, rate_hz = _Findings(), configuration.loop.rate_hz
-    driver = findings.attempt("driver.", lambda: _driver(configuration))
-    facts = driver and findings.attempt("", lambda: require_facts(driver, rate_hz, paced))
-    if facts is None:
-        raise ConfigError(configuration.source, findings.faults)
+    facts = _facts(configuration, paced, findings)
     if configuration.loop.enable_input is not None:
-        enable_input = configuration.loop.enable_input
-        findings.attempt("loop.enable_input: ", lambda: index_of(facts.inputs, enable_input))
+        with findings.at("loop.enable_input: "):
+            index_of(facts.inputs, configuration.loop.enable_input)
     checks, coefficients = [], []
     for axis in configuration.axes:
         check = _check(axis, 1.0 / rate_hz, findings)
@@ -112,12 +111,18 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
 
 
-def _driver(configuration: Configuration) -> Driver:
-    kind = driver_class(configuration.driver_kind)
+def _facts(configuration: Configuration, paced: bool, findings: _Findings) -> Facts:
+    """What the driver says of itself. Raises ConfigError where it cannot be made: nothing else can be judged then."""
+    rate_hz = configuration.loop.rate_hz
     try:
-        return kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
+        with findings.at("driver."):
+            kind = driver_class(configuration.driver_kind)
+            driver = kind(configuration.driver_options, configuration.wiring, rate_hz)
+            with findings.at(""):
+                return require_facts(driver, rate_hz, paced)
     except DriverError as error:
-        raise ConfigError(configuration.source, [f"driver: {error}"]) from None
+        findings.faults.append(f"driver: {error}")
+    raise ConfigError(configuration.source, findings.faults)
 
 
 def _pacing(configuration: Configuration, paced: bool) -> Pacing:
@@ -144,9 +149,9 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
         return AxisCheck(axis.name)
     where, options = f"axis.{axis.name}.controller", axis.controller
     transfer = options.transfer()
-    discrete = findings.attempt(
-        f"{where}: ", lambda: discretise(transfer, period_s, options.method, options.prewarp_hz)
-    )
+    discrete = None
+    with findings.at(f"{where}: "):
+        discrete = discretise(transfer, period_s, options.method, options.prewarp_hz)
     if discrete is None:
         return AxisCheck(axis.name, transfer)
     comparison = compare(transfer, discrete, up_to_hz=COMPARED_PART / period_s)
@@ -154,12 +159,10 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
     if axis.model is None:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
         return AxisCheck(axis.name, transfer, discrete, comparison)
-    plant = axis.model.transfer()
-    continuous = findings.attempt(f"axis.{axis.name}.model: ", lambda: analyse_continuous(transfer, plant))
-    running = findings.attempt(
-        f"axis.{axis.name}.model: ",
-        lambda: analyse_discrete(discrete, plant, axis.model.delay_ticks if axis.model else 0),
-    )
+    plant, continuous, running = axis.model.transfer(), None, None
+    with findings.at(f"axis.{axis.name}.model: "):
+        continuous = analyse_continuous(transfer, plant)
+        running = analyse_discrete(discrete, plant, axis.model.delay_ticks)
     if running is not None and not running.stable:
         message_ = (
             f"{where}: the loop is unstable on axis.{axis.name}.model at {1 / period_s:g} Hz "
@@ -169,7 +172,7 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
             findings.warnings.append(message_)
         else:
             findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
-    return AxisCheck(axis.name, transfer, discrete, comparison, continuous, running)
+    return AxisCheck(axis.name, transfer, discrete, comparison, plant, continuous, running)
 
 
 def _coefficients(
@@ -180,23 +183,17 @@ def _coefficients(
     findings: _Findings,
 ) -> Records | None:
     channel, where = configuration.channels[axis.name], f"driver.channels.{axis.name}."
-    source = findings.attempt(where + "input: ", lambda: index_of(facts.inputs, channel.input))
-    sink = findings.attempt(where + "output: ", lambda: index_of(facts.outputs, channel.output))
-    if source is None or sink is None:
+    output: Channel | None = None
+    with findings.at(where + "input: "):
+        index_of(facts.inputs, channel.input)
+    with findings.at(where + "output: "):
+        output = facts.outputs[index_of(facts.outputs, channel.output)]
+    if output is None:
         return None
-    output: Channel = facts.outputs[sink]
-    return findings.attempt(
-        f"axis.{axis.name}.",
-        lambda: axis_coefficients(
-            axis,
-            discrete,
-            channel.um_per_v,
-            channel.offset,
-            output,
-            1.0 / configuration.loop.rate_hz,
-            enable=configuration.loop.enable_input is not None,
-        ),
-    )
+    with findings.at(f"axis.{axis.name}."):
+        period_s, enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
+        return axis_coefficients(axis, discrete, channel.um_per_v, channel.offset, output, period_s, enable=enable)
+    return None
 
 
 def _uses_closed_loop(configuration: Configuration) -> bool:
@@ -209,13 +206,10 @@ def _generators(
 ) -> np.ndarray[Any, Any]:
     generators = np.zeros(len(configuration.axes), GENERATOR)
     for i, axis in enumerate(configuration.axes):
-        values = findings.attempt(
-            f"axis.{axis.name}.reference.",
-            lambda axis=axis: generator_values(
+        with findings.at(f"axis.{axis.name}.reference."):
+            values = generator_values(
                 axis.reference, configuration.loop.rate_hz, facts.inputs, configuration.folder, table
-            ),
-        )
-        if values is not None:
+            )
             generators["kind"][i] = values[0]
             generators["volts"][i] = configuration.loop.mode == "raw"
             generators["parameters"][i, : len(values) - 1] = values[1:]
@@ -230,12 +224,8 @@ def _schedule(
     entries = sorted(configuration.schedule, key=lambda entry: entry.at_tick)
     commands = [np.zeros(0, MESSAGE)]
     for entry in entries:
-        built = findings.attempt(
-            f"schedule, at_tick {entry.at_tick}: ",
-            lambda entry=entry: _command(entry, names, configuration, facts, table),
-        )
-        if built is not None:
-            commands.append(built)
+        with findings.at(f"schedule, at_tick {entry.at_tick}: "):
+            commands.append(_command(entry, names, configuration, facts, table))
     return np.concatenate(commands)
 
 

@@ -29,13 +29,13 @@ class AxisDelay:
 def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     """For each axis that has a controller and a model: 360° · f · lateness."""
     delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
-    for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
-        if check.discrete is None or axis.model is None or check.running is None or not check.running.stable:
+    for check in prepared.checks:
+        if check.discrete is None or check.plant is None or check.running is None or not check.running.stable:
             continue
-        loop = discrete_loop(check.discrete, axis.model.transfer(), axis.model.delay_ticks)
+        loop = discrete_loop(check.discrete, check.plant, check.running.delay_ticks)
         tolerated_s, hz = delay_tolerated(loop)
         p50_deg, p99_deg = (360 * hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
-        delays.append(AxisDelay(axis.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
+        delays.append(AxisDelay(check.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
     return delays
 
 
