@@ -31,7 +31,7 @@ from rtloop.design.identification.measured import Measured, UnsuitableData, nois
 from rtloop.design.synthesis.section import controller_section
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
-from rtloop.design.toml_text import section
+from rtloop.design.toml_text import edited
 from rtloop.hysteresis.plays import model_output
 from rtloop.law.hysteresis import PlayModel
 
@@ -104,13 +104,13 @@ def configuration_text(
     }
     chosen = _chosen(raw["axis"], axis)
     parts["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), chain.dynamics, step.period_s)
-    raw["axis"] = [_replaced(one, parts) if one is chosen else one for one in raw["axis"]]
+    raw["axis"] = [{**one, **parts} if one is chosen else one for one in raw["axis"]]
     heading = [
         *hysteresis_provenance(chain.hysteresis, [hysteresis]),
         *dynamics_provenance(chain.dynamics, step, "hysteresis"),
         *comments,
     ]
-    return section("", raw, heading)
+    return edited(step.configuration, raw, heading)
 
 
 def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
@@ -127,9 +127,3 @@ def _section(content: str, name: str) -> Any:
 
 def _chosen(axes: list[Any], name: str | None) -> Any:
     return next(one for one in axes if name in (None, one["name"]))
-
-
-def _replaced(axis: Mapping[str, Any], parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain keys first: TOML has no way back from a table to its parent."""
-    merged = {**axis, **parts}
-    return dict(sorted(merged.items(), key=lambda item: isinstance(item[1], Mapping)))

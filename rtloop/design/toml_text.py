@@ -1,48 +1,84 @@
-"""TOML text from plain values: numbers are written so that reading them gives the same bits."""
+"""TOML from plain values: numbers are written so that reading them gives the same bits."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import AoT, Array, Item, Table
+
+WIDTH = 90
+"""Lists that are longer have a line for each entry."""
 
 
 def section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
     """`[name]` with its keys, below comment lines; tables within follow as sections, lists of tables as [[…]]."""
-    lines = [f"# {comment}\n" for comment in comments]
-    inner = {key: value for key, value in values.items() if isinstance(value, Mapping) or _is_tables(value)}
-    own = {key: value for key, value in values.items() if key not in inner}
-    if name and (own or not inner):
-        lines.append(f"[{name}]\n")
-    lines += [f"{key} = {text(value)}\n" for key, value in own.items()]
-    for key, value in inner.items():
-        path = f"{name}.{key}" if name else key
-        if isinstance(value, Mapping):
-            lines.append("\n" + section(path, value))
+    document = tomlkit.document()
+    for comment in comments:
+        document.add(tomlkit.comment(comment))
+    found: Mapping[str, Any] = values
+    for part in reversed(name.split(".") if name else []):
+        found = {part: found}
+    for key, value in _plain_first(found):
+        document.add(key, item(value))
+    return document.as_string()
+
+
+def edited(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
+    """`text` changed so that it says `values`, with its own comments kept, below `comments`.
+
+    Where its form does not let it be changed in place, the values alone.
+    """
+    heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
+    try:
+        document = tomlkit.parse(text)
+        _update(document, values)
+        found = f"{heading}\n{document.as_string()}"
+        if tomllib.loads(found) == values:
+            return found
+    except (TOMLKitError, tomllib.TOMLDecodeError):
+        pass
+    return section("", values, comments)
+
+
+def _update(table: Any, values: Mapping[str, Any]) -> None:
+    for key in [key for key in table if key not in values]:
+        table.remove(key)
+    for key, value in _plain_first(values):
+        old = table.get(key)
+        if key in table and old == value:
             continue
-        for item in value:
-            lines.append("\n" + section(path, item).replace(f"[{path}]", f"[[{path}]]", 1))
-    return "".join(lines).replace("\n\n\n", "\n\n")
+        if isinstance(old, MutableMapping) and isinstance(value, Mapping):
+            _update(old, value)
+        elif isinstance(old, AoT) and _is_tables(value) and len(old) == len(value):
+            for one, wanted in zip(old, value, strict=True):
+                _update(one, wanted)
+        else:
+            table[key] = made = item(value)
+            if isinstance(made, Table):
+                made.add(tomlkit.nl())
 
 
-def text(value: Any) -> str:
-    """One value. Inline tables for mappings within lists and values."""
-    if isinstance(value, bool | np.bool_):
-        return "true" if value else "false"
-    if isinstance(value, int | np.integer):
-        return str(int(value))
-    if isinstance(value, float | np.floating):
-        return repr(float(value))
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
+def item(value: Any) -> Item:
+    """A value as it stands in a file; in lists, a mapping is an inline table."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {text(item)}" for key, item in value.items()) + " }"
-    items = [text(item) for item in value]
-    joined = ", ".join(items)
-    return f"[{joined}]" if len(joined) < 90 else "[\n" + "".join(f"    {item},\n" for item in items) + "]"
+        table = tomlkit.table(is_super_table=bool(value) and all(map(_is_table, value.values())))
+        for key, within in _plain_first(value):
+            table.add(key, item(within))
+        return table
+    if _is_tables(value):
+        tables = tomlkit.aot()
+        for one in value:
+            tables.append(_table(one))
+        return tables
+    if isinstance(value, list | tuple | np.ndarray):
+        return _array(value)
+    return tomlkit.item(value.item() if isinstance(value, np.generic) else value)
 
 
 def roots(values: npt.NDArray[np.complex128]) -> list[list[float]]:
@@ -50,5 +86,42 @@ def roots(values: npt.NDArray[np.complex128]) -> list[list[float]]:
     return [[float(value.real), float(value.imag)] for value in values]
 
 
+def _table(values: Mapping[str, Any]) -> Table:
+    table = tomlkit.table()
+    for key, value in _plain_first(values):
+        table.add(key, item(value))
+    return table
+
+
+def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
+    array = tomlkit.array()
+    for value in values:
+        array.append(_within(value))
+    return array.multiline(len(array.as_string()) > WIDTH)
+
+
+def _inline(values: Mapping[str, Any]) -> Item:
+    table = tomlkit.inline_table()
+    for key, value in values.items():
+        table.append(key, _within(value))
+    return table
+
+
+def _within(value: Any) -> Item:
+    """A value in a list or an inline table."""
+    if isinstance(value, Mapping):
+        return _inline(value)
+    return _array(value) if isinstance(value, list | tuple | np.ndarray) else item(value)
+
+
+def _plain_first(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """TOML has no way back from a table to its parent."""
+    return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, Mapping | AoT) or _is_tables(value)
+
+
 def _is_tables(value: Any) -> bool:
-    return isinstance(value, list | tuple) and bool(value) and all(isinstance(item, Mapping) for item in value)
+    return isinstance(value, list | tuple) and bool(value) and all(isinstance(one, Mapping) for one in value)

@@ -1,0 +1,83 @@
+"""What is written says the same values when it is read, and a file that is changed keeps its comments."""
+
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtloop.design.toml_text import edited, section
+
+WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=10)
+KEYS = st.text("abcdefgh_", min_size=1, max_size=4)
+PLAIN = st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | WORDS
+VALUES = st.recursive(
+    PLAIN, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=4), max_leaves=12
+)
+TABLES = st.dictionaries(KEYS, VALUES, max_size=5)
+
+
+@given(TABLES)
+def test_whatever_is_written_is_read(values):
+    assert tomllib.loads(section("", values, ["a comment", ""])) == values
+
+
+@given(TABLES, TABLES)
+def test_whatever_is_changed_says_what_it_should(old, new):
+    assert tomllib.loads(edited(section("", old), new, ["why"])) == new
+
+
+@pytest.mark.parametrize("number", [0.1, 1e-300, 5e-324, 1e22, -0.0, float("inf"), np.float64(2 / 3)])
+def test_a_number_keeps_its_bits(number):
+    found = tomllib.loads(section("x", {"a": number}))["x"]["a"]
+    assert np.float64(found).tobytes() == np.float64(number).tobytes()
+
+
+TEXT = """\
+# the stage on the left table
+[loop]
+rate_hz = 10000     # as fast as the sensor
+mode = "raw"        # until there is a law
+
+[[axis]]
+name = "x"          # along the beam
+# the weights are last year's
+[axis.feedforward]
+weights = [1.0, 2.0]
+
+[[axis]]
+name = "y"
+
+# where the disk is
+[recording]
+folder = "recordings"
+"""
+
+
+def test_comments_are_kept_and_what_is_new_has_its_place():
+    values = tomllib.loads(TEXT)
+    del values["loop"]["mode"]
+    values["axis"][0] |= {"specification": "spec.toml", "controller": {"gain": 3.0, "poles": [[-1.0, 2.0]] * 12}}
+    values["axis"][0]["feedforward"]["weights"] = [4.0]
+    found = edited(TEXT, values, ["made anew"])
+    assert tomllib.loads(found) == values
+    assert found.startswith("# made anew\n")
+    for line in ("# the stage on the left table", "# as fast as the sensor", "# along the beam", "# where the disk is"):
+        assert line in found
+    assert "until there is a law" not in found
+    assert found.index("# made anew") < found.index("# the stage") < found.index("specification") < found.index('"y"')
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'axis = [{ name = "x" }]',
+        'axis = [\n  { name = "x", feedforward.weights = [1.0] },\n]',
+        '[[axis]]\nname="x"\nf.w=1\n',
+    ],
+)
+def test_other_ways_to_write_the_same(text):
+    values = tomllib.loads(text)
+    values["axis"][0] |= {"controller": {"gain": 3.0}, "specification": "a.toml"}
+    assert tomllib.loads(edited(text, values)) == values
