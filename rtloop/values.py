@@ -1,7 +1,8 @@
-"""Results as plain values, for JSON."""
+"""Results as plain values, for JSON, and as pages."""
 
 from __future__ import annotations
 
+import base64
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
@@ -38,3 +39,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, int | np.integer):
         return int(value)
     return str(value) if isinstance(value, Path) else value
+
+
+def rendered(package: str | None, **values: Any) -> str:
+    """The `page.html` of a package, a jinja2 template, filled in: text is escaped, bytes of a PNG go through `png`."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader(str(package), "")
+    pages = Environment(autoescape=True, loader=loader, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    pages.filters["png"] = lambda content: f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
+    return pages.get_template("page.html").render(values)

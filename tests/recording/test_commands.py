@@ -167,6 +167,20 @@ def test_plot_writes_a_picture_or_a_page(path: Path, tmp_path: Path):
     assert run("plot", copy, "--out", tmp_path / "absent" / "a.png").exit_code == 73
 
 
+def test_a_page_shows_any_name_as_it_is(path: Path, tmp_path: Path):
+    copy = shutil.copy(path, tmp_path / "DATA of <i>Ann & Bob {{ 1 + 1 }}.mcap")
+    answer("plot", copy, "--html", "--out", tmp_path / "odd.html")
+    data, page = data_of(tmp_path / "odd.html"), (tmp_path / "odd.html").read_text()
+    assert data["about"].startswith("DATA of <i>Ann & Bob {{ 1 + 1 }}.mcap")
+    assert "<i>" not in page
+    assert page.count("application/json") == 1
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    text = page.read_text()
+    return json.loads(text[text.index('"application/json">') + 19 : text.index("</script>")])
+
+
 def check_page(page: Path, ticks: int) -> None:
     """Self-contained, and the embedded numbers are the recorded ones."""
     import base64
@@ -174,7 +188,7 @@ def check_page(page: Path, ticks: int) -> None:
     text = page.read_text()
     assert "http" not in text
     assert "src=" not in text
-    data = json.loads(text[text.index('"application/json">') + 19 : text.index("</script>")])
+    data = data_of(page)
     time_s = np.frombuffer(base64.b64decode(data["time_s"]))
     assert len(time_s) == ticks
     recording = load(page.parent / "run.mcap")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
-from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from rtloop.errors import OutputError
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import Band, Progress, drawn_signals, marks, read_bands, title
+from rtloop.values import rendered
 
 POINTS = 100_000
 """About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
@@ -45,10 +44,9 @@ def write_page(
         "panels": _panels(recording.header["axes"], bands),
         "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
-    page = package_files("rtloop.recording.views").joinpath("page.html").read_text(encoding="utf-8")
     embedded = json.dumps(data).replace("<", "\\u003c")
     try:
-        target.write_text(page.replace("TITLE", html.escape(title(recording))).replace("DATA", embedded), "utf-8")
+        target.write_text(rendered(__package__, title=title(recording), data=embedded), "utf-8")
     except OSError as error:
         raise OutputError(f"{target}: {error.strerror}") from None
     return target
