@@ -12,6 +12,7 @@ from rtloop.cli import main
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from tests.one_axis import one_axis, wired
 from tests.paper_configuration import PAPER, RATE, TEXT
 
 RAW = (RATE, f'{RATE}mode = "raw"\n')
@@ -77,3 +78,16 @@ def test_an_amplifier_of_one_side_is_shown_as_one(tmp_path: Path) -> None:
     assert "drive 0 … 10 V" in shown.stdout
     assert "paper: 1 axis at 10000 Hz" not in shown.stdout
     assert "stage: 1 axis at 10000 Hz" in shown.stdout
+
+
+def test_a_model_without_a_resonance_is_checked(tmp_path):
+    """A first-order lag under an integrator: no resonance whose shift could be tolerated."""
+    lag = '[axis.model]\nform = "zpk"\ngain = 1000.0\npoles = [[-1000.0, 0.0]]\n'
+    config = tmp_path / "lag.toml"
+    config.write_text(f'[loop]\nrate_hz = 10000\n[driver]\nkind = "sim"\n{wired("adc0", "dac0")}{one_axis(200.0)}{lag}')
+    shown = CliRunner().invoke(main, ["check", str(config)])
+    assert shown.exit_code == 0, shown.output
+    assert "max |S|" in shown.output
+    assert "resonance" not in shown.output
+    (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
+    assert axis["resonance_shift_tolerated_percent"] == {}
