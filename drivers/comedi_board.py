@@ -12,7 +12,7 @@ from ctypes import c_char_p, c_double, c_int, c_uint, c_void_p
 from enum import IntEnum
 from typing import Any
 
-from rtloop.drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.errors import DriverError, MissingLibrary
 
 
 class Kind(IntEnum):
@@ -61,7 +61,7 @@ class Board:
     """An open board. Every method raises DriverError."""
 
     def __init__(self, library: str, device: str) -> None:
-        """Raises MissingExtra without the library, DriverError without the device."""
+        """Raises MissingLibrary without the library, DriverError without the device."""
         self._device = device
         try:
             self._library = ctypes.CDLL(library)
@@ -69,7 +69,7 @@ class Board:
                 function = getattr(self._library, name)
                 function.restype, function.argtypes = result, arguments
         except (OSError, AttributeError) as error:
-            raise MissingExtra(f"driver 'comedi': {error}; install libcomedi0 (Debian's name of libcomedi)") from None
+            raise MissingLibrary(f"driver 'comedi': {error}; install libcomedi0 (Debian's name of libcomedi)") from None
         self._handle: int | None = self._library.comedi_open(device.encode())
         if self._handle is None:
             raise DriverError(f"{device}: {self.last_error()}{_HINTS.get(self._library.comedi_errno(), '')}")

@@ -5,5 +5,5 @@ class DriverError(Exception):
     """The hardware, its library or its device is not available or has failed."""
 
 
-class MissingExtra(DriverError):
+class MissingLibrary(DriverError):
     """A package or library that a driver needs is not installed; the message says what to install."""

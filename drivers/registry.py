@@ -6,7 +6,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 
 from rtloop.drivers.base import Driver
-from rtloop.drivers.errors import MissingExtra
+from rtloop.drivers.errors import MissingLibrary
 
 GROUP = "rtloop.drivers"
 BUILT_IN = {
@@ -26,7 +26,7 @@ def kinds() -> dict[str, str]:
 def driver_class(kind: str) -> type[Driver]:
     """The class of a kind.
 
-    Raises ValueError for an unknown kind, MissingExtra for a module, or a package that it needs, that is not there.
+    Raises ValueError for an unknown kind, MissingLibrary for a module, or a package that it needs, that is not there.
     """
     known = kinds()
     if kind not in known:
@@ -35,4 +35,4 @@ def driver_class(kind: str) -> type[Driver]:
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise MissingExtra(f"driver {kind!r}, {known[kind]}: cannot be imported: {error}") from error
+        raise MissingLibrary(f"driver {kind!r}, {known[kind]}: cannot be imported: {error}") from error

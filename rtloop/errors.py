@@ -5,11 +5,15 @@
     ├── UnavailableError 69  hardware or service not available
     ├── OutputError      73  the output cannot be written
     ├── MissingExtra     78  an optional package is needed
-    ├── RefusedError     77  refused by the host
+    ├── HostRefused      77  refused by the host
     ├── NoDesign          1  no controller does what is asked
-    └── LoopFault         1  the loop tripped, lost data or failed
+    ├── LoopFault         1  the loop tripped, lost data or failed
+    ├── RecordingError   66  a recording cannot be read            (rtloop.recording.errors)
+    ├── InputFileError   66  a file that was named cannot be read  (rtloop.configuration.text_files)
+    ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.measured)
+    └── Refused, Taken    1  a running loop does not take, or has taken, a command  (rtloop.service.desk)
 
-Recordings that cannot be read have `rtloop.recording.errors.RecordingError` (66), drivers `rtloop.drivers.errors` (69).
+What a driver raises is a `DriverError` (69, rtloop.drivers.errors), which knows nothing of these.
 """
 
 from __future__ import annotations
@@ -70,7 +74,7 @@ class NoDesign(RtloopError):
     exit_code = 1
 
 
-class RefusedError(RtloopError):
+class HostRefused(RtloopError):
     """The host does not allow what the configuration requires."""
 
     exit_code = 77

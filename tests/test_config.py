@@ -55,7 +55,7 @@ ONE_FAULT = [
     ((RATE, "rate_hz = true\n"), "loop.rate_hz: True: must be a valid number"),
     ((RATE, "rate_hz = 2e6\n"), "loop.rate_hz: 2000000.0: must be less than or equal to 1000000"),
     ((RATE, RATE + "priorty = 3\n"), "loop.priorty: unknown key; did you mean priority\\?"),
-    ((RATE, RATE + "drive_v = 3\n"), "loop.drive_v: unknown key here; drive_v belongs into another table"),
+    ((RATE, RATE + "drive_v = 3\n"), "loop.drive_v: unknown key here; drive_v belongs in another table"),
     ((RATE, RATE + "xyzzy = 3\n"), "loop.xyzzy: unknown key"),
     ((RATE, RATE + 'mode = "on"\n'), "loop.mode: 'on': must be 'off', 'raw', 'feedforward' or 'closed_loop'"),
     (("[recording]", "[recrding]"), "recrding: unknown key; did you mean recording\\?"),

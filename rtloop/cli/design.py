@@ -11,7 +11,7 @@ from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
 
 @click.group()
 def design() -> None:
-    """From specifications to a verified controller: synthesise, reduce, judge."""
+    """From a specification to a verified controller."""
 
 
 @design.command()
@@ -22,7 +22,9 @@ def design() -> None:
 @JSON
 @fails_clearly
 def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> int:
-    """Compute the H∞ controller that SPEC.toml asks for, reduce it, and write it as [axis.controller].
+    """Compute the H∞ controller that SPEC.toml asks for.
+
+    It is reduced, and written as [axis.controller].
 
     SPEC.toml names plant and specification; deploy/paper-spec.toml is a complete example. What --out writes is a
     configuration around a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
@@ -40,7 +42,9 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
 @JSON
 @fails_clearly
 def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
-    """Judge the loops of CONFIG: every specification with required, achieved and verdict; margins; robustness.
+    """Judge the loops of CONFIG by their specifications.
+
+    Every specification with what is required, what is achieved and the verdict; margins; robustness.
 
     Exit 1, "the answer is no", where a loop as it will run is unstable or misses a specification; 0 where all are met.
     """

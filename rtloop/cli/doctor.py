@@ -19,7 +19,9 @@ from rtloop.cli.options import JSON, OUTPUT, Seconds, fails_clearly
 @JSON
 @fails_clearly
 def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, as_json: bool) -> int:
-    """Judge this host for the loop of CONFIG, or for 10 kHz; exit 1 where it is not suitable.
+    """Judge this host for the loop of CONFIG, or for 10 kHz.
+
+    Exit 1 where it is not suitable.
 
     Looks at what makes ticks late, tells what each thing costs and the command that mends it, measures the lateness of
     the loop's own clock, and compares it with the loop's period and margins. Touches no hardware; changes nothing

@@ -22,7 +22,10 @@ OUT = click.option("--out", type=OUTPUT, help="Folder for recordings and report 
 
 @click.group()
 def experiment() -> None:
-    """Characterise the stage, judge the loop: experiments on any driver, and one report of them."""
+    """Experiments on any driver, and one report of them.
+
+    They characterise the stage and judge the loop.
+    """
 
 
 @experiment.command(name="list")
@@ -48,10 +51,11 @@ def run(
     names: tuple[str, ...], config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None,
     as_json: bool,
 ) -> int:  # fmt: skip
-    """Run experiments on the rig or the hardware of CONFIG, record each, and report.
+    """Run experiments on the driver of CONFIG, and report.
 
-    Only mode, reference and schedule are changed, and the simulated rig where an experiment is about that; limits and
-    interlocks stay. Ctrl-C ramps down and reports what there is. Exit 1 where an experiment could not be finished.
+    Each is recorded. Only mode, reference and schedule are changed, and the simulated rig where an experiment is about
+    that; limits and interlocks stay. Ctrl-C ramps down and reports what there is. Exit 1 where an experiment could not
+    be finished.
     """
     from rtloop.commands.experiment import run_experiments
 
@@ -69,7 +73,7 @@ def run(
 def run_all(
     config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None, as_json: bool
 ) -> int:
-    """Run every experiment that the rig or the hardware of CONFIG allows."""
+    """Run every experiment that the driver of CONFIG allows."""
     from rtloop.commands.experiment import run_experiments
     from rtloop.experiments.registry import EXPERIMENTS
 
@@ -82,11 +86,16 @@ def run_all(
 @JSON
 @fails_clearly
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
-    """Analyse recordings of experiments again; RUN is a recording or a folder of them."""
+    """Analyse recordings of experiments again.
+
+    RUN is a recording or a folder of them.
+    """
     from rtloop.commands.experiment import report_recordings
 
     return report_recordings(runs, out, as_json)
 
 
-experiment.add_command(run_all, "paper")
+experiment.add_command(
+    click.Command("paper", callback=run_all.callback, params=run_all.params, help=run_all.help, hidden=True)
+)
 COMMANDS = (experiment,)

@@ -57,7 +57,10 @@ def hysteresis(
     thresholds: tuple[float, ...] | None, weights: Literal["invertible", "free"], out: Path | None, plot: Path | None,
     as_json: bool,
 ) -> int:  # fmt: skip
-    """Thresholds and weights from recorded slow sines, each RUN from rest with its initial loading curve."""
+    """Thresholds and weights from recorded slow sines.
+
+    Each RUN begins at rest and shows its initial loading curve.
+    """
     from rtloop.commands.identify import hysteresis_report
     from rtloop.terminal.identification import print_hysteresis
 
@@ -98,7 +101,10 @@ def dynamics(
     criterion: Literal["aic", "held-out", "validation"], compare: Path | None, out: Path | None, plot: Path | None,
     as_json: bool,
 ) -> int:  # fmt: skip
-    """D(s) from the first RUN, a step or any other excitation from rest; further RUNs validate it."""
+    """D(s) from a step, or another excitation, from rest.
+
+    It is identified from the first RUN; further RUNs validate it.
+    """
     from rtloop.commands.identify import dynamics_report
     from rtloop.terminal.identification import print_dynamics
 
@@ -121,7 +127,10 @@ def dynamics(
 def compensation(
     config: Path, actuator: Path, axis: str | None, command_um: float | None, plot: Path | None, as_json: bool
 ) -> int:
-    """What the inverse compensation of CONFIG leaves on the identified actuator: ρ, Ω and its bound ξ."""
+    """What the inverse of CONFIG leaves of the hysteresis.
+
+    On the identified actuator: ρ, Ω and its bound ξ.
+    """
     from rtloop.commands.identify import compensation_report
     from rtloop.terminal.identification import print_compensation
 
@@ -142,7 +151,9 @@ def compensation(
 def auto(
     hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, as_json: bool
 ) -> int:
-    """Identify from two recordings, synthesise for a specification, write a configuration that runs, and verify it.
+    """Identify, synthesise, write a configuration, verify it.
+
+    Two recordings and a specification go in; the configuration that comes out runs.
 
     HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
     the loop misses the specification; the configuration is written all the same.

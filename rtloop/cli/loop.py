@@ -32,7 +32,10 @@ POSITIVE = Positive(0.0, 1e6, min_open=True)
 @JSON
 @fails_clearly
 def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None, as_json: bool) -> int:
-    """Run the loop of CONFIG and record every tick; Ctrl-C ramps down, finishes the recording and ends well."""
+    """Run the loop of CONFIG and record every tick.
+
+    Ctrl-C ramps down, finishes the recording and ends with 0.
+    """
     from rtloop.supervision.interruption import Interruption
 
     with Interruption() as interruption:
@@ -47,7 +50,10 @@ def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None,
 @JSON
 @fails_clearly
 def check(config: Path, strict: bool, as_json: bool) -> int:
-    """Validate CONFIG and show what would run: law, C(z) against C(s), margins, limits. Touches no hardware."""
+    """Show what CONFIG would run, and judge it; touches no hardware.
+
+    Limits, C(z) against C(s), margins on the model, and what the axis's specification says of it.
+    """
     from rtloop.commands.check import check_configuration
 
     return check_configuration(config, strict, as_json)
@@ -71,7 +77,9 @@ def check(config: Path, strict: bool, as_json: bool) -> int:
 def drivers(
     config: Path | None, amplitude_v: float, loopback: bool, gain_tolerance: float, offset_v: float, as_json: bool
 ) -> int:
-    """List the backends; or test the channels of a configuration: gain, offset, noise, delay, highest rate.
+    """List the backends, or test the channels of a configuration.
+
+    The test measures gain, offset, noise, delay and the highest rate.
 
     The self-test moves outputs: nothing fragile may hang on them.
     """

@@ -21,7 +21,10 @@ TO = click.Choice(["csv", "parquet", "npz"])
 @JSON
 @fails_clearly
 def info(files: tuple[Path, ...], as_json: bool) -> int:
-    """Show what a recording holds: completeness, timing, errors, drives. The parts of a rotated one count as one."""
+    """Show what a recording holds.
+
+    Completeness, timing, errors, drives. The parts of a rotated recording count as one.
+    """
     from rtloop.recording.views.summary import summarise
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.run import print_summary
@@ -39,7 +42,9 @@ def info(files: tuple[Path, ...], as_json: bool) -> int:
 @JSON
 @fails_clearly
 def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_json: bool) -> int:
-    """Execute a recording again and compare every output of every tick in bytes; exit 1 where one differs.
+    """Execute a recording again and compare it in bytes.
+
+    Every output of every tick; exit 1 where one differs.
 
     With --config: what another law would have commanded on the same inputs, from rest. With --resimulate: how it
     would have followed the recorded reference on the simulated rig of its configuration (without --config: the
@@ -71,7 +76,10 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
 @JSON
 @fails_clearly
 def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
-    """Make a complete file of a recording that was killed, cut off or damaged; the original stays as it is."""
+    """Make a whole file of a damaged recording.
+
+    It was killed, cut off or damaged; the original stays as it is.
+    """
     from rtloop.recording.file.parts import find_files
     from rtloop.recording.file.recover import recover as recover_recording
     from rtloop.terminal.progress import Counter
@@ -94,7 +102,10 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
 @JSON
 @fails_clearly
 def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) -> int:
-    """Hand a recording on as CSV, Parquet or npz: every number exactly, never over an existing file."""
+    """Write a recording as CSV, Parquet or npz.
+
+    Every number exactly, and never over an existing file.
+    """
     from rtloop.recording.views.export import export as export_recording
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_export
@@ -116,7 +127,7 @@ def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) ->
 def plot(
     files: tuple[Path, ...], out: Path | None, start_s: float, end_s: float | None, html: bool, as_json: bool
 ) -> int:
-    """Draw reference and position, error, drive, timing and events."""
+    """Draw signals, timing and events of a recording."""
     from rtloop.recording.load import load
     from rtloop.recording.views.page import write_page
     from rtloop.recording.views.plot import plot as plot_recording

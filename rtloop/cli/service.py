@@ -16,7 +16,10 @@ from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
 @CONFIG
 @fails_clearly
 def serve(config: Path) -> int:
-    """Run the loop of CONFIG as a daemon, with control API and systemd notification, until told to stop."""
+    """Run the loop of CONFIG as a daemon with a control API.
+
+    It tells systemd how it is, and ends when it is told to.
+    """
     from rtloop.service.daemon import serve as serve_configuration
 
     return serve_configuration(config)
@@ -26,7 +29,7 @@ def serve(config: Path) -> int:
 @CONFIG
 @fails_clearly
 def park(config: Path) -> int:
-    """Bring every output of CONFIG to its safe value, ramping from where it is."""
+    """Ramp every output of CONFIG to its safe value."""
     from rtloop.supervision.parking import park_configuration
 
     click.echo(park_configuration(config), err=True)
@@ -43,7 +46,10 @@ def hil() -> None:
 @click.option("--can", "on_can", is_flag=True, help="Be a node on the CAN bus of CONFIG, whose driver is of kind can.")
 @fails_clearly
 def hil_serve(config: Path, on_can: bool) -> int:
-    """Be the board of CONFIG, whose driver is of kind shm: a rig with its own clock that outlives its controllers."""
+    """Be the board of CONFIG, whose driver is of kind shm.
+
+    A rig with a clock of its own, which outlives its controllers.
+    """
     from rtloop.commands.board import serve_board, serve_node
 
     return serve_node(config) if on_can else serve_board(config)
@@ -156,7 +162,10 @@ def setpoint(context: click.Context, axis: str, value: float) -> int:
 @click.pass_context
 @fails_clearly
 def reference(context: click.Context, axis: str, reference: str) -> int:
-    """Change the reference of AXIS, as in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'."""
+    """Change the reference of AXIS.
+
+    As in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
+    """
     body = {"axis": axis, "reference": _inline_table(reference)}
     click.echo(json.dumps(_client(context).post("/reference", body)))
     return 0
@@ -170,7 +179,7 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
 @click.pass_context
 @fails_clearly
 def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repeat: bool) -> int:
-    """Play the numbers in FILE (one a line) on AXIS."""
+    """Play the numbers in FILE, one to a line, on AXIS."""
     samples = _numbers(file)
     body = {"axis": axis, "samples": samples, "hold_ticks": hold_ticks, "repeat": repeat}
     click.echo(json.dumps(_client(context).post("/waveform", body)))
@@ -184,7 +193,10 @@ def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repe
 @click.pass_context
 @fails_clearly
 def tune(context: click.Context, axis: str, section: str, values: str) -> int:
-    """Change keys of [axis.SECTION] of AXIS: 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'."""
+    """Change keys of [axis.SECTION] of AXIS.
+
+    For example 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'.
+    """
     body = {"axis": axis, "section": section, "values": _inline_table(values)}
     click.echo(json.dumps(_client(context).post("/tune", body)))
     return 0
@@ -196,7 +208,10 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
 @click.pass_context
 @fails_clearly
 def controller(context: click.Context, axis: str, config: Path) -> int:
-    """Swap in the [axis.controller] of AXIS from another configuration file."""
+    """Swap in the controller of another configuration.
+
+    FILE's [axis.controller] of that axis is verified first.
+    """
     from rtloop.configuration.file import load
 
     axes = {one.name: one for one in load(config).axes}
@@ -211,7 +226,7 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
 
 
 def _numbers(file: Any) -> list[float]:
-    """One a line; empty lines are left out. Raises a usage error."""
+    """One to a line; empty lines are left out. Raises a usage error."""
     found: list[float] = []
     for number, line in enumerate(file, start=1):
         try:

@@ -215,7 +215,7 @@ class StepsOptions(Options):
 
 
 class TableOptions(Options):
-    """Samples from a file, a number a line (.csv, .txt) or an .npy array, `hold_ticks` ticks each."""
+    """Samples from a file, one number to a line (.csv, .txt) or an .npy array, `hold_ticks` ticks each."""
 
     kind: Literal["table"]
     file: str

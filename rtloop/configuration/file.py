@@ -226,7 +226,7 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str]) -> str:
         return f"{where}: missing; it is needed"
     if detail["type"] == "extra_forbidden":
         if path[-1] in known_keys:
-            return f"{where}: unknown key here; {path[-1]} belongs into another table"
+            return f"{where}: unknown key here; {path[-1]} belongs in another table"
         near = get_close_matches(path[-1], known_keys, n=1)
         return f"{where}: unknown key" + (f"; did you mean {near[0]}?" if near else "")
     if detail["type"] == "union_tag_not_found":

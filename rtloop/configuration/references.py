@@ -107,7 +107,7 @@ def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float6
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """A number a line; empty lines and what follows a # do not count. Raises _NotANumber with the line's number."""
+    """One number to a line; empty lines and comments (#) do not count. Raises _NotANumber with the line's number."""
     numbers = []
     for count, line in enumerate(text.splitlines(), start=1):
         if content := line.partition("#")[0].strip():

@@ -27,7 +27,7 @@ from rtloop.engine.plan import Plan, require_facts
 from rtloop.engine.ramp import found_v, ramp_to_safe
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
 from rtloop.engine.rehearsal import rehearse
-from rtloop.errors import ConfigError, LoopFault, RefusedError, RtloopError, UnavailableError
+from rtloop.errors import ConfigError, HostRefused, LoopFault, RtloopError, UnavailableError
 
 EXIT_CODES = {
     Outcome.DONE: 0,
@@ -123,7 +123,7 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcom
     realtime = prepare_realtime(plan.pacing)
     granted = realtime["scheduler"] == "SCHED_FIFO" and realtime["mlock"]
     if plan.pacing.require_realtime and plan.pacing.paced and not granted:
-        raise RefusedError(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
+        raise HostRefused(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
     block.store(Word.LOOP_STATE, ProcessState.READY)
     report("ready", realtime=realtime)
     while not block.load(Word.GO):

@@ -9,7 +9,10 @@ from rtloop.law.layout import ANEW, BLOCK, LANES
 
 @jit
 def controller_output(coefficients, state, error_um):
-    """Command v = c x + d e in µm."""
+    """Command v = c x + d e in µm.
+
+    Plainly: s[i mod 4] += c_i x_i + c_i+4 x_i+4 for i = 0 … 3, 8 … 11, …, then (s0 + s1) + (s2 + s3) + d e.
+    """
     c, x = coefficients.c, state.controller
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(coefficients.order // BLOCK):

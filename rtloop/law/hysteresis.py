@@ -99,7 +99,10 @@ def total(sums, first, second, third, fourth):
 
 @jit
 def plays_sum(value, thresholds, weights, plays, count, sums):
-    """Σ w_i F_i[value] in four interleaved partial sums, a fixed order; the plays do not move."""
+    """Σ w_i F_i[value] in four partial sums; the plays do not move.
+
+    Plainly: s[i mod 4] += w_i F_i[value] for i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
+    """
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
         i = block * LANES

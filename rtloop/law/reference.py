@@ -48,7 +48,7 @@ GENERATOR = np.dtype(
 )
 FOR_EVER = np.iinfo(np.int64).max
 
-HOLD, TABLE, SINE, TRIANGLE, CHIRP = 0, 1, 2, 3, 4
+HOLD, TABLE, SINE, TRIANGLE, CHIRP = (int(kind) for kind in Generator if kind is not Generator.INPUT)
 TURN = 2.0 * math.pi
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rtloop import errors, signals
-from rtloop.drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.service.desk import Refused, asked_by
@@ -43,7 +43,7 @@ def supervised_by_can(service: Service) -> Iterator[None]:
         require_interface(options)
         frames = load_frames(options)
         bus = open_bus(options)
-    except MissingExtra as error:
+    except MissingLibrary as error:
         raise errors.MissingExtra(f"{where}: {error}") from None
     except ValueError as error:
         raise ConfigError(str(service.config), [f"service.can.{error}"]) from None
@@ -151,7 +151,7 @@ class CanSupervision:
             self._complain(f"cannot be written: {error}")
 
     def _complain(self, text: str) -> None:
-        """At most once a second: a flood of frames is to be none of the journal."""
+        """At most once a second: a flood of frames must not become one of the journal."""
         now_s = time.monotonic()
         if now_s - self._said_s >= LOG_PERIOD_S:
             self._said_s = now_s

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import RefusedError, RtloopError, UnavailableError
+from rtloop.errors import HostRefused, RtloopError, UnavailableError
 from rtloop.hil.trusted import Untrusted, owners
 from rtloop.supervision.paths import refusal
 
@@ -30,7 +30,7 @@ class _UnixConnection(http.client.HTTPConnection):
 
 
 def _connected(path: Path) -> socket.socket:
-    """A connection to who serves there: we, root, or whom root gave the folder to. Raises OSError, RefusedError."""
+    """A connection to who serves there: we, root, or whom root gave the folder to. Raises OSError, HostRefused."""
     try:
         believed = owners(path.parent)
     except Untrusted as error:
@@ -46,9 +46,7 @@ def _connected(path: Path) -> socket.socket:
         )
         owner = path.lstat().st_uid
         if server not in believed or owner != server:
-            raise RefusedError(
-                f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner"
-            )
+            raise HostRefused(f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner")
         return connection
     except BaseException:
         connection.close()

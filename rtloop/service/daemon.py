@@ -62,7 +62,7 @@ def _listening(service: Service) -> Iterator[None]:
 def _bind(path: Path, mode: int) -> socket.socket:
     """A listening socket with exactly these permissions, of the folder's group where we may give it that.
 
-    Raises UnavailableError where another service listens or something else than a socket stands, RefusedError for a
+    Raises UnavailableError where another service listens or something else than a socket stands, HostRefused for a
     folder that others may write to.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

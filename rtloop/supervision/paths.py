@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rtloop.configuration.file import Configuration
-from rtloop.errors import OutputError, RefusedError, UnavailableError
+from rtloop.errors import HostRefused, OutputError, UnavailableError
 from rtloop.hil.trusted import Untrusted, open_file, open_folder
 
 FOLDER_MODE = 0o750
@@ -48,7 +48,7 @@ def block_path(configuration: Configuration) -> Path:
 def new_block(path: Path) -> int:
     """An empty file in place of an old one, which a process that still has it mapped keeps.
 
-    Raises OutputError, RefusedError for a folder that is not ours alone to write.
+    Raises OutputError, HostRefused for a folder that is not ours alone to write.
     """
     try:
         folder = open_folder(path.parent, FOLDER_MODE)
@@ -65,7 +65,7 @@ def new_block(path: Path) -> int:
 
 
 def open_block(path: Path) -> int | None:
-    """A service's shared block; None where there is none. Raises RefusedError, UnavailableError."""
+    """A service's shared block; None where there is none. Raises HostRefused, UnavailableError."""
     try:
         return open_file(path, os.O_RDWR)
     except FileNotFoundError:
@@ -76,6 +76,6 @@ def open_block(path: Path) -> int | None:
         raise UnavailableError(f"{path}: {error.strerror}") from None
 
 
-def refusal(error: Untrusted) -> RefusedError:
+def refusal(error: Untrusted) -> HostRefused:
     """For a user: what is not believed, and why."""
-    return RefusedError(f"{error.filename}: {error.strerror}")
+    return HostRefused(f"{error.filename}: {error.strerror}")

@@ -12,7 +12,7 @@ import pytest
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.comedi import ComediDriver, ComediOptions
 from rtloop.drivers.contract import Calls, DriverContract
-from rtloop.drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.errors import DriverError, MissingLibrary
 from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
 
 ONE = {"x": Wiring("ai0", "ao0")}
@@ -165,9 +165,9 @@ def test_a_board_in_use_is_said(tmp_path):
 
 
 def test_a_missing_library_is_said_with_what_to_install(tmp_path):
-    with pytest.raises(MissingExtra, match=r"driver 'comedi': libabsent\.so\.0: .*; install libcomedi0"):
+    with pytest.raises(MissingLibrary, match=r"driver 'comedi': libabsent\.so\.0: .*; install libcomedi0"):
         comedi(tmp_path / "comedi0", library="libabsent.so.0").open()
-    with pytest.raises(MissingExtra, match="undefined symbol: comedi_open; install libcomedi0"):
+    with pytest.raises(MissingLibrary, match="undefined symbol: comedi_open; install libcomedi0"):
         comedi(tmp_path / "comedi0", library="libm.so.6").open()
 
 

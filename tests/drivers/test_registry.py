@@ -8,7 +8,7 @@ import pytest
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.drivers.errors import DriverError, MissingExtra
+from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.drivers.registry import driver_class, kinds
 from rtloop.drivers.sim import SimDriver
 from rtloop.errors import ConfigError
@@ -86,9 +86,9 @@ def test_an_entry_point_is_found_but_cannot_replace_a_built_in():
     ],
 )
 def test_an_entry_point_that_is_broken_says_how(kind, message):
-    with pytest.raises(MissingExtra, match=message):
+    with pytest.raises(MissingLibrary, match=message):
         driver_class(kind)
-    assert issubclass(MissingExtra, DriverError)
+    assert issubclass(MissingLibrary, DriverError)
 
 
 @pytest.mark.usefixtures("acme")

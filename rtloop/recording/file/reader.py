@@ -85,7 +85,7 @@ class Reader:
         self._source.close()
 
     def begin_behind(self, before: Reader) -> None:
-        """Take no tick that belongs into the part `before` this one."""
+        """Take no tick that belongs in the part `before` this one."""
         if before.totals:
             self.first_tick = max(self.first_tick, before.totals["ticks_executed"])
 

@@ -1,4 +1,4 @@
-"""What came of a rerun, in numbers: differences signal by signal, and how well the reference was followed."""
+"""How a rerun went, in numbers: differences signal by signal, and how well the reference was followed."""
 
 from __future__ import annotations
 

@@ -1,0 +1,25 @@
+"""The law's records have no byte that is nobody's: copies, comparisons and recordings are of bytes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtloop.engine.messages import MESSAGE
+from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.reference import GENERATOR, Generator
+
+
+@pytest.mark.parametrize("record", [COEFFICIENTS, STATE, LOOP_STATE, GENERATOR, MESSAGE])
+def test_every_byte_belongs_to_one_field(record):
+    owners = np.zeros(record.itemsize, int)
+    for field in record.names:
+        kind, offset = record.fields[field][:2]
+        owners[offset : offset + kind.itemsize] += 1
+    assert np.all(owners == 1), np.flatnonzero(owners != 1)
+
+
+def test_kinds_of_generators_are_numbered_as_they_are_recorded():
+    assert {kind.name: int(kind) for kind in Generator} == {
+        "HOLD": 0, "TABLE": 1, "SINE": 2, "TRIANGLE": 3, "CHIRP": 4, "INPUT": 5
+    }  # fmt: skip
