@@ -12,8 +12,8 @@ import click
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
-from rtloop.design.synthesis.assumptions import NoController
-from rtloop.design.synthesis.augment import augmented
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.hinf.augment import augmented
 from rtloop.design.synthesis.section import controller_configuration, controller_section
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
@@ -78,7 +78,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
 
 
 def _slicot(found: Synthesis, design: DesignOptions) -> float:
-    from rtloop.design.synthesis.slicot import slicot_gamma
+    from rtloop.design.synthesis.hinf.slicot import slicot_gamma
 
     assert design.plant is not None
     return slicot_gamma(augmented(design.plant.transfer(), found.weights), 10 * found.hinf.gamma_opt)[0]

@@ -13,7 +13,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain, configuration_text, designed
 from rtloop.design.identification.identified import write_new
 from rtloop.design.identification.measured import measured
-from rtloop.design.synthesis.assumptions import NoController
+from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, NoDesign
 

@@ -14,7 +14,7 @@ KEPT_CACHES = 8
 
 def main() -> int:
     """Compile the loop for this version and processor, and drop the caches of old versions."""
-    from rtloop.engine.rehearsal import rehearse
+    from rtloop.engine.assembly import rehearse
 
     rehearse()
     _rehearse_others()

@@ -6,16 +6,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.drivers.base import Facts, Pointers, index_of
-from rtloop.engine.clock import Clock
+from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, index_of
+from rtloop.engine.clock import Clock, clock_context, paced_now, unpaced_clock
 from rtloop.engine.context import LOOP
 from rtloop.engine.loop import Outcome, run_ticks
-from rtloop.engine.memory import SharedBlock
-from rtloop.engine.plan import Plan
+from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.messages import MESSAGE
+from rtloop.engine.plan import Pacing, Plan
 from rtloop.law.law import set_mode
-from rtloop.law.layout import CONDITIONS, Records, copied, initial_state
+from rtloop.law.layout import COEFFICIENTS, CONDITIONS, Records, copied, initial_state
+from rtloop.law.reference import GENERATOR
+from rtloop.signals import Mode
 
 SNAPSHOT_SECONDS = 1.0
+REHEARSED_TICKS = 100
 UNLIMITED = np.iinfo(np.int64).max
 
 
@@ -117,3 +121,19 @@ class Assembly:
         loop.now, loop.clock_context = clock.now, clock.context
         own = bool(pointers.wait)
         loop.wait, loop.wait_context = (pointers.wait, pointers.context) if own else (clock.wait, clock.context)
+
+
+def rehearse() -> None:
+    """Compile the loop, the clocks and the simulated rig: some ticks in virtual time, within the caller's process."""
+    pacing = Pacing(rate_hz=1000.0, paced=False)
+    wiring = {"x": Wiring("adc0", "dac0")}
+    coefficients = np.zeros(1, COEFFICIENTS)
+    coefficients["trip_slew_v_per_tick"] = Channel("dac0").maximum_v
+    nothing = np.zeros(0, MESSAGE)
+    plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, coefficients, Mode.OFF,
+                np.zeros(1, GENERATOR), np.zeros(0), nothing, ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
+    driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
+    ring = block.ring("ticks")
+    clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)
+    assert paced_now.address
+    Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan)).run(REHEARSED_TICKS)

@@ -19,14 +19,13 @@ from typing import Any
 
 from rtloop.drivers.base import Driver, Facts, Pointers
 from rtloop.drivers.errors import DriverError
-from rtloop.engine.assembly import UNLIMITED, Assembly, law_at_rest
+from rtloop.engine.assembly import UNLIMITED, Assembly, law_at_rest, rehearse
 from rtloop.engine.clock import clock_context, paced_clock, unpaced_clock
 from rtloop.engine.loop import WRITE_FAILED, Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
 from rtloop.engine.ramp import found_v, ramp_to_safe
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
-from rtloop.engine.rehearsal import rehearse
 from rtloop.errors import ConfigError, HostRefused, LoopFault, RtloopError, UnavailableError
 
 EXIT_CODES = {

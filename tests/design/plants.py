@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from rtloop.design.synthesis.augment import GeneralisedPlant
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant
 
 
 def random_plant(seed: int) -> GeneralisedPlant:

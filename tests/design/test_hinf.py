@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from rtloop.design.paper import PAPER_D
-from rtloop.design.synthesis.assumptions import NoController
-from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices, augmented
-from rtloop.design.synthesis.hinf import synthesise_hinf
-from rtloop.design.synthesis.norm import hinf_norm
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.design.synthesis.hinf.norm import hinf_norm
+from rtloop.design.synthesis.hinf.solver import synthesise_hinf
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer
 from tests.design.plants import dense_norm, hamiltonian_norm, random_plant

@@ -11,9 +11,9 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.margins import margins
 from rtloop.design.interchange import from_control, to_control
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.synthesis.augment import Matrices, augmented
-from rtloop.design.synthesis.hinf import synthesise_hinf
-from rtloop.design.synthesis.norm import hinf_norm
+from rtloop.design.synthesis.hinf.augment import Matrices, augmented
+from rtloop.design.synthesis.hinf.norm import hinf_norm
+from rtloop.design.synthesis.hinf.solver import synthesise_hinf
 from rtloop.design.synthesis.reduce import reduce_order
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.discretise import discretise, discretised

@@ -13,7 +13,7 @@ from rtloop.analysis.step_response import position_at
 from rtloop.cli import main
 from rtloop.configuration.axis import ControllerOptions
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.synthesis.augment import Matrices, augmented
+from rtloop.design.synthesis.hinf.augment import Matrices, augmented
 from rtloop.design.synthesis.synthesise import synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS, tracking_weight
 from tests.design.plants import dense_norm

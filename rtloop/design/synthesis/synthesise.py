@@ -13,10 +13,10 @@ import numpy as np
 
 from rtloop.analysis.closed_loop import realised
 from rtloop.design.synthesis.at_rate import LARGEST_SENSITIVITY, dead_time, runs, within_rate
-from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices, augmented
-from rtloop.design.synthesis.hinf import Hinf, NoController, smallest_gamma, synthesise_hinf
-from rtloop.design.synthesis.norm import hinf_norm
-from rtloop.design.synthesis.normalised import normalised
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.design.synthesis.hinf.norm import hinf_norm
+from rtloop.design.synthesis.hinf.normalised import normalised
+from rtloop.design.synthesis.hinf.solver import Hinf, NoController, smallest_gamma, synthesise_hinf
 from rtloop.design.synthesis.reduce import ReductionMethod, hankel_singular_values, reduce_order
 from rtloop.design.synthesis.specification import DesignOptions, weights_of
 from rtloop.design.synthesis.weights import Weights

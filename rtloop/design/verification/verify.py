@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.comparison import compare
 from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
-from rtloop.design.synthesis.augment import augmented
+from rtloop.design.synthesis.hinf.augment import augmented
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions, weights_of
 from rtloop.design.synthesis.synthesise import weighted_norm
 from rtloop.design.synthesis.weights import Weights

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import sqrtm
 
-from rtloop.design.synthesis.assumptions import NoController, check_assumptions
-from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices
-from rtloop.design.synthesis.norm import hinf_norm
-from rtloop.design.synthesis.normalised import Normalised, normalised
-from rtloop.design.synthesis.riccati import Fault, NoSolution, stabilising_solution
+from rtloop.design.synthesis.hinf.assumptions import NoController, check_assumptions
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
+from rtloop.design.synthesis.hinf.norm import hinf_norm
+from rtloop.design.synthesis.hinf.normalised import Normalised, normalised
+from rtloop.design.synthesis.hinf.riccati import Fault, NoSolution, stabilising_solution
 from rtloop.hil.modal import Real
 
 LARGEST_GAMMA = 1e8

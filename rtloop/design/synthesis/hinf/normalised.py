@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
 from rtloop.hil.modal import Real
 
 

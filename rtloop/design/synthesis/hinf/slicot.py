@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.design.synthesis.augment import GeneralisedPlant, Matrices
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
 from rtloop.errors import MissingExtra
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.design.synthesis.augment import GeneralisedPlant
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant
 from rtloop.hil.modal import Real
 
 SMALL = 1e-10

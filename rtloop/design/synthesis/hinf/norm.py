@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.design.synthesis.augment import Matrices
+from rtloop.design.synthesis.hinf.augment import Matrices
 from rtloop.hil.modal import Real
 
 
