@@ -12,7 +12,6 @@ from rtloop.drivers.can.extra import UnsupportedDatabaseFormatError, can, load_f
 from rtloop.drivers.can.options import BusOptions
 
 DBC = Path(__file__).with_name("rtloop.dbc")
-HIGHEST_STANDARD_ID = 0x7FF
 _CODES = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (32, False): "I", (32, True): "i"}
 
 

@@ -13,14 +13,6 @@ import numpy as np
 from rtloop.hil.modal import Complex, Modal, Real
 
 
-def continuous_modes(discrete: Modal, period_s: float) -> Modal:
-    """The sum in s whose zero-order hold `discrete` is. Raises ValueError for a mode at z ≤ 0, which has none."""
-    if np.any((discrete.poles.imag == 0) & (discrete.poles.real <= 0)):
-        raise ValueError("a real mode at z ≤ 0 has no counterpart in continuous time")
-    rates = (np.log(discrete.poles) / period_s).astype(complex)
-    return held_from(rates, discrete.residues, discrete.direct, period_s)
-
-
 def held_from(rates: Complex, residues: Complex, direct: Real, period_s: float) -> Modal:
     """The sum in s with poles `rates` (n,) whose zero-order hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
     x = rates * period_s
