@@ -1,4 +1,4 @@
-"""Results as plain values, for JSON, and as pages."""
+"""Results as plain values, for JSON, in words and as pages."""
 
 from __future__ import annotations
 
@@ -39,6 +39,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, int | np.integer):
         return int(value)
     return str(value) if isinstance(value, Path) else value
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """The number and its noun, in the singular for 1; `many` where the plural is not made by an s."""
+    return f"{number:,} {one if number == 1 else many or f'{one}s'}"
 
 
 def rendered(package: str | None, **values: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Sized
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -16,6 +16,7 @@ from rtloop.engine.realtime import prepare_realtime
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.hil.board import serve
 from rtloop.service.notify import Notifier
+from rtloop.values import counted
 
 BOARD_PRIORITY = 85
 
@@ -32,7 +33,7 @@ def serve_board(config: Path) -> int:
     axes = _axes_by_output(configuration)
     stopped = _stop_signals()
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
-    click.echo(f"board at {options.file}: {_channels(axes)} at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
+    click.echo(f"board at {options.file}: {counted(len(axes), 'channel')} at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
     try:
         ready = lambda: Notifier().send(READY=1)
         samples = serve(Path(options.file), options, axes, rate_hz, stopped, ready)
@@ -58,7 +59,7 @@ def serve_node(config: Path) -> int:
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def ready() -> None:
-        click.echo(f"node on {options.place}: {_channels(axes)}; Ctrl-C ends it", err=True)
+        click.echo(f"node on {options.place}: {counted(len(axes), 'channel')}; Ctrl-C ends it", err=True)
         Notifier().send(READY=1)
 
     try:
@@ -85,7 +86,3 @@ def _stop_signals() -> Callable[[], bool]:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     return lambda: stopped
-
-
-def _channels(axes: Sized) -> str:
-    return "1 channel" if len(axes) == 1 else f"{len(axes)} channels"

@@ -22,6 +22,7 @@ from rtloop.design.verification.text import answer, span
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
 from rtloop.terminal.table import console as _console
+from rtloop.values import counted
 
 ROWS = (
     ("stable", lambda loop: "yes" if loop.stable else "NO"),
@@ -49,9 +50,8 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
         return 0
     console = _console()
     plan, facts = prepared.plan, prepared.facts
-    axes = "1 axis" if len(plan.axes) == 1 else f"{len(plan.axes)} axes"
     console.print(
-        f"[bold]{escape(plan.name)}[/]: {axes} at {plan.pacing.rate_hz:g} Hz, "
+        f"[bold]{escape(plan.name)}[/]: {counted(len(plan.axes), 'axis', 'axes')} at {plan.pacing.rate_hz:g} Hz, "
         f"mode {plan.mode.name.lower()}, driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
     )
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):

@@ -21,6 +21,7 @@ from rtloop.supervision.naming import recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.progress import Counter
 from rtloop.terminal.run import RunView, print_run
+from rtloop.values import counted
 
 
 def run_configuration(
@@ -92,6 +93,9 @@ def recover_leftovers(folder: Path) -> None:
         except RtloopError as error:
             click.echo(f"warning: {error}", err=True)
             continue
-        click.echo(f"{report['output']}: {report['ticks']:,} ticks recovered from {part.name}, which is kept", err=True)
+        click.echo(
+            f"{report['output']}: {counted(report['ticks'], 'tick')} recovered from {part.name}, which is kept",
+            err=True,
+        )
         for problem in report["problems"]:
             click.echo(f"warning: {part}: {problem}", err=True)

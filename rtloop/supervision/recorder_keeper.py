@@ -19,6 +19,7 @@ from rtloop.errors import OutputError, RtloopError
 from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
 from rtloop.supervision.stall import StallWatch
+from rtloop.values import counted
 
 MODULE = "rtloop.recording.capture.recorder"
 STALL_S = 3.0
@@ -145,7 +146,7 @@ class RecorderKeeper:
             self.notes.append(str(error))
             return
         part.unlink()
-        self.notes.append(f"{report['output']}: recovered, {report['ticks']} ticks")
+        self.notes.append(f"{report['output']}: recovered, {counted(report['ticks'], 'tick')}")
 
     def _totals(self) -> dict[str, Any]:
         reports = self._child.reports()

@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from rtloop.recording.replay.replay import ReplayReport
 from rtloop.terminal.table import console, table
+from rtloop.values import counted
 
 METRICS = (
     ("rms_error_um", "rms error µm"),
@@ -29,12 +30,12 @@ def print_replay(path: Path, report: ReplayReport) -> None:
     """The verdict, the gaps, what is not verified and what cannot be, the first difference."""
     out = console()
     for gap in report.gaps:
-        out.print(f"gap: {gap['count']} ticks from tick {gap['first_tick']} on are not in the recording")
+        out.print(f"gap: {counted(gap['count'], 'tick')} from tick {gap['first_tick']} on, missing in the recording")
     _print_problems(out, report.problems)
     for entry in report.not_verified:
         out.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
     out.print(f"not judged: {'; '.join(report.not_judged)}")
-    checked = f"{report.ticks:,} ticks and {report.snapshots} snapshots of the law's state"
+    checked = f"{counted(report.ticks, 'tick')} and {counted(report.snapshots, 'snapshot')} of the law's state"
     name, found = _name(path), report.first_difference
     if report.identical:
         out.print(f"[green]identical[/]: {name}: {checked} compared in bytes")
@@ -50,14 +51,14 @@ def _range(entry: dict[str, Any]) -> str:
     first, count = entry["first_tick"], entry["count"]
     if first is None:
         return ""
-    return f"ticks from {first} on: " if count is None else f"{count:,} ticks from tick {first} on: "
+    return f"ticks from {first} on: " if count is None else f"{counted(count, 'tick')} from tick {first} on: "
 
 
 def print_differences(report: dict[str, Any]) -> None:
     """Largest and root mean square difference, signal by signal."""
     out = console()
     law, recording = _name(report["config"]), _name(report["recording"])
-    out.print(f"the law of {law} on the inputs of {recording}: {report['ticks']:,} ticks")
+    out.print(f"the law of {law} on the inputs of {recording}: {counted(report['ticks'], 'tick')}")
     shown = table("difference", "largest", "at tick", "rms")
     for name, difference in report["signals"].items():
         shown.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")
@@ -70,7 +71,7 @@ def print_resimulation(report: dict[str, Any]) -> None:
     """Recorded and resimulated, side by side."""
     out = console()
     law = report["config"] or "the recorded law and rig"
-    out.print(f"the reference of {_name(report['recording'])} through {_name(law)}: {report['ticks']:,} ticks")
+    out.print(f"the reference of {_name(report['recording'])} through {_name(law)}: {counted(report['ticks'], 'tick')}")
     for axis in report["axes"]:
         before, after = axis["recorded"], axis["resimulated"]
         shown = table(f"axis {axis['name']}", "recorded", "resimulated")
@@ -92,9 +93,9 @@ def print_recovery(report: dict[str, Any]) -> None:
     if whole:
         out.print(f"{original} is whole, there was nothing to recover; {_name(report['output'])} is a copy")
         return
-    out.print(f"{_name(report['output'])}: {report['ticks']:,} ticks recovered from {original}")
+    out.print(f"{_name(report['output'])}: {counted(report['ticks'], 'tick')} recovered from {original}")
     for first, count in report["gaps"]:
-        out.print(f"missing: {count:,} ticks from tick {first} on")
+        out.print(f"missing: {counted(count, 'tick')} from tick {first} on")
     _print_problems(out, report["problems"])
     if not report["complete"]:
         out.print("the end of the run is not in it: what came after its last tick is not known")
@@ -103,7 +104,7 @@ def print_recovery(report: dict[str, Any]) -> None:
 def print_export(report: dict[str, Any]) -> None:
     """What was written where."""
     out = console()
-    out.print(f"{_name(report['output'])}: {report['ticks']:,} ticks, {report['bytes'] / 2**20:.1f} MiB")
+    out.print(f"{_name(report['output'])}: {counted(report['ticks'], 'tick')}, {report['bytes'] / 2**20:.1f} MiB")
     _print_problems(out, report["problems"])
 
 
