@@ -17,7 +17,7 @@ from rtloop.configuration.references import TableOfSamples, extent, generator_va
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
-from rtloop.errors import ConfigError
+from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
@@ -107,7 +107,7 @@ class LiveLaw:
         """Make `offset_v` the reading at position 0; returns the tick."""
         with self._lock:
             self.offsets_v[number] = offset_v
-            return self._stage(number, self.prepared)
+            return self._stage(number, self.prepared, self.prepared.configuration.axes[number])
 
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Take over another configuration; what changed. Raises Refused where that needs a restart."""
@@ -122,14 +122,33 @@ class LiveLaw:
                     raise Refused(f"axis.{after.name}.feedforward: changed, which needs a restart")
             references = {n: self._generator(after.reference) for n, (before, after) in pairs
                           if before.reference != after.reference}  # fmt: skip
-            changed = [f"axis.{after.name}" for _, (before, after) in pairs if before != after]
-            for number, (before, after) in pairs:
-                if before != after:
-                    self._stage(number, prepared)
+            changed: list[str] = []
+            try:
+                for number, (before, after) in pairs:
+                    law = after.model_copy(update={"reference": before.reference})
+                    if law != before:
+                        self._stage(number, prepared, law)
+                        changed.append(f"axis.{after.name}")
+                for number, (values, samples) in references.items():
+                    self._play(number, values, samples)
+                    self._note(number, prepared, new.axes[number])
+                    changed.append(f"axis.{new.axes[number].name}")
+            except RtloopError as error:
+                if not changed:
+                    raise
+                faults = error.faults if isinstance(error, ConfigError) else [str(error)]
+                raise Refused("; ".join([*faults, f"changed already: {', '.join(dict.fromkeys(changed))}"])) from None
             self.prepared = prepared
-            for number, (values, samples) in references.items():
-                self._play(number, values, samples)
-            return changed
+            return list(dict.fromkeys(changed))
+
+    def _note(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
+        """The loop has taken an axis of `prepared`, and of what it does `axis` is true; the others are as they were."""
+        coefficients = np.asarray(self.prepared.plan.coefficients).copy()
+        coefficients[number] = np.asarray(prepared.plan.coefficients)[number]
+        configuration = _with_axis(self.prepared.configuration, number, axis)
+        self.prepared = replace(
+            self.prepared, configuration=configuration, plan=replace(self.prepared.plan, coefficients=coefficients)
+        )
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
         """Build the configuration with another axis, verify it, swap its coefficients."""
@@ -138,16 +157,10 @@ class LiveLaw:
             raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
         prepared = prepare_limited(_with_axis(configuration, number, axis))
         with self._lock:
-            try:
-                tick = self._stage(number, prepared)
-            except Taken:
-                self.prepared = prepared
-                raise
-            self.prepared = prepared
-            return tick
+            return self._stage(number, prepared, axis)
 
-    def _stage(self, number: int, prepared: Prepared) -> int:
-        """Copy coefficients to where the loop takes them from, and have it take them."""
+    def _stage(self, number: int, prepared: Prepared, axis: AxisOptions) -> int:
+        """Copy coefficients to where the loop takes them from, have it take them; note `axis`. Raises Taken, too."""
         before, after = self.prepared.configuration.axes[number], prepared.configuration.axes[number]
         coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1].copy()
         coefficients["offset_v"] = self.offsets_v.get(number, float(coefficients["offset_v"][0]))
@@ -155,7 +168,13 @@ class LiveLaw:
         self._require_settled()
         self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller
-        return self._settling(Kind.LOAD_LAW, number, [float(another)])
+        try:
+            tick = self._settling(Kind.LOAD_LAW, number, [float(another)])
+        except Taken:
+            self._note(number, prepared, axis)
+            raise
+        self._note(number, prepared, axis)
+        return tick
 
     def _require_settled(self) -> None:
         """Raise Refused while the loop may still take what was staged before."""

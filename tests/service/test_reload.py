@@ -1,0 +1,89 @@
+"""A reload that the loop takes in part leaves no doubt about what runs: the next one applies the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.engine.memory import SharedBlock
+from rtloop.engine.messages import Kind
+from rtloop.service.desk import Refused
+from rtloop.service.live import LiveLaw
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+TEXT = (DEPLOY / "two-axis.toml").read_text(encoding="utf-8")
+FIRST, SECOND = (axis.name for axis in parse(TEXT, "lab", DEPLOY, "lab.toml").axes)
+
+
+class FakeDesk:
+    """Takes commands, but for those of the axes and kinds in `refuses`."""
+
+    def __init__(self) -> None:
+        self.refuses: set[tuple[Kind, int]] = set()
+        self.taken: list[tuple[Kind, int]] = []
+
+    def submit(self, kind: Kind, *, axis: int, values=()) -> int:
+        if (kind, axis) in self.refuses:
+            raise Refused(f"{kind.name.lower()}: refused at tick 7: tripped or stopping")
+        self.taken.append((kind, axis))
+        return 7
+
+
+def prepared(*changes: tuple[str, str]) -> Prepared:
+    text = TEXT
+    for old, new in changes:
+        assert text.count(old) >= 2, old
+        text = text.replace(old, new)
+    return prepare(parse(text, "lab", DEPLOY, "lab.toml"), paced=False)
+
+
+@pytest.fixture
+def live():
+    before = prepared()
+    sizes = before.plan.sizes._replace(table_samples=1000)
+    return LiveLaw(before, SharedBlock.create(sizes), FakeDesk(), {})  # type: ignore[arg-type]
+
+
+TIGHTER = ("position_um = 60.0", "position_um = 50.0")
+
+
+def positions_um(live: LiveLaw) -> list[float]:
+    """What is noted of the loop, in the configuration and in the coefficients alike."""
+    noted = [axis.interlocks.position_um for axis in live.prepared.configuration.axes]
+    assert np.asarray(live.prepared.plan.coefficients)["position_limit_um"].tolist() == noted
+    return noted
+
+
+def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live):
+    desk = live._desk
+    desk.refuses.add((Kind.LOAD_LAW, 1))
+    with pytest.raises(Refused, match=f"tripped or stopping; changed already: axis.{FIRST}"):
+        live.replace_all(prepared(TIGHTER))
+    assert positions_um(live) == [50.0, 60.0]
+    desk.refuses.clear()
+    assert live.replace_all(prepared(TIGHTER)) == [f"axis.{SECOND}"]
+    assert positions_um(live) == [50.0, 50.0]
+    assert desk.taken == [(Kind.LOAD_LAW, 0), (Kind.LOAD_LAW, 1)]
+    assert live.replace_all(prepared(TIGHTER)) == []
+
+
+def test_a_refusal_of_the_first_changes_nothing(live):
+    live._desk.refuses.add((Kind.LOAD_LAW, 0))
+    with pytest.raises(Refused, match=r"tripped or stopping$"):
+        live.replace_all(prepared(TIGHTER))
+    assert positions_um(live) == [60.0, 60.0]
+
+
+def test_a_reference_that_was_refused_is_played_by_the_next_reload(live):
+    text = TEXT.replace("levels = [10.0, 0.0]", "levels = [5.0, 0.0]").replace("amplitude = 20.0", "amplitude = 9.0")
+    other = prepare(parse(text, "lab", DEPLOY, "lab.toml"), paced=False)
+    live._desk.refuses.add((Kind.SET_REFERENCE, 1))
+    with pytest.raises(Refused, match=f"changed already: axis.{FIRST}"):
+        live.replace_all(other)
+    live._desk.refuses.clear()
+    assert live.replace_all(other) == [f"axis.{SECOND}"]
+    assert live._desk.taken == [(Kind.SET_REFERENCE, 0), (Kind.SET_REFERENCE, 1)]
