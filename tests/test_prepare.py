@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from rtloop.configuration import prepare as preparing
+from rtloop.drivers.errors import MissingLibrary
 from rtloop.drivers.sim import SimDriver
 from tests.paper_configuration import CONTROLLER, TEXT, UNSTABLE, built, faults
 
@@ -74,3 +76,14 @@ def test_every_ramp_to_safe_ends_within_seconds(slew, good):
         (found,) = faults(change)
         assert found.startswith(f"axis.x.limits.trip_slew_v_per_s: {slew:g} takes ")
         assert found.endswith("from 10 V to safe; 5 s, so at least 2 V/s, are allowed")
+
+
+def test_a_library_that_is_missing_is_no_fault_of_the_configuration(monkeypatch):
+    """Exit 69, what is not there; 78 is for what is written wrongly."""
+
+    def missing(kind: str) -> None:
+        raise MissingLibrary(f"driver {kind!r}: libcard.so: cannot open shared object file")
+
+    monkeypatch.setattr(preparing, "driver_class", missing)
+    with pytest.raises(MissingLibrary, match=r"libcard\.so"):
+        built()

@@ -15,7 +15,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import axis_coefficients, joined
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
-from rtloop.drivers.base import Channel, Facts, index_of
+from rtloop.drivers.base import Channel, Driver, Facts, index_of
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
@@ -113,16 +113,19 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
 
 def _facts(configuration: Configuration, paced: bool, findings: _Findings) -> Facts:
     """What the driver says of itself. Raises ConfigError where it cannot be made: nothing else can be judged then."""
-    rate_hz = configuration.loop.rate_hz
-    try:
-        with findings.at("driver."):
-            kind = driver_class(configuration.driver_kind)
-            driver = kind(configuration.driver_options, configuration.wiring, rate_hz)
-            with findings.at(""):
-                return require_facts(driver, rate_hz, paced)
-    except DriverError as error:
-        findings.faults.append(f"driver: {error}")
+    with findings.at("driver."):
+        driver = _driver(configuration)
+        with findings.at(""):
+            return require_facts(driver, configuration.loop.rate_hz, paced)
     raise ConfigError(configuration.source, findings.faults)
+
+
+def _driver(configuration: Configuration) -> Driver:
+    kind = driver_class(configuration.driver_kind)
+    try:
+        return kind(configuration.driver_options, configuration.wiring, configuration.loop.rate_hz)
+    except DriverError as error:
+        raise ConfigError(configuration.source, [f"driver: {error}"]) from None
 
 
 def _pacing(configuration: Configuration, paced: bool) -> Pacing:

@@ -67,10 +67,7 @@ def _update(table: Any, values: Mapping[str, Any]) -> None:
 def item(value: Any) -> Item:
     """A value as it stands in a file; in lists, a mapping is an inline table."""
     if isinstance(value, Mapping):
-        table = tomlkit.table(is_super_table=bool(value) and all(map(_is_table, value.values())))
-        for key, within in _plain_first(value):
-            table.add(key, item(within))
-        return table
+        return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
     if _is_tables(value):
         tables = tomlkit.aot()
         for one in value:
@@ -86,8 +83,8 @@ def roots(values: npt.NDArray[np.complex128]) -> list[list[float]]:
     return [[float(value.real), float(value.imag)] for value in values]
 
 
-def _table(values: Mapping[str, Any]) -> Table:
-    table = tomlkit.table()
+def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
+    table = tomlkit.table(is_super_table=holds_tables_alone)
     for key, value in _plain_first(values):
         table.add(key, item(value))
     return table
