@@ -1,8 +1,8 @@
 """Another law, built in a process of its own: one that takes too long is killed, and whoever asked is told.
 
-The process is started by the first change and waits for more; a killed one is replaced by the next that is needed. It
-reads pickled configurations on its stdin and writes pickled answers to its stdout, and ends with its stdin: with the
-service.
+The process is started once the loop runs, so that it does not delay the loop, and waits; a killed one is replaced by
+the next change. It reads pickled configurations on its stdin and writes pickled answers to its stdout, and ends with
+its stdin: with the service.
 """
 
 from __future__ import annotations
@@ -42,6 +42,11 @@ class Builder:
     def pid(self) -> int | None:
         """Of its process; None where none runs."""
         return None if self._process is None else self._process.pid
+
+    def start(self) -> None:
+        """Start its process without waiting for it; one that cannot be started is tried again by the first change."""
+        with self._lock, contextlib.suppress(OSError):
+            self._start()
 
     def _start(self) -> None:
         if self._process is not None and self._process.poll() is None:
@@ -121,6 +126,11 @@ _builder = Builder()
 def prepare_limited(configuration: Configuration) -> Prepared:
     """Prepare a change of a service in the process beside it. Raises as `Builder.prepare`."""
     return _builder.prepare(configuration)
+
+
+def expect_changes() -> None:
+    """Have the process ready before it is needed."""
+    _builder.start()
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.recording.file.recover import leftovers, recover
-from rtloop.service.building import prepare_limited
+from rtloop.service.building import expect_changes, prepare_limited
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
 from rtloop.service.notify import Notifier
@@ -253,6 +253,7 @@ class Service:
         if not self._ready and supervisor.ticks >= READY_TICKS:
             self._ready = True
             self.notifier.send(READY=1)
+            self._aside(expect_changes)
         if self._told_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
         if not self.notifier.due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):

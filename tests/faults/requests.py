@@ -19,8 +19,9 @@ from tests.service.hostile import EXPENSIVE, hostile
 from tests.service.http import exchange
 
 RELOADS, CLIENTS, REQUESTS = 100, 8, 60
-AT_ONCE_MS, BUILT_MS = 60.0, 2000.0
-"""From a signal; from a request, whose coefficients must be built and verified first."""
+AT_ONCE_MS, BUILT_MS, FIRST_BUILT_MS = 60.0, 1000.0, 4000.0
+"""From a signal; from a request, whose coefficients must be built and verified first; from such a one that comes with
+the first ticks, while the process that builds is still starting."""
 SILENT, BODIES, SEED, STOPPED_MS = 600, 200, 14, 2000.0
 BAD = (
     b"",
@@ -144,9 +145,9 @@ def second_instance(bench: Bench) -> Measured:
 def trip_and_reset(bench: Bench) -> Measured:
     """An interlock tightened until it trips; start, mode and arm are refused until the reset; twice."""
     took_ms = 0.0
-    for _ in range(2):
+    for allowed_ms in (FIRST_BUILT_MS, BUILT_MS):
         bench.strike(lambda: tune(bench, position_um=5.0))
-        took_ms = max(took_ms, bench.await_safe(BUILT_MS))
+        took_ms = max(took_ms, bench.await_safe(allowed_ms))
         bench.await_state("tripped", "position")
         for path, body in (("/start", {}), ("/mode", {"mode": "raw"}), ("/arm", {})):
             assert is_refused(bench, path, body), path

@@ -40,6 +40,18 @@ def test_what_is_built_beside_is_what_is_built_here():
     assert builder.pid is None
 
 
+def test_one_that_is_expected_waits_before_the_first_change():
+    builder = Builder(build_s=60.0)
+    try:
+        builder.start()
+        pid = builder.pid
+        assert pid is not None
+        assert builder.prepare(configuration()).plan.axes == ("x",)
+        assert builder.pid == pid
+    finally:
+        builder.end()
+
+
 def test_a_configuration_survives_the_way():
     here = configuration()
     assert pickle.loads(pickle.dumps(here)) == here
