@@ -16,6 +16,7 @@ import platform
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import llvmlite
@@ -25,6 +26,7 @@ import numba.extending
 import numba.np.linalg
 from numba import config as numba_config
 
+from rtloop.hil.native.uncompiled import address_of
 from rtloop.hil.trusted import open_folder
 
 
@@ -48,7 +50,7 @@ def _absent() -> None:
 
 _load_arrays_without_blas()
 PACKAGE = Path(__file__).parents[2]
-KERNELS = ("hil", "drivers", "law", "engine", "signals.py")
+KERNELS = ("hil", "drivers", "law", "laws", "engine", "signals.py")
 """Where compiled code, and what it is made from, may stand."""
 OPTIONS = "options.py"
 """Files there that hold what a user may say: no kernel is made from one, and an edited text in one compiles nothing."""
@@ -103,6 +105,10 @@ numba_config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAcc
 numba_config.SLP_VECTORIZE, numba_config.LOOP_VECTORIZE = 1, 0  # pyright: ignore[reportAttributeAccessIssue]
 
 
+UNCOMPILED = bool(getattr(numba_config, "DISABLE_JIT", 0))
+"""Whether kernels are to run as they are written, which NUMBA_DISABLE_JIT=1 asks for."""
+
+
 def jit(function: Callable[..., Any]) -> Any:
     """Compile a kernel on first use, part of its compiled callers; `.py_func` is the same kernel uncompiled.
 
@@ -114,6 +120,11 @@ def jit(function: Callable[..., Any]) -> Any:
 def guarded(function: Callable[..., Any]) -> Any:
     """As `jit`, for what is told its indices: one beyond its array is an IndexError, and no write to somewhere."""
     return numba.njit(cache=True, error_model="numpy", forceinline=True, boundscheck=True)(function)
+
+
+def checked(function: Callable[..., Any]) -> Any:
+    """Compile somebody else's kernel: an index beyond its array, or a division by zero, is an exception."""
+    return numba.njit(error_model="python", boundscheck=True)(function)
 
 
 def seldom(function: Callable[..., Any]) -> Any:
@@ -138,4 +149,18 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 def cfunc(signature: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a kernel to a C function whose `.address` other compiled code may call."""
+    if UNCOMPILED:
+        return lambda function: SimpleNamespace(address=address_of(function))
     return numba.cfunc(signature, cache=True, error_model="numpy")
+
+
+def native_address(kernel: Any, signature: Any) -> int:
+    """Address of a kernel, as `jit` or `checked` gives it, for `call_law`; compiled, or loaded, for one signature.
+
+    Raises numba's TypingError and what it raises otherwise for what it cannot compile.
+    """
+    if UNCOMPILED:
+        return address_of(kernel)
+    kernel.compile(signature)
+    found = kernel.overloads[signature.args]
+    return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)

@@ -1,7 +1,7 @@
 """C function pointers and raw addresses, as compiled code calls and reads them.
 
-Everything that the loop calls has one shape, `int32 function(void *context, double *values)`: drivers and clocks are
-interchangeable objects and not branches in the loop.
+Drivers and clocks have one shape, `int32 function(void *context, double *values)`, and the functions of a law another:
+both are interchangeable objects and not branches in the loop.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from llvmlite import ir
 from numba import carray as _carray  # pyright: ignore[reportPrivateImportUsage]
 from numba import types
 
-from rtloop.hil.native.compiled import intrinsic
+from rtloop.hil.native import uncompiled
+from rtloop.hil.native.compiled import UNCOMPILED, intrinsic
 
-carray: Any = _carray
+carray: Any = uncompiled.carray if UNCOMPILED else _carray
 """numba's array view of a pointer."""
 SIGNATURE = types.int32(types.voidptr, types.CPointer(types.float64))
 """numba's signature of `int32 function(void *context, double *values)`."""
@@ -37,6 +38,25 @@ def call(typingctx: Any, function: Any, context: Any, values: Any) -> Any:
 
 
 @intrinsic
+def call_law(typingctx: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, told: Any) -> Any:
+    """Call a compiled function of two records and a third or a number; its status, 0 where it came to its end.
+
+    Function and records are given as integers, as are the places where it may write what it returns and what it
+    raised. This is how compiled functions call each other: an exception is a status, and nothing is unwound.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = ir.IntType(8).as_pointer()
+        last = ir.DoubleType() if number else pointer
+        target = builder.inttoptr(arguments[0], ir.FunctionType(ir.IntType(32), [pointer] * 4 + [last]).as_pointer())
+        given = [builder.inttoptr(argument, pointer) for argument in arguments[1:5]]
+        return builder.call(target, [*given, arguments[5] if number else builder.inttoptr(arguments[5], pointer)])
+
+    number = isinstance(told, types.Float)
+    return types.int32(*[types.intp] * 5, types.float64 if number else types.intp), codegen
+
+
+@intrinsic
 def address_pointer(typingctx: Any, address: Any) -> Any:
     """An integer address as `void *`, for numba.carray."""
 
@@ -44,3 +64,7 @@ def address_pointer(typingctx: Any, address: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), codegen
+
+
+if UNCOMPILED:
+    call, call_law, address_pointer = uncompiled.call, uncompiled.call_law, uncompiled.address_pointer

@@ -29,7 +29,7 @@ from rtloop.errors import ConfigError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import compensated, residual_operator
 from rtloop.hysteresis.plays import model_output
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.values import fields_of, plain
 
 Input = Literal["hysteresis", "command", "drive"]

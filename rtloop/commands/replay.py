@@ -15,9 +15,8 @@ from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Driver
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
-from rtloop.law.layout import Records
 from rtloop.recording.load import Recording, load
-from rtloop.recording.replay.whatif import other_law, recorded_coefficients, resimulate
+from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
 
 Progress = Callable[[int], None]
 
@@ -25,8 +24,8 @@ Progress = Callable[[int], None]
 def replay_with_other_law(files: Sequence[Path], other: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Differences between the recorded outputs and those of another configuration's law on the recorded inputs."""
     recording = load(files)
-    coefficients = _coefficients(config.load(other), recording)
-    return {**_about(recording, other), **other_law(recording, coefficients, progress)}
+    law = _law(config.load(other), recording)
+    return {**_about(recording, other), **other_law(recording, law, progress)}
 
 
 def replay_on_the_rig(files: Sequence[Path], other: Path | None, progress: Progress | None = None) -> dict[str, Any]:
@@ -35,19 +34,19 @@ def replay_on_the_rig(files: Sequence[Path], other: Path | None, progress: Progr
     if other is None:
         path = recording.paths[0]
         configuration = config.parse(recording.configuration, path.stem, path.parent, f"configuration in {path}")
-        coefficients = recorded_coefficients(recording)
+        law = recorded_law(recording)
     else:
         configuration = config.load(other)
-        coefficients = _coefficients(configuration, recording)
+        law = _law(configuration, recording)
     driver = _rig(configuration, recording)
-    return {**_about(recording, other), **resimulate(recording, coefficients, driver, progress)}
+    return {**_about(recording, other), **resimulate(recording, law, driver, progress)}
 
 
 def _about(recording: Recording, other: Path | None) -> dict[str, Any]:
     return {"recording": str(recording.paths[0]), "config": None if other is None else str(other)}
 
 
-def _coefficients(configuration: Configuration, recording: Recording) -> Records:
+def _law(configuration: Configuration, recording: Recording) -> Law:
     """The law of a configuration for the recording's axes and rate. Raises ConfigError."""
     header, faults = recording.header, []
     names = [axis.name for axis in configuration.axes]
@@ -57,7 +56,8 @@ def _coefficients(configuration: Configuration, recording: Recording) -> Records
         faults.append(f"loop.rate_hz: {configuration.loop.rate_hz:g}; the recording has {header['rate_hz']:g}")
     if faults:
         raise ConfigError(configuration.source, faults)
-    return prepare(changed(configuration, schedule=())).plan.coefficients.view(np.recarray)
+    plan = prepare(changed(configuration, schedule=())).plan
+    return Law(plan.laws, plan.coefficients.view(np.recarray))
 
 
 def _rig(configuration: Configuration, recording: Recording) -> Driver:

@@ -7,123 +7,10 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from rtloop.hil.options import Factor, Numbers, Options, Root
-from rtloop.law.hysteresis import PlayModel, play_model
+from rtloop.hil.options import Numbers, Options
 from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
-from rtloop.linear.transfer import Transfer
-
-Matrix = Annotated[tuple[Numbers, ...], Field(strict=False)]
-
-
-class FeedforwardOptions(Options):
-    """Inverse hysteresis: the forward model's thresholds and weights (inverted by formula), or an explicit inverse."""
-
-    thresholds_v: Numbers = ()
-    weights_um_per_v: Numbers = ()
-    inverse_thresholds_um: Numbers = ()
-    inverse_weights_v_per_um: Numbers = ()
-    dead_band: Literal["none", "exact"] = "none"
-    """What is done about a first threshold r_0 > 0. `exact` leaves no residual but jumps by 2 r_0 at each reversal:
-    right for smooth commands known beforehand; a noisy command (closed loop) makes it chatter."""
-    dead_band_threshold_v: float = Field(default=1e-6, ge=0)
-    """`exact` reverses only when the drive without dead band has turned by more than this."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        self.models()
-        if self.dead_band == "exact" and not self.thresholds_v:
-            raise ValueError("dead_band is 'exact': allowed only with thresholds_v, whose first value it needs")
-        return self
-
-    def actuator(self) -> PlayModel:
-        """The forward model as it was identified, its dead band included."""
-        if self.thresholds_v:
-            return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))
-        return self.models()[0]
-
-    def models(self) -> tuple[PlayModel, PlayModel]:
-        """Forward model and inverse, consistent with each other."""
-        if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
-            raise ValueError(
-                "either thresholds_v with weights_um_per_v, or inverse_thresholds_um with inverse_weights_v_per_um, "
-                "is needed"
-            )
-        if self.inverse_thresholds_um:
-            inverse = play_model("inverse", self.inverse_thresholds_um, self.inverse_weights_v_per_um)
-            if inverse.thresholds[0] != 0:
-                raise ValueError(f"inverse_thresholds_um: the first, {inverse.thresholds[0]:g}, must be 0")
-            return inverse.inverse(), inverse
-        forward = play_model("forward model", self.thresholds_v, self.weights_um_per_v)
-        behind = forward.without_dead_band()
-        return (forward if self.dead_band == "exact" else behind), behind.inverse()
-
-
-class TransferOptions(Options):
-    """A transfer function in s (rad/s): factors, zeros and poles, two polynomials, or a state space."""
-
-    form: Literal["factors", "zpk", "transfer_function", "state_space"] = "factors"
-    gain: float | None = None
-    numerator: Annotated[tuple[Factor | float, ...], Field(strict=False)] = ()
-    denominator: Annotated[tuple[Factor | float, ...], Field(strict=False)] = ()
-    zeros: Annotated[tuple[Root, ...], Field(strict=False)] = ()
-    poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
-    a: Matrix = ()
-    b: Numbers = ()
-    c: Numbers = ()
-    d: float | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        allowed = {
-            "factors": {"gain", "numerator", "denominator"},
-            "zpk": {"gain", "zeros", "poles"},
-            "transfer_function": {"numerator", "denominator"},
-            "state_space": {"a", "b", "c", "d"},
-        }
-        parts = set().union(*allowed.values())
-        foreign = sorted((self.model_fields_set & parts) - allowed[self.form])
-        if foreign:
-            raise ValueError(
-                f"{', '.join(foreign)}: not part of form {self.form!r}, which takes "
-                f"{', '.join(sorted(allowed[self.form]))}"
-            )
-        self.transfer()
-        return self
-
-    def transfer(self) -> Transfer:
-        """The transfer function. Raises ValueError for an improper or malformed one."""
-        if self.form == "zpk":
-            zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
-            return Transfer.from_zpk(zeros, poles, self._gain())
-        if self.form == "state_space":
-            if self.d is None:
-                raise ValueError("d: needed in a state space; 0.0 for no direct part")
-            return Transfer.from_state_space(np.array(self.a), self.b, self.c, self.d)
-        nested = [isinstance(part, tuple) for part in (*self.numerator, *self.denominator)]
-        if self.form == "transfer_function":
-            if any(nested):
-                raise ValueError("numerator and denominator: lists of numbers in form 'transfer_function'")
-            return Transfer.from_transfer_function(self.numerator, self.denominator)
-        if not all(nested):
-            raise ValueError("numerator and denominator: lists of lists of numbers in form 'factors'")
-        return Transfer.from_factors(self._gain(), self.numerator, self.denominator)
-
-    def _gain(self) -> float:
-        if self.gain is None:
-            raise ValueError(f"gain: needed in form {self.form!r}")
-        return self.gain
-
-
-class ControllerOptions(TransferOptions):
-    """C(s) and how it becomes C(z)."""
-
-    method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
-    prewarp_hz: float | None = Field(default=None, gt=0)
-    tracking_s: float = Field(default=0.0005, ge=0)
-    """Anti-windup: time constant with which the states follow a command that was limited, short against the loop's
-    response. 0 is at once, which lets even a single limited tick throw the slow states off."""
-    allow_unstable: bool = False
-    """Run although the loop is unstable on the axis's model."""
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions, TransferControllerOptions
+from rtloop.linear.options import Matrix, TransferOptions
 
 
 class ModelOptions(TransferOptions):
@@ -272,8 +159,8 @@ class AxisOptions(Options):
     """One axis of the law."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")
-    feedforward: FeedforwardOptions
-    controller: ControllerOptions | None = None
+    feedforward: PrandtlIshlinskiiOptions
+    controller: TransferControllerOptions | None = None
     model: ModelOptions | None = None
     specification: str | None = None
     """File, relative to the configuration's, with what the loop is asked to do; `rtloop design verify` judges it."""

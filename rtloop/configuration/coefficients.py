@@ -2,44 +2,71 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from rtloop.configuration.axis import AxisOptions, FeedforwardOptions, InterlockOptions, LimitsOptions, PrefilterOptions
+from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptions, PrefilterOptions
 from rtloop.drivers.base import Channel
-from rtloop.law.layout import BLOCK, COEFFICIENTS, LANES, MAX_ORDER, Records, records
-from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.realisation import blocks, row_bands
+from rtloop.law.layout import Records
+from rtloop.law.memory import records
+from rtloop.laws.contract import Controller, Law, record_of
+from rtloop.laws.registry import law_class, layout_of
+
+DEFAULT_LAWS = ("prandtl_ishlinskii", "transfer")
+"""Known to every loop. An axis without a controller has the last one, with coefficients of 0: it commands nothing."""
+
+
+def laws_of(axes: Sequence[AxisOptions]) -> tuple[str, ...]:
+    """Kinds of all laws of these axes, each once."""
+    named = [part.kind for axis in axes for part in (axis.feedforward, axis.controller) if part is not None]
+    return tuple(dict.fromkeys((*DEFAULT_LAWS, *named)))
+
+
+def controller_of(axis: AxisOptions, period_s: float) -> Controller | None:
+    """The controller of an axis, not yet built. Raises ValueError for a kind that is not known, or no controller."""
+    if axis.controller is None:
+        return None
+    kind = law_class(axis.controller.kind)
+    if not issubclass(kind, Controller):
+        raise ValueError(f"kind: {axis.controller.kind!r} is no controller")
+    return kind(axis.controller, period_s, axis.model)
 
 
 def axis_coefficients(
+    laws: Sequence[str],
     axis: AxisOptions,
-    controller: DiscreteController | None,
+    controller: Controller | None,
     um_per_v: float,
     offset_v: float,
     output: Channel,
     period_s: float,
     enable: bool = False,
 ) -> Records:
-    """Coefficients (1,) of one axis; `enable` where the loop has an enable input.
+    """Coefficients (1,) of one axis in a loop that knows `laws`; `enable` where the loop has an enable input.
 
     Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
     """
-    coefficients = records(COEFFICIENTS, 1)
-    fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v}
-    fields |= _feedforward(axis.feedforward)
-    fields |= _controller(controller)
-    if axis.controller is not None and controller is not None:
-        fields["tracking_share"] = _tracking_share(controller, axis.controller.tracking_s, period_s)
+    coefficients = records(layout_of(laws).coefficients, 1)
+    feedforward = law_class(axis.feedforward.kind)(axis.feedforward, period_s, axis.model)
+    fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v, "controller_axes": 1}
+    fields |= _law("feedforward", feedforward, laws)
+    if controller is None:
+        fields["controller_law"] = laws.index(DEFAULT_LAWS[-1])
+    else:
+        fields |= _law("controller", controller, laws)
+        fields["resting_error"] = [controller.resting_error()]
     fields |= _prefilter(axis.prefilter)
     fields |= limit_fields(axis.limits, output, period_s)
     fields |= interlock_fields(axis.interlocks, enable)
     for name, value in fields.items():
         _assign(coefficients, name, value)
     return coefficients
+
+
+def _law(slot: str, law: Law, laws: Sequence[str]) -> Mapping[str, object]:
+    """The law's number, and its coefficients as bytes."""
+    return {f"{slot}_law": laws.index(law.kind), slot: record_of(law).view(np.uint8)}
 
 
 def _assign(coefficients: Records, name: str, value: object) -> None:
@@ -50,92 +77,6 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
         coefficients[name][0] = numbers
     else:
         target[tuple(slice(0, length) for length in numbers.shape)] = numbers
-
-
-def _feedforward(options: FeedforwardOptions) -> Mapping[str, object]:
-    forward, inverse = options.models()
-    return {
-        "play_count": -(-forward.weights.size // LANES) * LANES,
-        "model_thresholds_v": forward.thresholds,
-        "model_weights_um_per_v": forward.weights,
-        "inverse_thresholds_um": inverse.thresholds,
-        "inverse_weights_v_per_um": inverse.weights,
-        "dead_band_v": forward.thresholds[0] if options.dead_band == "exact" else 0.0,
-        "dead_band_threshold_v": options.dead_band_threshold_v,
-    }
-
-
-def _controller(controller: DiscreteController | None) -> Mapping[str, object]:
-    if controller is None:
-        return {}
-    order = controller.b.size
-    if order > MAX_ORDER:
-        raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
-    places = _places(controller.a)
-
-    def placed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        vector = np.zeros(MAX_ORDER)
-        vector[places] = values
-        return vector
-
-    a = np.zeros((MAX_ORDER, MAX_ORDER))
-    a[np.ix_(places, places)] = controller.a
-    states = np.arange(MAX_ORDER)
-    partners = states ^ LANES
-    own, partner = a[states, states], a[states, partners]
-    a[states, states] = a[states, partners] = 0.0
-    bands = row_bands(a)
-    return {
-        "order": -(-(int(places.max(initial=-1)) + 1) // BLOCK) * BLOCK,
-        "own": own,
-        "partner": partner,
-        "coupling": a,
-        "coupled": bool(a.any()),
-        "row_start": bands[:, 0],
-        "row_stop": bands[:, 1],
-        "b": placed(controller.b),
-        "c": placed(controller.c),
-        "d": controller.d,
-        "tracking": placed(controller.antiwindup),
-        "steady_state": placed(controller.steady_state_gain),
-        "resting_error": _resting_error(controller),
-    }
-
-
-def _resting_error(controller: DiscreteController) -> float:
-    """Error per command that keeps C(z) at rest: 1/C(1). 0 with an integrator, and where C hardly passes 0 Hz."""
-    hz = np.geomspace(1e-3, 0.5, 200) / controller.period_s
-    at_rest, largest = abs(controller.dc_gain), np.abs(controller.response(hz)).max(initial=0.0)
-    return 1 / controller.dc_gain if at_rest > 1e-3 * largest else 0.0
-
-
-def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Place of each state in the kernels' order: blocks of four pairs, a pair's two states LANES apart.
-
-    The two states of a 2×2 block of A make a pair, and so do the other states, two by two.
-    """
-    found = blocks(a)
-    pairs = [(block.start, block.start + 1) for block in found if block.stop - block.start == 2]
-    single = [block.start for block in found if block.stop - block.start == 1]
-    pairs += [tuple(single[i : i + 2]) for i in range(0, len(single), 2)]
-    places = np.zeros(a.shape[0], np.int64)
-    for number, pair in enumerate(pairs):
-        for half, state in enumerate(pair):
-            places[state] = number // LANES * BLOCK + number % LANES + half * LANES
-    return places
-
-
-def _tracking_share(controller: DiscreteController, tracking_s: float, period_s: float) -> float:
-    """Share of a shortfall that the states take up in a tick. Raises ValueError where that is not stable."""
-    share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
-    a, m, c = controller.a, controller.antiwindup, controller.c
-    radius = np.abs(np.linalg.eigvals(a - share * np.outer(a @ m, c))).max(initial=0.0)
-    if not radius < 1:
-        raise ValueError(
-            f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
-            f"(largest |pole| {radius:.6g}); a smaller one, or 0, is needed"
-        )
-    return share
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:

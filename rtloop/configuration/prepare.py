@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_continuous, analyse_discrete
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import axis_coefficients, joined
+from rtloop.configuration.coefficients import axis_coefficients, controller_of, joined, laws_of
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.drivers.base import Channel, Driver, Facts, index_of
@@ -23,7 +23,9 @@ from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
 from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
-from rtloop.linear.discretise import DiscreteController, discretise
+from rtloop.laws.contract import Controller
+from rtloop.laws.shipped.transfer import TransferController
+from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 from rtloop.signals import Mode
 
@@ -39,6 +41,7 @@ class AxisCheck:
     """What is known of an axis before it runs; None where there is no controller or no model."""
 
     name: str
+    law: Controller | None = None
     controller: Transfer | None = None
     discrete: DiscreteController | None = None
     comparison: Comparison | None = None
@@ -83,7 +86,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     for axis in configuration.axes:
         check = _check(axis, 1.0 / rate_hz, findings)
         checks.append(check)
-        coefficients.append(_coefficients(configuration, axis, check.discrete, facts, findings))
+        coefficients.append(_coefficients(configuration, axis, check.law, facts, findings))
         if axis.controller is None and _uses_closed_loop(configuration):
             findings.faults.append(f"axis.{axis.name}.controller: missing; mode closed_loop needs it")
     table = TableOfSamples()
@@ -100,6 +103,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         driver_kind=configuration.driver_kind,
         driver_options=configuration.driver_options.model_dump(exclude_unset=True),
         wiring=configuration.wiring,
+        laws=laws_of(configuration.axes),
         coefficients=joined(coefficients),
         mode=Mode[configuration.loop.mode.upper()],
         generators=generators,
@@ -151,17 +155,18 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
     if axis.controller is None:
         return AxisCheck(axis.name)
     where, options = f"axis.{axis.name}.controller", axis.controller
-    transfer = options.transfer()
-    discrete = None
+    transfer, law, discrete = options.transfer(), None, None
     with findings.at(f"{where}: "):
-        discrete = discretise(transfer, period_s, options.method, options.prewarp_hz)
+        law = controller_of(axis, period_s)
+        if isinstance(law, TransferController):
+            discrete = law.discrete
     if discrete is None:
-        return AxisCheck(axis.name, transfer)
+        return AxisCheck(axis.name, None, transfer)
     comparison = compare(transfer, discrete, up_to_hz=COMPARED_PART / period_s)
     findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
     if axis.model is None:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
-        return AxisCheck(axis.name, transfer, discrete, comparison)
+        return AxisCheck(axis.name, law, transfer, discrete, comparison)
     plant, continuous, running = axis.model.transfer(), None, None
     with findings.at(f"axis.{axis.name}.model: "):
         continuous = analyse_continuous(transfer, plant)
@@ -175,13 +180,13 @@ def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck
             findings.warnings.append(message_)
         else:
             findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
-    return AxisCheck(axis.name, transfer, discrete, comparison, plant, continuous, running)
+    return AxisCheck(axis.name, law, transfer, discrete, comparison, plant, continuous, running)
 
 
 def _coefficients(
     configuration: Configuration,
     axis: AxisOptions,
-    discrete: DiscreteController | None,
+    controller: Controller | None,
     facts: Facts,
     findings: _Findings,
 ) -> Records | None:
@@ -195,7 +200,9 @@ def _coefficients(
         return None
     with findings.at(f"axis.{axis.name}."):
         period_s, enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
-        return axis_coefficients(axis, discrete, channel.um_per_v, channel.offset, output, period_s, enable=enable)
+        return axis_coefficients(
+            laws_of(configuration.axes), axis, controller, channel.um_per_v, channel.offset, output, period_s, enable
+        )
     return None
 
 

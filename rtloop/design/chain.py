@@ -33,7 +33,7 @@ from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edited
 from rtloop.hysteresis.plays import model_output
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 
 LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of

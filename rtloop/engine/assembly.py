@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +14,11 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
 from rtloop.law.law import set_mode
-from rtloop.law.layout import COEFFICIENTS, CONDITIONS, Records, copied, initial_state
+from rtloop.law.layout import CONDITIONS
+from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR
+from rtloop.laws.binding import functions_of
+from rtloop.laws.registry import BUILT_IN, layout_of
 from rtloop.signals import Mode
 
 SNAPSHOT_SECONDS = 1.0
@@ -23,34 +26,24 @@ REHEARSED_TICKS = 100
 UNLIMITED = np.iinfo(np.int64).max
 
 
-class LawArrays(NamedTuple):
-    """Coefficients and state, before or in the middle of a run."""
-
-    coefficients: Records
-    axes: Records
-    state: Records
-
-
-def law_at_rest(plan: Plan) -> LawArrays:
+def law_at_rest(plan: Plan) -> LawMemory:
     """The plan's law before its first tick."""
-    coefficients = copied(plan.coefficients)
-    axes, state = initial_state(coefficients)
-    set_mode(axes, state[0], int(plan.mode), True)
-    return LawArrays(coefficients, axes, state)
+    memory = LawMemory.at_rest(plan.layout, functions_of(plan.laws), plan.coefficients)
+    set_mode(memory.law, int(plan.mode), True)
+    return memory
 
 
 class Assembly:
     """A loop's context (`loop`, one record) and the arrays that it points to, kept alive together."""
 
     def __init__(
-        self, plan: Plan, block: SharedBlock, facts: Facts, pointers: Pointers, clock: Clock, law: LawArrays
+        self, plan: Plan, block: SharedBlock, facts: Facts, pointers: Pointers, clock: Clock, law: LawMemory
     ) -> None:
         self._loops = np.zeros(1, LOOP).view(np.recarray)
         self.loop = self._loops[0]
         self._arrays: dict[str, np.ndarray[Any, Any]] = {}
-        self._point("coefficients", law.coefficients)
-        self._point("axes", law.axes)
-        self._point("law_state", law.state)
+        self._law = law
+        self._point("law", law.records)
         self._wire(plan, facts)
         self._share(plan, block)
         self._call(pointers, clock)
@@ -107,7 +100,7 @@ class Assembly:
                 self._point(f"{name}_{part}", block[f"{name}_{part}"])
             self._loops[f"{name}_capacity"] = block[f"{name}_marks"].size
         block["table"][: plan.table.size] = plan.table
-        block["last_drive_v"][:] = self._arrays["axes"]["drive_v"]
+        block["last_drive_v"][:] = self._law.axes["drive_v"]
         loop.table_count, loop.command_count = block["table"].size, block["commands"].size
         loop.column_count, loop.snapshot_bytes = block["ticks_slots"].shape[1], block["snapshots_slots"].shape[1]
         self._point("generators", plan.generators.copy())
@@ -127,10 +120,13 @@ def rehearse() -> None:
     """Compile the loop, the clocks and the simulated rig: some ticks in virtual time, within the caller's process."""
     pacing = Pacing(rate_hz=1000.0, paced=False)
     wiring = {"x": Wiring("adc0", "dac0")}
-    coefficients = np.zeros(1, COEFFICIENTS)
+    laws = tuple(BUILT_IN)
+    coefficients = np.zeros(1, layout_of(laws).coefficients)
+    coefficients["controller_axes"], coefficients["controller_law"] = 1, laws.index("transfer")
+    coefficients["feedforward_law"] = laws.index("prandtl_ishlinskii")
     coefficients["trip_slew_v_per_tick"] = Channel("dac0").maximum_v
     nothing = np.zeros(0, MESSAGE)
-    plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, coefficients, Mode.OFF,
+    plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, laws, coefficients, Mode.OFF,
                 np.zeros(1, GENERATOR), np.zeros(0), nothing, ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
     driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
     ring = block.ring("ticks")

@@ -10,14 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from rtloop.engine.context import (
-    axes_of,
-    coefficients_of,
     event_ring,
     generators_of,
+    law_of,
     messages,
     octets,
-    staged_of,
-    state_of,
     unsigned,
     words_of,
 )
@@ -26,9 +23,11 @@ from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
 from rtloop.hil.native.atomics import exchanged, load_acquire, store_release
 from rtloop.hil.native.compiled import guarded, jit, seldom, seldom_guarded
-from rtloop.law.filters import fill_prefilter_anew
-from rtloop.law.law import counts_fit, reset_trip, set_controller, set_mode
+from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.law.access import coefficients_of, loop_of, state_of
+from rtloop.law.law import fits, reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS
+from rtloop.law.prefilter import fill_prefilter_anew
 from rtloop.law.reference import GENERATOR_PARAMETERS, Generator
 from rtloop.signals import Mode
 
@@ -37,7 +36,6 @@ HEAD, TAIL, STOP_WORD = int(Word.COMMANDS_HEAD), int(Word.COMMANDS_TAIL), int(Wo
 SET_MODE, SET_REFERENCE, RESET_TRIP, STOP, LOAD_LAW, REFUSED = (
     int(kind) for kind in (Kind.SET_MODE, Kind.SET_REFERENCE, Kind.RESET_TRIP, Kind.STOP, Kind.LOAD_LAW, Kind.REFUSED)
 )
-COEFFICIENT_BYTES = COEFFICIENTS.itemsize
 OFF, RAW, FEEDFORWARD, CLOSED_LOOP = (int(mode) for mode in Mode)
 HOLD = int(Generator.HOLD)
 GONE = np.uint64(0)
@@ -109,7 +107,7 @@ def _apply_queue(loop):
 
 @seldom
 def _apply(loop, command):
-    state = state_of(loop)
+    law, state = law_of(loop), loop_of(law_of(loop))
     if command.kind == SET_MODE:
         if state.trip != 0 or loop.stopping != 0:
             values = (float(command.kind), command.values[0])
@@ -118,13 +116,13 @@ def _apply(loop, command):
         mode = np.int64(command.values[0])
         if mode != OFF:
             _change_units(loop, mode, command.values[2] != 0.0)
-        set_mode(axes_of(loop), state, mode, loop.tick == 0, command.values[1] == 0.0)
+        set_mode(law, mode, loop.tick == 0)
     elif command.kind == SET_REFERENCE:
         _set_reference(loop, command)
     elif command.kind == RESET_TRIP:
-        reset_trip(state)
+        reset_trip(law)
     elif command.kind == LOAD_LAW:
-        if not _load_law(loop, command.axis, command.values[0] != 0.0, command.values[1] == 0.0):
+        if not _load_law(loop, command.axis, command.values[0] != 0.0):
             publish_event(loop, REFUSED, command.axis, command.origin, command.identity, (float(command.kind), 0.0))
             return
     elif command.kind == STOP:
@@ -146,14 +144,14 @@ def _apply(loop, command):
 @guarded
 def _change_units(loop, mode, held):
     """References are volts, or micrometres, from here on; if `held`, one of the other unit gives way to what is."""
-    generators, axes, volts = generators_of(loop), axes_of(loop), 1 if mode == RAW else 0
+    generators, law, volts = generators_of(loop), law_of(loop), 1 if mode == RAW else 0
     for a in range(loop.axis_count):
         if held and generators[a].volts != volts:
-            in_force = axes[a].drive_v
+            in_force = state_of(law, a).drive_v
             if mode == FEEDFORWARD:
-                in_force = axes[a].applied_command_um
+                in_force = state_of(law, a).applied_command_um
             elif mode == CLOSED_LOOP:
-                in_force = axes[a].position_um
+                in_force = state_of(law, a).position_um
             generators[a].kind, generators[a].parameters[0] = HOLD, in_force
             generators[a].start_tick = generators[a].held_until = loop.tick
         generators[a].volts = volts
@@ -161,7 +159,7 @@ def _change_units(loop, mode, held):
 
 @guarded
 def _set_reference(loop, command):
-    generators, volts = generators_of(loop), 1 if state_of(loop).mode == RAW else 0
+    generators, volts = generators_of(loop), 1 if loop_of(law_of(loop)).mode == RAW else 0
     for a in range(loop.axis_count):
         if command.axis < 0 or command.axis == a:
             generators[a].kind = np.int64(command.values[0])
@@ -173,30 +171,45 @@ def _set_reference(loop, command):
 
 
 @guarded
-def _load_law(loop, axis, another, fitting):
-    """Take the staged coefficients of an axis and make its state fit; False where their counts do not fit a record.
+def _load_law(loop, first, another):
+    """Take the staged coefficients of an axis, and of those that share its controller, and make their state fit.
 
-    Another controller continues from the command in force. Another pre-filter begins with the reference in force; where
-    not `fitting` (as in recordings of revision 1) it does so only where its memory would not fit.
+    False, and nothing taken, where their counts do not fit a record. Another controller continues from the command in
+    force. Another pre-filter begins with the reference in force.
     """
-    offset = axis * COEFFICIENT_BYTES
-    size = (loop.axis_count) * COEFFICIENT_BYTES
-    staged, active = octets(loop.staged, size), octets(loop.coefficients, size)
-    before, after = coefficients_of(loop)[axis], staged_of(loop)[axis]
-    if not counts_fit(after):
+    law = law_of(loop)
+    size = law.coefficients_bytes
+    if first < 0 or first >= law.axis_count:
         return False
+    staged = loop.staged + first * size
+    count = max(np.int64(carray(address_pointer(staged), 1, COEFFICIENTS)[0].controller_axes), 1)
+    for i in range(count):
+        other = carray(address_pointer(staged + i * size), 1, COEFFICIENTS)[0]
+        if not fits(law, first + i, staged + i * size):
+            return False
+        if other.controller_axes != coefficients_of(law, first + i).controller_axes:
+            return False
+    for i in range(count):
+        _take_axis(law, first + i, staged + i * size)
+    if another:
+        set_controller(law, first)
+    loop.next_snapshot = loop.tick
+    return True
+
+
+@guarded
+def _take_axis(law, a, staged):
+    """Coefficients of one axis, from an address."""
+    before, after = coefficients_of(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
     refilled = before.tap_count != after.tap_count or before.section_count != after.section_count
-    if fitting and not refilled:
+    if not refilled:
         for i in range(after.section_count):
             for j in range(after.sections.shape[1]):
                 refilled = refilled or before.sections[i, j] != after.sections[i, j]
-    active[offset : offset + COEFFICIENT_BYTES] = staged[offset : offset + COEFFICIENT_BYTES]
+    size = law.coefficients_bytes
+    octets(law.coefficients + a * size, size)[:] = octets(staged, size)
     if refilled:
-        fill_prefilter_anew(axes_of(loop)[axis])
-    if another:
-        set_controller(axes_of(loop)[axis])
-    loop.next_snapshot = loop.tick
-    return True
+        fill_prefilter_anew(state_of(law, a))
 
 
 @seldom

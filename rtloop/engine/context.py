@@ -12,7 +12,7 @@ from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
+from rtloop.law.layout import CONDITIONS, LAW
 from rtloop.law.reference import GENERATOR
 
 WORDS = 64
@@ -22,7 +22,7 @@ _ADDRESSES = (
     # buffers that the driver and the clock fill or read
     *("inputs", "outputs", "timing"),
     # law
-    *("coefficients", "axes", "law_state", "generators", "table", "adc_v", "references", "input_index", "output_index"),
+    *("law", "generators", "table", "adc_v", "references", "input_index", "output_index"),
     "conditions",
     # shared block
     *("words", "last_drive_v", "commands", "commands_marks", "schedule", "staged"),
@@ -70,27 +70,9 @@ LOOP = np.dtype(
 
 
 @jit
-def coefficients_of(loop):
-    """Coefficients of all axes."""
-    return carray(address_pointer(loop.coefficients), loop.axis_count, COEFFICIENTS)
-
-
-@jit
-def staged_of(loop):
-    """Coefficients that wait for all axes."""
-    return carray(address_pointer(loop.staged), loop.axis_count, COEFFICIENTS)
-
-
-@jit
-def axes_of(loop):
-    """State of all axes."""
-    return carray(address_pointer(loop.axes), loop.axis_count, STATE)
-
-
-@jit
-def state_of(loop):
-    """State common to all axes."""
-    return carray(address_pointer(loop.law_state), 1, LOOP_STATE)[0]
+def law_of(loop):
+    """Where the law's records are."""
+    return carray(address_pointer(loop.law), 1, LAW)[0]
 
 
 @jit

@@ -14,15 +14,13 @@ import numpy as np
 
 from rtloop.engine.commands import apply_commands, publish_event
 from rtloop.engine.context import (
-    axes_of,
-    coefficients_of,
     conditions_of,
     floats,
     generators_of,
     integers,
+    law_of,
     octets,
     snapshot_ring,
-    state_of,
     tick_ring,
     words_of,
 )
@@ -33,8 +31,9 @@ from rtloop.engine.trips import publish_trip
 from rtloop.hil.native.atomics import load_acquire
 from rtloop.hil.native.compiled import jit, seldom
 from rtloop.hil.native.pointers import call
-from rtloop.law.law import counts_fit, evaluate, set_mode, update
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.access import loop_of, state_of
+from rtloop.law.law import all_fit, evaluate, set_mode, update
+from rtloop.law.layout import LOOP_STATE
 from rtloop.law.reference import reference_sample
 from rtloop.signals import (
     ADC,
@@ -84,7 +83,7 @@ STOP_KIND = int(Kind.STOP)
 TRIPPED, DRIVER_FAILED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED)
 LATENESS_BEGINS, LATENESS_OVER = int(Kind.PERIODS_MISSED), int(Kind.LATENESS_OVER)
 DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
-COEFFICIENT_BYTES, STATE_BYTES, LOOP_STATE_BYTES = COEFFICIENTS.itemsize, STATE.itemsize, LOOP_STATE.itemsize
+LOOP_STATE_BYTES = LOOP_STATE.itemsize
 US_PER_NS = 1e-3
 GIVE_UP_S = 1.0
 """A card that refuses every write for so long is left to whoever parks it."""
@@ -99,21 +98,14 @@ def run_ticks(loop, until_tick):
     """
     outcome = BROKEN
     try:
-        _require_counts(loop)
+        if not all_fit(law_of(loop)):
+            raise IndexError("a count of the law is beyond its record")
         outcome = _run_ticks(loop, until_tick)
         if outcome != DONE:
             _end_lateness(loop)
     except Exception:
         publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, (TRIP_LAW, 0.0))
     return outcome
-
-
-@jit
-def _require_counts(loop):
-    coefficients = coefficients_of(loop)
-    for a in range(loop.axis_count):
-        if not counts_fit(coefficients[a]):
-            raise IndexError("a count of the law is beyond its record")
 
 
 @jit
@@ -124,7 +116,7 @@ def _run_ticks(loop, until_tick):
             return FAILURE
         _tick(loop)
         loop.tick += 1
-        state = state_of(loop)
+        state = loop_of(law_of(loop))
         if state.settled != 0:
             if loop.failed != 0:
                 return FAILURE
@@ -143,7 +135,7 @@ def _prepare(loop):
     if loop.stopping == 0 and (failing or load_acquire(words_of(loop), STOP_WORD) != 0):
         loop.stopping = 1
         publish_event(loop, STOP_KIND, ALL_AXES, LOOP_ORIGIN if failing else SUPERVISOR, 0, (0.0, 0.0))
-        set_mode(axes_of(loop), state_of(loop), OFF, False)
+        set_mode(law_of(loop), OFF, False)
     if loop.tick >= loop.next_snapshot:
         _publish_snapshot(loop)
         loop.next_snapshot = loop.tick + loop.snapshot_ticks
@@ -167,8 +159,8 @@ def _tick(loop):
     write_ns = _now(loop)
 
     _note(loop, written)
-    state = state_of(loop)
-    update(coefficients_of(loop), axes_of(loop), state)
+    state = loop_of(law_of(loop))
+    update(law_of(loop))
     _report(loop, status, written, missed)
     if loop.tick >= loop.record_limit:
         return
@@ -205,20 +197,20 @@ def _note(loop, written):
     if written < 0:
         _hold(loop)
         return
-    axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    law, last_drive_v = law_of(loop), floats(loop.last_drive_v, loop.axis_count)
     loop.refused = 0
     for a in range(loop.axis_count):
-        last_drive_v[a] = axes[a].drive_v
+        last_drive_v[a] = state_of(law, a).drive_v
 
 
 @seldom
 def _hold(loop):
     """A write failed: the outputs are where they were, and the law goes on from there. After GIVE_UP_S no further."""
-    axes, last_drive_v = axes_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    law, last_drive_v = law_of(loop), floats(loop.last_drive_v, loop.axis_count)
     loop.refused += 1
-    state_of(loop).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
+    loop_of(law).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
     for a in range(loop.axis_count):
-        axes[a].drive_v = last_drive_v[a]
+        state_of(law, a).drive_v = last_drive_v[a]
 
 
 @jit
@@ -232,7 +224,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
         integers(loop.output_index, loop.axis_count),
     )
     generators, table = generators_of(loop), floats(loop.table, loop.table_count)
-    axes = axes_of(loop)
+    law = law_of(loop)
     for a in range(loop.axis_count):
         adc_v[a] = inputs[input_index[a]]
         references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
@@ -243,9 +235,9 @@ def _evaluate(loop, status, now_ns, lateness_us):
     conditions.sample_age_us = inputs[loop.input_count]
     conditions.lateness_us = lateness_us
     conditions.enable_v = inputs[loop.enable_index] if loop.enable_index >= 0 else 0.0
-    evaluate(coefficients_of(loop), axes, state_of(loop), adc_v, references, conditions)
+    evaluate(law, adc_v, references, conditions)
     for a in range(loop.axis_count):
-        outputs[output_index[a]] = axes[a].drive_v
+        outputs[output_index[a]] = state_of(law, a).drive_v
 
 
 @jit
@@ -253,18 +245,18 @@ def _fill_signals(loop, row):
     """Sample age, the signals of each axis, the observed signals."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
-    axes = axes_of(loop)
+    law = law_of(loop)
     row[SAMPLE_AGE] = inputs[loop.input_count]
     row[ENABLE] = conditions_of(loop).enable_v
     for a in range(loop.axis_count):
-        column = COMMON_COUNT + a * PER_AXIS_COUNT
+        column, state = COMMON_COUNT + a * PER_AXIS_COUNT, state_of(law, a)
         row[column + ADC] = adc_v[a]
-        row[column + POSITION] = axes[a].position_um
+        row[column + POSITION] = state.position_um
         row[column + REFERENCE] = references[a]
-        row[column + ERROR] = axes[a].error_um
-        row[column + COMMAND] = axes[a].command_um
-        row[column + DEMAND] = axes[a].demand_v
-        row[column + DRIVE] = axes[a].drive_v
+        row[column + ERROR] = state.error_um
+        row[column + COMMAND] = state.command_um
+        row[column + DEMAND] = state.demand_v
+        row[column + DRIVE] = state.drive_v
     column = COMMON_COUNT + loop.axis_count * PER_AXIS_COUNT
     for i in range(loop.observed_count):
         row[column + i] = inputs[loop.input_count + 1 + i]
@@ -273,7 +265,7 @@ def _fill_signals(loop, row):
 @jit
 def _report(loop, status, written, missed):
     """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
-    new_trip = state_of(loop).new_trip
+    new_trip = loop_of(law_of(loop)).new_trip
     if new_trip != 0:
         publish_trip(loop, new_trip)
     if loop.failed == 0 and (status < 0 or written < 0):
@@ -315,11 +307,11 @@ def _publish_snapshot(loop):
     row = ring.slots[claim(ring, position)]
     for i in range(8):
         row[i] = (loop.tick >> (8 * i)) & 0xFF
-    offset = 8
+    law, offset = law_of(loop), 8
     for address, count in (
-        (loop.coefficients, loop.axis_count * COEFFICIENT_BYTES),
-        (loop.axes, loop.axis_count * STATE_BYTES),
-        (loop.law_state, LOOP_STATE_BYTES),
+        (law.coefficients, law.axis_count * law.coefficients_bytes),
+        (law.axes, law.axis_count * law.axes_bytes),
+        (law.loop, LOOP_STATE_BYTES),
     ):
         row[offset : offset + count] = octets(address, count)
         offset += count

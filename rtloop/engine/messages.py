@@ -29,8 +29,8 @@ class Kind(IntEnum):
     """Kinds below 100 are commands, and events once they took effect; the rest are events only."""
 
     SET_MODE = 1
-    """values[0]: Mode; values[1]: 1 to keep the pre-filter's memory, as before revision 2 of the law; values[2]: 1 to
-    hold what is in force where a reference in volts would be taken for micrometres, or the other way round."""
+    """values[0]: Mode; values[2]: 1 to hold what is in force where a reference in volts would be taken for micrometres,
+    or the other way round."""
     SET_REFERENCE = 2
     """values: Generator kind, then its parameters."""
     RESET_TRIP = 3

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from rtloop.drivers.base import Driver, Facts, Wiring
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.memory import Sizes
-from rtloop.law.layout import snapshot_bytes
+from rtloop.law.memory import Layout
+from rtloop.laws.registry import layout_of
 from rtloop.signals import Mode, columns
 
 
@@ -40,6 +41,8 @@ class Plan:
     driver_kind: str
     driver_options: Mapping[str, Any]
     wiring: Mapping[str, Wiring]
+    laws: tuple[str, ...]
+    """Kinds of laws that the loop knows; the coefficients name them by their number."""
     coefficients: npt.NDArray[Any]
     mode: Mode
     generators: npt.NDArray[Any]
@@ -51,6 +54,11 @@ class Plan:
     """Room behind `table` for waveforms that come while the loop runs."""
 
     @property
+    def layout(self) -> Layout:
+        """The records of these laws."""
+        return layout_of(self.laws)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a record."""
         return columns(self.axes, self.observed)
@@ -60,7 +68,7 @@ class Plan:
         """Sizes of the shared block."""
         axes = len(self.axes)
         samples = self.table.size + self.spare_samples
-        return Sizes(len(self.columns), axes, self.pacing.rate_hz, snapshot_bytes(axes), samples)
+        return Sizes(len(self.columns), axes, self.pacing.rate_hz, self.layout.snapshot_bytes(axes), samples)
 
     @property
     def trip_slew_v_per_s(self) -> float:

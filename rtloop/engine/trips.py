@@ -6,17 +6,18 @@ The conditions are those of `rtloop.law.safety` and `rtloop.law.watch`, on the s
 from __future__ import annotations
 
 from rtloop.engine.commands import publish_event
-from rtloop.engine.context import axes_of, coefficients_of, conditions_of, floats
+from rtloop.engine.context import conditions_of, floats, law_of
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.hil.native.compiled import seldom
+from rtloop.law.access import coefficients_of, state_of
 from rtloop.signals import Flag
 
 TRIPPED, LOOP = int(Kind.TRIPPED), int(Origin.LOOP)
-NON_FINITE, SENSOR_RANGE, POSITION, STALE, ENABLE, FROZEN, LATE, TRACKING, OSCILLATION = (
+NON_FINITE, SENSOR_RANGE, POSITION, STALE, ENABLE, FROZEN, LATE, TRACKING, OSCILLATION, LAW = (
     int(flag)
     for flag in (
         *(Flag.TRIP_NON_FINITE, Flag.TRIP_SENSOR_RANGE, Flag.TRIP_POSITION, Flag.TRIP_STALE, Flag.TRIP_ENABLE),
-        *(Flag.TRIP_FROZEN, Flag.TRIP_LATE, Flag.TRIP_TRACKING, Flag.TRIP_OSCILLATION),
+        *(Flag.TRIP_FROZEN, Flag.TRIP_LATE, Flag.TRIP_TRACKING, Flag.TRIP_OSCILLATION, Flag.TRIP_LAW),
     )
 )
 
@@ -24,10 +25,12 @@ NON_FINITE, SENSOR_RANGE, POSITION, STALE, ENABLE, FROZEN, LATE, TRACKING, OSCIL
 @seldom
 def publish_trip(loop, causes):
     """One event of all new `causes`, with the first axis and cause that explains it, the value and its limit."""
-    coefficients, axes = coefficients_of(loop), axes_of(loop)
+    law = law_of(loop)
     adc_v = floats(loop.adc_v, loop.axis_count)
     for a in range(loop.axis_count):
-        cause, value, limit = _first_cause(coefficients[a], axes[a], adc_v[a], conditions_of(loop), causes)
+        cause, value, limit = _first_cause(
+            coefficients_of(law, a), state_of(law, a), adc_v[a], conditions_of(loop), causes
+        )
         if cause != 0:
             publish_event(loop, TRIPPED, a, LOOP, 0, (float(causes), value, limit, float(cause)))
             return
@@ -37,6 +40,8 @@ def publish_trip(loop, causes):
 @seldom
 def _first_cause(coefficients, state, adc_v, conditions, causes):
     """Flag bit, value and limit of what is wrong on one axis; 0 where nothing among `causes` is."""
+    if causes & LAW != 0 and state.failed != 0:
+        return LAW, state.failed_value, float(state.failed)
     if causes & NON_FINITE != 0 and state.usable == 0:
         return NON_FINITE, adc_v, 0.0
     if causes & SENSOR_RANGE != 0 and adc_v < coefficients.sensor_min_v:

@@ -18,7 +18,7 @@ from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
 from rtloop.experiments.verdict import Row
 from rtloop.hil.modal import Real
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.signals import Flag

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import loading_curve, loading_slopes, model_output
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 
 SAME = 1e-9
 """Bends closer than this part of the largest are one."""

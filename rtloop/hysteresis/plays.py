@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.modal import Real
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 
 
 def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike) -> Real:

@@ -1,27 +1,45 @@
 """The law of one tick for all axes: `evaluate` before the drive is written, `update` after.
 
-    x_d ─► pre-filter ─(+)─ e ─► C(z) ─► v ─► limit ─► P̂⁻¹ ─► demand ─► limit, slew ─► u
+    x_d ─► pre-filter ─(+)─ e ─► CONTROLLER ─► v ─► limit ─► FEEDFORWARD ─► demand ─► limit, slew ─► u
                         −▲ x
 
-Modes replace the left part: FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip
-ramp u to its safe value. Every change of mode continues from the drive in force: what the new mode would do otherwise
-is taken off its input as an offset, which dies out with `limits.bump_s`. In closed loop that input is the error, so
-that no controller meets a large error as a step. Another controller continues from the command and the error in force.
+The two in capitals are plug-ins, of which this file knows nothing but how to call them. Modes replace the left part:
+FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every
+change of mode continues from the drive in force: what the new mode would do otherwise is taken off its input as an
+offset, which dies out with `limits.bump_s`. In closed loop that input is the error, so that no controller meets a large
+error as a step. Another controller continues from the command and the error in force; what it cannot continue by itself
+is an offset of its command, which dies out likewise.
 """
 
 from __future__ import annotations
 
-from rtloop.hil.native.compiled import jit
-from rtloop.law.filters import (
+import numpy as np
+
+from rtloop.hil.native.compiled import jit, seldom
+from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.law.access import (
+    FEEDFORWARD_COEFFICIENTS,
+    coefficients_of,
+    control_of,
+    functions_of,
+    loop_of,
+    opened,
+    state_of,
+)
+from rtloop.law.layout import COEFFICIENTS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS
+from rtloop.law.prefilter import fill_prefilter_anew, prefilter
+from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
+from rtloop.law.slots import (
+    CONTROLLER_OUTPUT,
+    admitted,
     controller_enter,
     controller_output,
     controller_update,
-    fill_prefilter_anew,
-    prefilter,
+    feedforward_enter,
+    feedforward_output,
+    feedforward_update,
+    note_failure,
 )
-from rtloop.law.hysteresis import follow_drive, inverse_drive
-from rtloop.law.layout import MAX_ORDER, MAX_PLAYS, MAX_SECTIONS, MAX_TAPS
-from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
 from rtloop.law.watch import watch
 from rtloop.signals import Flag, Mode
 
@@ -31,84 +49,193 @@ DRIVE_LIMITED = int(Flag.DRIVE_LIMITED)
 SLEW_LIMITED = int(Flag.SLEW_LIMITED)
 RAMPING = int(Flag.RAMPING)
 HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
+TRIP_LAW = int(Flag.TRIP_LAW)
 NEGLIGIBLE_BUMP = 1e-9
 ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
 
 
 @jit
-def counts_fit(coefficients):
-    """Whether every count of an axis stays within its record: the innermost loops do not look."""
-    fit = coefficients.play_count <= MAX_PLAYS and coefficients.order <= MAX_ORDER
-    for i in range(MAX_ORDER):
-        fit = fit and coefficients.row_stop[i] <= MAX_ORDER
-    return fit and coefficients.tap_count <= MAX_TAPS and coefficients.section_count <= MAX_SECTIONS
+def fits(law, a, address):
+    """Whether every count in the coefficients of axis `a` at `address` stays within its record: no kernel looks."""
+    coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
+    count = np.int64(coefficients.controller_axes)
+    if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS:
+        return False
+    if coefficients.section_count < 0 or coefficients.section_count > MAX_SECTIONS:
+        return False
+    if coefficients.feedforward_law >= law.law_count or coefficients.controller_law >= law.law_count:
+        return False
+    if count > MAX_COUPLED or a + count > law.axis_count or functions_of(law, coefficients.feedforward_law).axes != 0:
+        return False
+    if count != 0 and functions_of(law, coefficients.controller_law).axes != count:
+        return False
+    if not admitted(law, coefficients.feedforward_law, address + FEEDFORWARD_COEFFICIENTS):
+        return False
+    return count == 0 or admitted(law, coefficients.controller_law, address + law.controller_coefficients)
 
 
 @jit
-def set_mode(axes, loop, mode, at_rest, filled=True):
+def all_fit(law):
+    """Whether `fits` holds for every axis, and each has a controller, its own or that of one before it."""
+    owned = 0
+    for a in range(law.axis_count):
+        count = np.int64(coefficients_of(law, a).controller_axes)
+        if (count == 0) != (a < owned) or not fits(law, a, law.coefficients + a * law.coefficients_bytes):
+            return False
+        owned = max(owned, a + count)
+    return True
+
+
+@jit
+def set_mode(law, mode, at_rest):
     """Change the mode; bumplessly, but from zero state `at_rest`, before anything was driven.
 
-    A mode that drives begins with a pre-filter `filled` by the present reference: what it remembers may be volts.
+    A mode that drives begins with a pre-filter filled by the present reference: what it remembers may be volts.
     """
-    loop.mode = mode
-    for a in range(axes.shape[0]):
-        axes[a].entering = 0 if at_rest else ANOTHER_MODE
-        if filled and not at_rest and mode != OFF:
-            fill_prefilter_anew(axes[a])
+    loop_of(law).mode = mode
+    for a in range(law.axis_count):
+        state = state_of(law, a)
+        state.entering, state.failed = 0 if at_rest else ANOTHER_MODE, 0
+        if not at_rest and mode != OFF:
+            fill_prefilter_anew(state)
 
 
 @jit
-def set_controller(state):
-    """Have an axis go on with another controller, whose coefficients have been put in place."""
-    if state.entering == 0:
-        state.entering = ANOTHER_CONTROLLER
+def set_controller(law, a):
+    """Have axis `a`, and those that share its controller, go on with another one, whose coefficients are in place."""
+    for i in range(a, a + max(np.int64(coefficients_of(law, a).controller_axes), 1)):
+        state = state_of(law, i)
+        if state.entering == 0:
+            state.entering = ANOTHER_CONTROLLER
 
 
 @jit
-def reset_trip(loop):
+def reset_trip(law):
     """Forget the causes of a trip; the mode stays OFF until it is set."""
-    loop.trip = 0
-    loop.mode = OFF
+    loop_of(law).trip = 0
+    loop_of(law).mode = OFF
 
 
 @jit
-def evaluate(coefficients, axes, loop, adc_v, references, conditions):
-    """Drives of this tick, in `axes[a].drive_v`, from the inputs in V and the references (µm; V in RAW mode).
+def evaluate(record, adc_v, references, conditions):
+    """Drives of this tick, in `drive_v` of each axis, from the inputs in V and the references (µm; V in RAW mode).
 
-    `conditions` is one CONDITIONS record.
+    `record` is one LAW record, `conditions` one CONDITIONS record.
     """
-    causes = loop_causes(conditions)
-    for a in range(axes.shape[0]):
-        state = axes[a]
-        state.position_um = (adc_v[a] - coefficients[a].offset_v) * coefficients[a].um_per_v
+    law = opened(record)
+    loop = loop_of(law)
+    causes = loop_causes(conditions) | loop.pending
+    loop.pending = 0
+    for a in range(law.axis_count):
+        coefficients, state = coefficients_of(law, a), state_of(law, a)
+        state.position_um = (adc_v[a] - coefficients.offset_v) * coefficients.um_per_v
         state.usable = 1 if usable(adc_v[a]) and usable(references[a]) else 0
-        causes |= axis_causes(coefficients[a], state, adc_v[a], conditions)
-        causes |= watch(coefficients[a], state, loop.mode, adc_v[a], conditions.lateness_us)
+        causes |= axis_causes(coefficients, state, adc_v[a], conditions)
+        causes |= watch(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
+        wanted_um = prefilter(coefficients, state, references[a]) if state.usable != 0 else references[a]
+        state.error_um = wanted_um - state.position_um
     loop.new_trip = causes & ~loop.trip
     loop.trip |= causes
     if loop.trip != 0:
         loop.mode = OFF
-    loop.tick_flags = loop.trip | (HEARTBEAT_LOST if conditions.heartbeat_lost != 0 else 0)
+    loop.tick_flags = HEARTBEAT_LOST if conditions.heartbeat_lost != 0 else 0
     loop.settled = 1
-    for a in range(axes.shape[0]):
-        loop.tick_flags |= _drive(coefficients[a], axes[a], loop, references[a])
-        if axes[a].drive_v != coefficients[a].safe_v:
-            loop.settled = 0
+    for a in range(law.axis_count):
+        count = np.int64(coefficients_of(law, a).controller_axes)
+        if count != 0 and loop.mode == CLOSED_LOOP and not _control(law, a, count):
+            _trip_by_law(loop)
+        if count != 0:
+            _drive(law, a, loop, references[a])
+        if count > 1:
+            _drive_others(law, a, count, loop, references)
+    loop.tick_flags |= loop.trip
 
 
 @jit
-def _drive(coefficients, state, loop, reference):
-    """Set the signals and the drive of one axis; returns its flags."""
-    last_v, mode = state.drive_v, loop.mode
-    if state.usable != 0:
-        error_um = prefilter(coefficients, state, reference) - state.position_um
-        state.error_um = error_um
+def _trip_by_law(loop):
+    """A plug-in failed in this tick."""
+    loop.new_trip |= TRIP_LAW & ~loop.trip
+    loop.trip |= TRIP_LAW
+    loop.mode = OFF
+
+
+@jit
+def _control(law, first, count):
+    """Commands of the axes from `first` on, which share a controller; False where it failed."""
+    coefficients, state = coefficients_of(law, first), state_of(law, first)
+    if count > 1:
+        _tell_together(law, first, count)
     else:
-        error_um = reference - state.position_um
-        state.error_um = error_um
-        if loop.new_trip != 0:  # hold for the tick that trips; the ramp below needs no input
-            state.demand_v = last_v
-            return RAMPING
+        _tell(law, first, coefficients, state, coefficients.resting_error[0] * state.applied_command_um)
+    good = state.entering == 0 or controller_enter(law, first)
+    succeeded, command_um = controller_output(law, first, coefficients)
+    good = good and succeeded
+    if count > 1:
+        return _command_together(law, first, count) and good
+    return _command(law, first, coefficients, state, command_um) and good
+
+
+@seldom
+def _tell_together(law, first, count):
+    """As `_tell`, for axes that share a controller: each rests at an error that depends on the commands of all."""
+    for i in range(first, first + count):
+        coefficients, resting_um = coefficients_of(law, i), 0.0
+        for j in range(count):
+            resting_um += coefficients.resting_error[j] * state_of(law, first + j).applied_command_um
+        _tell(law, i, coefficients, state_of(law, i), resting_um)
+
+
+@seldom
+def _command_together(law, first, count):
+    """As `_command`, for axes that share a controller."""
+    good = True
+    for i in range(first, first + count):
+        good = _command(law, i, coefficients_of(law, i), state_of(law, i), control_of(law, i).command_um) and good
+    return good
+
+
+@jit
+def _tell(law, i, coefficients, state, resting_um):
+    """What a controller meets on axis `i`, where it rests at an error of `resting_um`."""
+    control = control_of(law, i)
+    met_um = state.error_um - _bump(coefficients, state, state.error_um - resting_um)
+    control.reference_um, control.position_um, control.error_um = state.position_um + met_um, state.position_um, met_um
+    control.command_um = control.applied_um = state.applied_command_um
+
+
+@jit
+def _command(law, i, coefficients, state, command_um):
+    """Note the command of an axis, with what it still owes to the one before; False where it is none."""
+    gap_um = state.applied_command_um - command_um
+    state.command_bump_um = _died(coefficients, state.command_bump_um, state.entering != 0, gap_um)
+    state.command_um = control_of(law, i).command_um = command_um + state.command_bump_um
+    if not usable(command_um):
+        note_failure(state, CONTROLLER_OUTPUT, command_um)
+        return False
+    return True
+
+
+@jit
+def _drive(law, a, loop, reference):
+    """Set the signals and the drive of one axis, and its flags."""
+    coefficients, state = coefficients_of(law, a), state_of(law, a)
+    loop.tick_flags |= _driven(law, a, loop, coefficients, state, reference)
+    if state.drive_v != coefficients.safe_v:
+        loop.settled = 0
+
+
+@seldom
+def _drive_others(law, first, count, loop, references):
+    for i in range(first + 1, first + count):
+        _drive(law, i, loop, references[i])
+
+
+@jit
+def _driven(law, a, loop, coefficients, state, reference):
+    last_v, mode = state.drive_v, loop.mode
+    if loop.new_trip != 0 and (state.usable == 0 or state.failed != 0):
+        state.demand_v = last_v  # hold for the tick that trips; the ramp below needs no input
+        return RAMPING
     if mode == OFF:
         state.drive_v = toward(last_v, coefficients.safe_v, coefficients.trip_slew_v_per_tick)
         state.demand_v = coefficients.safe_v
@@ -120,18 +247,18 @@ def _drive(coefficients, state, loop, reference):
         demand_v = reference + _bump(coefficients, state, last_v - reference)
     else:
         if mode == FEEDFORWARD:
-            command_um = reference + _bump(coefficients, state, state.applied_command_um - reference)
-        else:
-            resting_um = coefficients.resting_error * state.applied_command_um
-            met_um = error_um - _bump(coefficients, state, error_um - resting_um)
-            if state.entering != 0:
-                controller_enter(coefficients, state, met_um, state.applied_command_um)
-            command_um = controller_output(coefficients, state, met_um)
-        state.command_um = command_um
+            state.command_um = reference + _bump(coefficients, state, state.applied_command_um - reference)
+        command_um = state.command_um
         limited_um = clip(command_um, -coefficients.command_limit_um, coefficients.command_limit_um)
         if limited_um != command_um:
             flags |= COMMAND_LIMITED
-        demand_v = inverse_drive(coefficients, state, limited_um)
+        if state.entering != 0:
+            feedforward_enter(law, a, last_v)
+        demand_v = feedforward_output(law, a, coefficients, state, limited_um)
+        if state.failed != 0:
+            _trip_by_law(loop)
+            state.demand_v = last_v
+            return RAMPING
     state.entering, state.demand_v = 0, demand_v
     allowed_v = clip(demand_v, coefficients.drive_min_v, coefficients.drive_max_v)
     if allowed_v != demand_v:
@@ -146,19 +273,45 @@ def _drive(coefficients, state, loop, reference):
 @jit
 def _bump(coefficients, state, gap):
     """The decaying offset that makes a new mode continue from where the old one was."""
-    state.bump = gap if state.entering == ANOTHER_MODE else state.bump * coefficients.bump_decay
-    if -NEGLIGIBLE_BUMP < state.bump < NEGLIGIBLE_BUMP:
-        state.bump = 0.0
+    state.bump = _died(coefficients, state.bump, state.entering == ANOTHER_MODE, gap)
     return state.bump
 
 
 @jit
-def update(coefficients, axes, loop):
+def _died(coefficients, offset, anew, gap):
+    """An offset a tick later, or `anew` from a gap."""
+    offset = gap if anew else offset * coefficients.bump_decay
+    return 0.0 if -NEGLIGIBLE_BUMP < offset < NEGLIGIBLE_BUMP else offset
+
+
+@jit
+def update(record):
     """Advance every memory by the drives really applied."""
-    for a in range(axes.shape[0]):
-        state = axes[a]
-        state.applied_command_um = follow_drive(coefficients[a], state, state.drive_v)
-        if loop.mode == CLOSED_LOOP:
-            shortfall_um = state.applied_command_um - state.command_um
-            tracked_um = coefficients[a].tracking_share * shortfall_um
-            controller_update(coefficients[a], state, state.error_um - state.bump, tracked_um)
+    law = opened(record)
+    loop = loop_of(law)
+    for a in range(law.axis_count):
+        coefficients = coefficients_of(law, a)
+        count = np.int64(coefficients.controller_axes)
+        if count != 0:
+            _follow(law, a, loop, coefficients)
+            if count > 1:
+                _follow_others(law, a, count, loop)
+            if loop.mode == CLOSED_LOOP and not controller_update(law, a, coefficients):
+                loop.pending |= TRIP_LAW
+
+
+@seldom
+def _follow_others(law, first, count, loop):
+    for i in range(first + 1, first + count):
+        _follow(law, i, loop, coefficients_of(law, i))
+
+
+@jit
+def _follow(law, a, loop, coefficients):
+    """Advance the feedforward of one axis, and say to its controller what was applied."""
+    state = state_of(law, a)
+    applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)
+    if usable(applied_um):
+        state.applied_command_um = applied_um
+    else:
+        loop.pending |= TRIP_LAW

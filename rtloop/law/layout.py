@@ -1,31 +1,27 @@
-"""Coefficients and state of the law as fixed-size records: their bytes are what a recording keeps and a replay uses.
+"""Coefficients and state of what every axis has, whatever law it runs, as fixed-size records.
 
-One record per axis, so that one compiled kernel serves every configuration. Sizes are upper bounds; `*_count` says
-how much of an array is in use.
+Their bytes are what a recording keeps and a replay uses. Behind each record of an axis stand those of its feedforward
+and of its controller (`rtloop.law.memory`), which are the plug-ins' own.
 """
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from rtloop.law.validity import COUNT, SWITCH, Allowed, Bits, require_allowed
+from rtloop.law.validity import COUNT, SWITCH, Allowed, Bits
 from rtloop.signals import TRIP_MASK, Flag, Mode
 
-REVISION = 2
-"""Of what the law does with its memory. 1 kept the pre-filter's through changes of mode, and of sections alone."""
-LANES = 4
-"""Play operators and pairs of controller states are computed four at a time. What is in use is padded to a multiple
-of this with zero weights, so that no kernel needs a remainder; counts have 8 bits, so that no index can be negative."""
-BLOCK = 2 * LANES
-"""Controller states in a block: four, and then the partners of these four."""
-MAX_PLAYS = 64
-MAX_ORDER = 24
+REVISION = 3
+"""Of what the law does with its memory, and of how it is laid out. Up to 2 there was one controller and one
+feedforward, within the records of the axes."""
 MAX_TAPS = 128
 MAX_SECTIONS = 12
+MAX_COUPLED = 8
+"""Axes that one controller may have."""
+MAX_LAWS = 32
+"""Kinds of laws that one loop may know."""
 ANEW = -1
 """A tap index that says: fill the pre-filter's memory with the next reference."""
 
@@ -35,46 +31,25 @@ LINE_BYTES = 64
 """Records begin at a cache line and arrays come first in them: no load of four numbers straddles two lines."""
 
 
-def _whole_lines(fields: list[Any]) -> np.dtype[Any]:
+def whole_lines(fields: list[Any]) -> np.dtype[Any]:
     """A record of `fields` and what fills up its last cache line."""
     size = np.dtype(fields, align=True).itemsize
     return np.dtype([*fields, ("reserved", np.float64, (-size % LINE_BYTES // 8,))], align=True)
 
 
-COEFFICIENTS = _whole_lines(
+COEFFICIENTS = whole_lines(
     [
-        # inverse Prandtl-Ishlinskii and the forward model that it inverts
-        ("inverse_thresholds_um", np.float64, (MAX_PLAYS,)),
-        ("inverse_weights_v_per_um", np.float64, (MAX_PLAYS,)),
-        ("model_thresholds_v", np.float64, (MAX_PLAYS,)),
-        ("model_weights_um_per_v", np.float64, (MAX_PLAYS,)),
-        # controller C(z): x⁺ = A x + b e, v = c x + d e. States stand in blocks of four pairs, four first ones and
-        # then their four partners; A within the pairs is `own` and `partner`, `coupling` holds the rest of A, of
-        # whose rows only the columns start ≤ j < stop are non-zero
-        ("own", np.float64, (MAX_ORDER,)),
-        ("partner", np.float64, (MAX_ORDER,)),
-        ("b", np.float64, (MAX_ORDER,)),
-        ("c", np.float64, (MAX_ORDER,)),
-        ("tracking", np.float64, (MAX_ORDER,)),
-        ("steady_state", np.float64, (MAX_ORDER,)),
-        ("coupling", np.float64, (MAX_ORDER, MAX_ORDER)),
         # reference pre-filter: FIR taps, then second-order sections b0 b1 b2 a1 a2
         ("taps", np.float64, (MAX_TAPS,)),
         ("sections", np.float64, (MAX_SECTIONS, 5)),
+        ("resting_error", np.float64, (MAX_COUPLED,)),  # error per command of each axis at which the controller rests
         ("tap_count", np.int64),
         ("section_count", np.int64),
-        # plays and controller
-        ("play_count", np.uint8),
-        ("order", np.uint8),
-        ("coupled", np.uint8),
-        ("row_start", np.uint8, (MAX_ORDER,)),
-        ("row_stop", np.uint8, (MAX_ORDER,)),
+        # numbers of the laws, and how many axes the controller has: 0 for one that an axis before this one owns
+        ("feedforward_law", np.uint8),
+        ("controller_law", np.uint8),
+        ("controller_axes", np.uint8),
         ("unused", np.uint8, (5,)),  # no byte of a record may lie between its fields: copies would leave it undefined
-        ("d", np.float64),
-        ("tracking_share", np.float64),
-        ("resting_error", np.float64),  # error per command at which C stays where it is
-        ("dead_band_v", np.float64),
-        ("dead_band_threshold_v", np.float64),
         # sensor scale
         ("um_per_v", np.float64),
         ("offset_v", np.float64),
@@ -103,18 +78,14 @@ COEFFICIENTS = _whole_lines(
         ("late_ticks", np.int64),
     ]
 )
-STATE = _whole_lines(
+STATE = whole_lines(
     [
-        ("inverse_plays_um", np.float64, (MAX_PLAYS,)),
-        ("model_plays_v", np.float64, (MAX_PLAYS,)),
-        ("controller", np.float64, (MAX_ORDER,)),
-        ("scratch", np.float64, (MAX_ORDER,)),
         ("tap_history", np.float64, (MAX_TAPS,)),
         ("section_history", np.float64, (MAX_SECTIONS, 2)),
-        ("sums", np.float64, (LANES,)),
         ("tap_index", np.int64),
-        ("dead_band_direction", np.float64),
+        # what makes a new mode, or another controller, go on from where the old one was
         ("bump", np.float64),
+        ("command_bump_um", np.float64),
         ("entering", np.int64),
         ("usable", np.int64),
         # interlocks with memory
@@ -127,6 +98,9 @@ STATE = _whole_lines(
         ("swing_age", np.int64),
         ("swing_count", np.int64),
         ("late_count", np.int64),
+        # a law that failed: which function of which, 0 for none, and what it returned
+        ("failed", np.int64),
+        ("failed_value", np.float64),
         # signals of the current tick
         ("position_um", np.float64),
         ("error_um", np.float64),
@@ -137,27 +111,27 @@ STATE = _whole_lines(
     ]
 )
 LOOP_STATE = np.dtype(
-    [("mode", np.int64), ("trip", np.int64), ("new_trip", np.int64), ("tick_flags", np.int64), ("settled", np.int64)],
+    [
+        *((name, np.int64) for name in ("mode", "trip", "new_trip", "tick_flags", "settled")),
+        ("pending", np.int64),
+    ],
     align=True,
 )
 """State common to all axes: Mode; latched causes and those of this tick, as Flag bits; flags of this tick; 1 when
-every output is at its safe value."""
+every output is at its safe value; causes that the end of a tick found, for the next."""
 TRIPS = Bits(sum(Flag) & TRIP_MASK)
 ALLOWED_COEFFICIENTS = {
     "tap_count": Allowed(0, MAX_TAPS),
     "section_count": Allowed(0, MAX_SECTIONS),
-    "play_count": Allowed(0, MAX_PLAYS, LANES),
-    "order": Allowed(0, MAX_ORDER, BLOCK),
-    "coupled": SWITCH,
-    "row_start": Allowed(0, MAX_ORDER),
-    "row_stop": Allowed(0, MAX_ORDER),
+    "controller_axes": Allowed(0, MAX_COUPLED),
     **dict.fromkeys(("frozen_ticks", "tracking_ticks", "oscillation_swings", "swing_ticks", "late_ticks"), COUNT),
 }
+"""What whole numbers may be; the numbers of laws depend on how many there are."""
 ALLOWED_STATE = {
     "entering": Allowed(0, 2),
     "usable": SWITCH,
     "swing_direction": Allowed(-1, 1),
-    **dict.fromkeys(("frozen_count", "tracking_count", "swing_age", "swing_count", "late_count"), COUNT),
+    **dict.fromkeys(("frozen_count", "tracking_count", "swing_age", "swing_count", "late_count", "failed"), COUNT),
 }
 ALLOWED_LOOP_STATE = {
     "mode": Allowed(min(Mode), max(Mode)),
@@ -165,8 +139,9 @@ ALLOWED_LOOP_STATE = {
     "new_trip": TRIPS,
     "tick_flags": Bits(sum(Flag)),
     "settled": SWITCH,
+    "pending": TRIPS,
 }
-"""What whole numbers may be in records that come from elsewhere; of `tap_index`, see `split_snapshot`."""
+"""What whole numbers may be in records that come from elsewhere; of `tap_index`, see `rtloop.law.memory`."""
 CONDITIONS = np.dtype(
     [
         ("driver_status", np.int64),
@@ -178,58 +153,34 @@ CONDITIONS = np.dtype(
     align=True,
 )
 """What a tick is judged by beside its inputs; all of it is recorded."""
-
-
-def records(dtype: np.dtype[Any], count: int) -> Records:
-    """Zeroed records at a cache line, with attribute access also where the kernels run uncompiled."""
-    room = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
-    begin = -room.ctypes.data % LINE_BYTES
-    return room[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
-
-
-def copied(source: npt.NDArray[Any]) -> Records:
-    """A copy of records, at a cache line."""
-    copy = records(source.dtype, source.size)
-    copy[:] = source
-    return copy
-
-
-def initial_state(coefficients: Records) -> tuple[Records, Records]:
-    """State of (axes, loop) at rest: outputs at their safe values, an unloaded actuator that never moved."""
-    axes = records(STATE, coefficients.size)
-    axes["drive_v"] = coefficients["safe_v"]
-    return axes, records(LOOP_STATE, 1)
-
-
-def snapshot_bytes(axes: int) -> int:
-    """Length of a snapshot: tick, coefficients and state."""
-    return 8 + axes * (COEFFICIENTS.itemsize + STATE.itemsize) + LOOP_STATE.itemsize
-
-
-def split_snapshot(snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[int, Records, Records, Records]:
-    """Tick, coefficients, axes' state and loop state of a snapshot, as copies that the kernels can work on.
-
-    Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed; a
-    `tap_index` of -1 says that the taps are still to be filled.
-    """
-    data = bytes(snapshot)
-    if len(data) != snapshot_bytes(axes):
-        raise ValueError(f"law snapshot: {len(data)} bytes, but {axes} axes take {snapshot_bytes(axes)}")
-    offset, parts = 8, []
-    for dtype, count in ((COEFFICIENTS, axes), (STATE, axes), (LOOP_STATE, 1)):
-        parts.append(copied(np.frombuffer(data, dtype, count, offset)))
-        offset += count * dtype.itemsize
-    coefficients, states, loop = parts
-    for number, (axis, state) in enumerate(zip(coefficients, states, strict=True)):
-        require_allowed(f"axis {number}", axis, ALLOWED_COEFFICIENTS)
-        taps = Allowed(-1, max(int(axis["tap_count"]), 1) - 1)
-        require_allowed(f"axis {number}", state, {**ALLOWED_STATE, "tap_index": taps})
-    require_allowed("the loop", loop[0], ALLOWED_LOOP_STATE)
-    return int.from_bytes(data[:8], "little"), coefficients, states, loop
-
-
-def layout_description() -> dict[str, Any]:
-    """What a recording says of the snapshot's layout: the fields with their offsets, and a digest of them."""
-    tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
-    described = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
-    return {**described, "sha256": hashlib.sha256(repr(described).encode()).hexdigest(), "revision": REVISION}
+CONTROL = np.dtype(
+    [(name, np.float64) for name in ("reference_um", "position_um", "error_um", "command_um", "applied_um")],
+    align=True,
+)
+"""What a controller is told of an axis, see `rtloop.laws.contract`; written anew each tick, no part of the state."""
+FUNCTIONS = np.dtype(
+    [
+        *((name, np.int64) for name in ("output", "update", "enter")),
+        *((name, np.int64) for name in ("axes", "coefficients_bytes", "state_bytes", "first_rule", "rule_count")),
+    ],
+    align=True,
+)
+"""A law as the loop calls it: addresses (0 for none), for how many axes (0 for a feedforward), sizes of its records,
+and which of the rules are its own."""
+RULE = np.dtype(
+    [(name, np.int64) for name in ("offset", "octets", "count", "low", "high", "step")],
+    align=True,
+)
+"""What whole numbers at `offset` of a record of coefficients may be, `count` of them with 1 or 8 octets each."""
+LAW = np.dtype(
+    [
+        *((name, np.int64) for name in ("coefficients", "coefficients_bytes", "axes", "axes_bytes", "loop")),
+        *((name, np.int64) for name in ("controls", "functions", "rules", "result", "raised")),
+        *((name, np.int64) for name in ("controller_coefficients", "controller_state")),
+        ("axis_count", np.uint32),
+        ("law_count", np.uint32),
+    ],
+    align=True,
+)
+"""Where the law of a loop is: addresses of its records and tables, what lies between the records of two axes, and where
+the controller's begin within them; the feedforward's begin behind the axis's own."""

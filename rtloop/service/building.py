@@ -158,10 +158,11 @@ def main() -> None:
     """Answer until stdin ends."""
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints goes where messages go
-    _write(answers, pickle.dumps(("ready", None)))
-    while len(length := sys.stdin.buffer.read(_LENGTH.size)) == _LENGTH.size:
-        data = sys.stdin.buffer.read(_LENGTH.unpack(length)[0])
-        _write(answers, pickle.dumps(_build(pickle.loads(data))))
+    with contextlib.suppress(BrokenPipeError):  # the service was killed meanwhile
+        _write(answers, pickle.dumps(("ready", None)))
+        while len(length := sys.stdin.buffer.read(_LENGTH.size)) == _LENGTH.size:
+            data = sys.stdin.buffer.read(_LENGTH.unpack(length)[0])
+            _write(answers, pickle.dumps(_build(pickle.loads(data))))
 
 
 if __name__ == "__main__":

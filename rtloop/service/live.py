@@ -18,7 +18,6 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.law.layout import COEFFICIENTS
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 from rtloop.service.building import prepare_limited
@@ -164,7 +163,7 @@ class LiveLaw:
         before, after = self.prepared.configuration.axes[number], prepared.configuration.axes[number]
         coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1].copy()
         coefficients["offset_v"] = self.offsets_v.get(number, float(coefficients["offset_v"][0]))
-        size = COEFFICIENTS.itemsize
+        size = coefficients.dtype.itemsize
         self._require_settled()
         self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller

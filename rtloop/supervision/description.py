@@ -12,7 +12,6 @@ from typing import Any
 
 from rtloop.configuration.prepare import Prepared
 from rtloop.hil.native.compiled import cpu_identity
-from rtloop.law.layout import layout_description
 
 FORMAT = 1
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
@@ -34,7 +33,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "mode": plan.mode.name.lower(),
         "configuration": configuration.text,
         "configuration_sha256": hashlib.sha256(configuration.text.encode()).hexdigest(),
-        "law": layout_description(),
+        "law": plan.layout.description(),
         "driver": {
             "kind": plan.driver_kind,
             "inputs": [channel.name for channel in prepared.facts.inputs],

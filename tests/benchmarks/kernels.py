@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.engine.assembly import law_at_rest
 from rtloop.hil.native.compiled import jit
+from rtloop.law.access import loop_of, state_of
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
-from rtloop.law.layout import CONDITIONS, Records, initial_state, records
+from rtloop.law.layout import CONDITIONS
+from rtloop.law.memory import LawMemory, records
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
 from tests.benchmarks.measure import Effort, Spread, alternately, seconds
@@ -26,23 +29,23 @@ class Differs(AssertionError):
 
 
 @jit
-def run_law(coefficients, axes, loop, adc_v, references, modes, conditions, out):
+def run_law(law, adc_v, references, modes, conditions, out):
     """The law over arrays of inputs, as `run_law` of loop.c."""
     adc, reference = np.empty(1), np.empty(1)
     for k in range(adc_v.size):
         if modes[k] >= 0:
-            reset_trip(loop)
-            set_mode(axes, loop, modes[k], False)
+            reset_trip(law)
+            set_mode(law, modes[k], False)
         adc[0], reference[0] = adc_v[k], references[k]
-        evaluate(coefficients, axes, loop, adc, reference, conditions[0])
-        update(coefficients, axes, loop)
-        state = axes[0]
+        evaluate(law, adc, reference, conditions[0])
+        update(law)
+        state = state_of(law, 0)
         out[k, 0], out[k, 1] = state.command_um, state.demand_v
-        out[k, 2], out[k, 3] = state.drive_v, float(loop.tick_flags)
+        out[k, 2], out[k, 3] = state.drive_v, float(loop_of(law).tick_flags)
 
 
-def law_inputs(ticks: int) -> tuple[Records, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Coefficients, and the readings and references of a closed loop that ran before."""
+def law_inputs(ticks: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """The readings and references of a closed loop that ran before."""
     plan = paper_plan()
     loop = PythonLoop(plan)
     adc_v, references = np.empty(ticks), np.empty(ticks)
@@ -51,10 +54,10 @@ def law_inputs(ticks: int) -> tuple[Records, np.ndarray[Any, Any], np.ndarray[An
         rows = loop.rows[np.arange(begin, begin + CHUNK) % loop.rows.shape[0]]
         adc_v[begin : begin + CHUNK] = rows[:, axis_column(0, ADC)]
         references[begin : begin + CHUNK] = rows[:, axis_column(0, REFERENCE)]
-    return loop.law.coefficients, adc_v, references
+    return adc_v, references
 
 
-def check_law(coefficients: Records, adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> None:
+def check_law(adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> None:
     """Equal bits in all modes, through limits, trips and unusable inputs. Raises Differs."""
     random = np.random.default_rng(1)
     adc_v, references = adc_v.copy(), references * np.where(np.arange(adc_v.size) % 30_000 < 5_000, 3.0, 1.0)
@@ -62,13 +65,14 @@ def check_law(coefficients: Records, adc_v: np.ndarray[Any, Any], references: np
     modes[::700] = random.choice([int(mode) for mode in Mode], modes[::700].size, p=[0.1, 0.2, 0.2, 0.5])
     adc_v[9_999::10_000] = random.choice([np.nan, np.inf, 9.995, -6.5], adc_v[9_999::10_000].size)
     outs = [np.empty((adc_v.size, 4)) for _ in range(2)]
-    axes, loop = initial_state(coefficients)
-    conditions = records(CONDITIONS, 1)
-    run_law(coefficients, axes, loop[0], adc_v, references, modes, conditions, outs[0])
-    native_axes, native_loop = initial_state(coefficients)
-    native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, outs[1])
+    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), records(CONDITIONS, 1)
+    for memory in (ours, theirs):
+        memory.state["mode"] = int(Mode.OFF)
+    run_law(ours.law, adc_v, references, modes, conditions, outs[0])
+    native.run_law((*native.arrays_of(theirs), adc_v, references, modes), adc_v.size, outs[1])
     _require_equal("law", outs[0], outs[1])
-    _require_equal("law's state", axes["controller"], native_axes["controller"])
+    if not same_memory(ours, theirs):
+        raise Differs("law: the states differ")
     flags = np.bitwise_or.reduce(outs[0][:, 3].astype(np.int64))
     wanted = WANTED | Flag.TRIP_NON_FINITE | Flag.TRIP_SENSOR_RANGE
     if flags & wanted != wanted:
@@ -77,20 +81,16 @@ def check_law(coefficients: Records, adc_v: np.ndarray[Any, Any], references: np
 
 def law(effort: Effort) -> dict[str, Any]:
     """ns a tick of the law alone in closed loop, beside the same in C; both must give the same bits."""
-    coefficients, adc_v, references = law_inputs(CHECKED_TICKS)
-    check_law(coefficients, adc_v, references)
+    adc_v, references = law_inputs(CHECKED_TICKS)
+    check_law(adc_v, references)
     modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
-    states = [initial_state(coefficients) for _ in range(2)]
-    conditions = records(CONDITIONS, 1)
-    for _, loop in states:
-        loop["mode"] = int(Mode.CLOSED_LOOP)
-    (axes, loop), (native_axes, native_loop) = states
+    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), records(CONDITIONS, 1)
     pair = alternately(
-        lambda: run_law(coefficients, axes, loop[0], adc_v, references, modes, conditions, out),
-        lambda: native.run_law((coefficients, native_axes, native_loop, adc_v, references, modes), adc_v.size, out),
+        lambda: run_law(ours.law, adc_v, references, modes, conditions, out),
+        lambda: native.run_law((*native.arrays_of(theirs), adc_v, references, modes), adc_v.size, out),
         effort.pairs,
     )
-    if loop["mode"][0] != Mode.CLOSED_LOOP or axes["controller"].tobytes() != native_axes["controller"].tobytes():
+    if ours.state["mode"][0] != Mode.CLOSED_LOOP or not same_memory(ours, theirs):
         raise Differs("the law left closed loop, or its states differ")
     return _compared(pair, adc_v.size)
 
@@ -139,6 +139,16 @@ def axes(effort: Effort) -> dict[str, Any]:
     spreads = {count: Spread.of(values[1:]) for count, values in taken.items()}
     named = {f"ns_per_tick_{count}": spread._asdict() for count, spread in spreads.items()}
     return named | {"ns_per_further_axis": (spreads[8].minimum - spreads[1].minimum) / 7}
+
+
+def same_memory(one: LawMemory, other: LawMemory) -> bool:
+    """Whether two laws remember the same, in bits, of what the drives depend on."""
+    names = {"controller": ("controller",), "feedforward": ("inverse_plays_um", "model_plays_v")}
+    return one.axes["drive_v"].tobytes() == other.axes["drive_v"].tobytes() and all(
+        one.of_law(0, slot, "state")[name].tobytes() == other.of_law(0, slot, "state")[name].tobytes()
+        for slot in ("controller", "feedforward")
+        for name in names[slot]
+    )
 
 
 def _compared(pair: Any, ticks: int) -> dict[str, Any]:

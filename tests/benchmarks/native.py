@@ -16,15 +16,31 @@ import numpy as np
 from rtloop.hil.rig import COEFFICIENTS as RIG_COEFFICIENTS
 from rtloop.hil.rig import STATE as RIG_STATE
 from rtloop.law.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
+from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR
+from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
 SOURCE = Path(__file__).parent / "c"
 # vectors of four are the fastest that this code was seen to run with on x86; 512 bits cost a third more
 VECTORS = ("-mprefer-vector-width=256",) if platform.machine() == "x86_64" else ()
 OPTIONS = ("-O3", "-march=native", *VECTORS, "-ffp-contract=off", "-std=gnu11", "-Wall", "-Wextra", "-fPIC", "-shared")
+
+
+def in_one(**parts: np.dtype[Any]) -> np.dtype[Any]:
+    """The records of an axis and of its laws, one behind the other, as one; a name that comes twice gets a prefix."""
+    fields: list[Any] = []
+    for owner, part in parts.items():
+        for name, *rest in part.descr:
+            taken = any(name == before for before, *_ in fields)
+            fields.append((f"{owner}_{name}" if taken else name, *rest))
+    return np.dtype(fields)
+
+
 STRUCTS = {
-    "law_coefficients": COEFFICIENTS,
-    "law_state": STATE,
+    "law_coefficients": in_one(
+        axis=COEFFICIENTS, plays=prandtl_ishlinskii.COEFFICIENTS, controller=transfer.COEFFICIENTS
+    ),
+    "law_state": in_one(axis=STATE, plays=prandtl_ishlinskii.STATE, controller=transfer.STATE),
     "loop_state": LOOP_STATE,
     "conditions": CONDITIONS,
     "rig_coefficients": RIG_COEFFICIENTS,
@@ -73,6 +89,11 @@ def library() -> ctypes.CDLL:
         command = [compiler, *OPTIONS, f"-I{folder}", f"-I{SOURCE}", str(SOURCE / "loop.c"), "-lm", "-o", str(target)]
         subprocess.run(command, check=True)
         return ctypes.CDLL(str(target))
+
+
+def arrays_of(law: LawMemory) -> tuple[np.ndarray[Any, Any], ...]:
+    """Coefficients, axes and loop, as C has them."""
+    return law.coefficients, law.axes, law.state
 
 
 def run_law(arrays: tuple[np.ndarray[Any, Any], ...], ticks: int, out: np.ndarray[Any, Any]) -> None:

@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.engine.assembly import Assembly, LawArrays, law_at_rest
+from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.native.pointers import call
+from rtloop.law.access import state_of
 from rtloop.law.law import evaluate, update
-from rtloop.law.layout import CONDITIONS, records
+from rtloop.law.layout import CONDITIONS
+from rtloop.law.memory import records
 from rtloop.signals import Mode
-from tests.benchmarks.kernels import Differs, law_inputs
+from tests.benchmarks.kernels import Differs, law_inputs, same_memory
 from tests.benchmarks.measure import Effort, in_turn, seconds, spread
 from tests.benchmarks.scenario import paper_plan
 from tests.benchmarks.tape import Tape, due_clock
@@ -25,7 +27,7 @@ FAR_AWAY_NS = 1 << 62
 
 
 @jit
-def bare_ticks(pointers, clock, coefficients, axes, loop, conditions, references, buffers, ticks):
+def bare_ticks(pointers, clock, law, conditions, references, buffers, ticks):
     """The calls of a tick in their order, and nothing around them. `buffers`: inputs, outputs, timing."""
     inputs, outputs, timing = buffers
     adc_v, reference = np.empty(1), np.empty(1)
@@ -34,12 +36,12 @@ def bare_ticks(pointers, clock, coefficients, axes, loop, conditions, references
         call(pointers[1], pointers[0], inputs.ctypes.data)
         call(clock[1], clock[2], timing.ctypes.data)
         adc_v[0], reference[0] = inputs[0], references[k]
-        evaluate(coefficients, axes, loop, adc_v, reference, conditions[0])
-        outputs[0] = axes[0].drive_v
+        evaluate(law, adc_v, reference, conditions[0])
+        outputs[0] = state_of(law, 0).drive_v
         call(clock[1], clock[2], timing.ctypes.data)
         call(pointers[2], pointers[0], outputs.ctypes.data)
         call(clock[1], clock[2], timing.ctypes.data)
-        update(coefficients, axes, loop)
+        update(law)
         call(clock[1], clock[2], timing.ctypes.data)
 
 
@@ -85,7 +87,7 @@ class Bare:
 
     def __init__(self, adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> None:
         plan = paper_plan()
-        self.law: LawArrays = law_at_rest(plan)
+        self.law = law_at_rest(plan)
         self._tape, self._references = Tape(adc_v), references
         clock, self._kept = due_clock(plan.pacing.rate_hz)
         self._clock, self._pointers = tuple(clock), tuple(self._tape.pointers())[:3]
@@ -95,10 +97,7 @@ class Bare:
     def further(self) -> None:
         """TICKS more."""
         law = self.law
-        bare_ticks(
-            self._pointers, self._clock, law.coefficients, law.axes, law.state[0], self._conditions, self._references,
-            self._buffers, TICKS,
-        )  # fmt: skip
+        bare_ticks(self._pointers, self._clock, law.law, self._conditions, self._references, self._buffers, TICKS)
 
     def clock(self) -> None:
         """The clock alone."""
@@ -115,7 +114,7 @@ def overhead(effort: Effort) -> dict[str, Any]:
     recorded readings and a clock that is read as often as the paced one but never waits; `bare` is a loop of the same
     calls of clock, driver and law, on the same readings and references, which leaves the law in the same bits; `engine`
     is the difference, pair by pair. `clock_reads` (five) and `driver_calls` (two) are parts of both, timed alone."""
-    _, adc_v, references = law_inputs(TICKS)
+    adc_v, references = law_inputs(TICKS)
     whole, bare = Whole(adc_v), Bare(adc_v, references)
     actions = {"whole": whole.further, "bare": bare.further, "clock_reads": bare.clock, "driver_calls": bare.driver}
     for number, action in enumerate(actions.values()):
@@ -131,7 +130,5 @@ def overhead(effort: Effort) -> dict[str, Any]:
 
 def _require_same_law(whole: Whole, bare: Bare) -> None:
     """Both did the law's work, the same, in closed loop all the time. Raises Differs."""
-    fields = ("controller", "inverse_plays_um", "model_plays_v", "drive_v")
-    same = all(whole.law.axes[field].tobytes() == bare.law.axes[field].tobytes() for field in fields)
-    if not same or whole.law.state["mode"][0] != Mode.CLOSED_LOOP:
+    if not same_memory(whole.law, bare.law) or whole.law.state["mode"][0] != Mode.CLOSED_LOOP:
         raise Differs("overhead: the bare loop's law is not that of the whole loop")

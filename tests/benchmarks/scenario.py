@@ -10,7 +10,7 @@ import numpy as np
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Wiring
-from rtloop.engine.assembly import Assembly, LawArrays, law_at_rest
+from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Plan
@@ -82,7 +82,7 @@ class NativeLoop:
         options: Any = plan.driver().options
         self.block = SharedBlock.create(plan.sizes)
         self.block["table"][: plan.table.size] = plan.table
-        self.law: LawArrays = law_at_rest(plan)
+        self.law = law_at_rest(plan)
         rig_coefficients, rig_state = build_rig(options, plan.axes, period_s)
         ring = self.block.ring("ticks")
         self._kept: dict[str, np.ndarray[Any, Any] | Records] = {

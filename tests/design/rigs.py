@@ -28,7 +28,7 @@ from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.hil.stages.hysteresis import step as hysteresis_step
 from rtloop.hysteresis.compensation import residual_operator
 from rtloop.hysteresis.plays import model_output
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 
 SLOW_S, FAST_S = 1e-3, 1e-4
 SENSOR_UM_PER_V = 10.0

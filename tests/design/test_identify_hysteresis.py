@@ -13,7 +13,7 @@ from rtloop.design.identification.measured import Measured, UnsuitableData, requ
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
 
 DRIVES = st.lists(st.floats(-10, 10), min_size=1, max_size=60)

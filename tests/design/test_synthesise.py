@@ -11,11 +11,11 @@ from click.testing import CliRunner
 from rtloop.analysis.closed_loop import continuous_loop, realised
 from rtloop.analysis.step_response import position_at
 from rtloop.cli import main
-from rtloop.configuration.axis import ControllerOptions
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.hinf.augment import Matrices, augmented
 from rtloop.design.synthesis.synthesise import synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS, tracking_weight
+from rtloop.laws.shipped.options import TransferControllerOptions
 from tests.design.plants import dense_norm
 
 SPEC = Path(__file__).resolve().parents[2] / "deploy" / "paper-spec.toml"
@@ -98,12 +98,12 @@ def test_the_command_writes_a_section_that_a_configuration_reads(tmp_path) -> No
     text = out.read_text(encoding="utf-8")
     assert "from paper-spec.toml" in text
     assert "γ_opt = 1.676" in text
-    controller = ControllerOptions.model_validate(tomllib.loads(text)["axis"][0]["controller"]).transfer()
+    controller = TransferControllerOptions.model_validate(tomllib.loads(text)["axis"][0]["controller"]).transfer()
     assert [[root.real, root.imag] for root in controller.poles] == report["poles"]
     assert controller.gain == report["gain"]
     again = run(str(SPEC))
     assert again.exit_code == 0
-    alone = ControllerOptions.model_validate(tomllib.loads(again.stdout)["axis"]["controller"]).transfer()
+    alone = TransferControllerOptions.model_validate(tomllib.loads(again.stdout)["axis"]["controller"]).transfer()
     assert alone.poles.tolist() == controller.poles.tolist()
     assert alone.zeros.tolist() == controller.zeros.tolist()
 

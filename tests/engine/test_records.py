@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.law.layout import split_snapshot
 from tests.engine.harness import AXIS, CONTROLLER, MATCHED, LoopBench, text
 from tests.law.harness import LawBench
 
@@ -35,11 +34,11 @@ def test_a_snapshot_a_second_each_at_the_state_before_its_tick():
     loop = bench()
     rows = loop.run(TICKS)
     snapshots = loop.drain("snapshots")
-    assert [split_snapshot(one, 1)[0] for one in snapshots] == [0, 10_000, 20_000]
+    assert [loop.plan.layout.split(one, 1)[0] for one in snapshots] == [0, 10_000, 20_000]
     for one in snapshots:
-        tick, coefficients, axes, state = split_snapshot(one, 1)
+        tick, coefficients, axes, state = loop.plan.layout.split(one, 1)
         law = LawBench(coefficients)
-        law.axes, law.loops = axes, state
+        law.axes[:], law.loops[:] = axes, state
         rest = rows[tick:]
         inputs = {"adc_v": loop.column(rest, "x_adc_v"), "age_us": loop.column(rest, "sample_age_us")}
         signals = law.run(loop.column(rest, "x_reference_um"), **inputs)

@@ -17,16 +17,20 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import json
+import numpy as np
 from rtloop.law.law import set_mode
-from rtloop.law.layout import COEFFICIENTS, initial_state, records
+from rtloop.law.memory import LawMemory
+from rtloop.laws.binding import functions_of
+from rtloop.laws.registry import BUILT_IN, layout_of
 
-axes, loop = initial_state(records(COEFFICIENTS, 1))
-set_mode(axes, loop[0], 1, False)
+layout = layout_of(BUILT_IN)
+law = LawMemory.at_rest(layout, functions_of(BUILT_IN), np.zeros(1, layout.coefficients))
+set_mode(law.law, 1, False)
 hits = sum(set_mode.stats.cache_hits.values())
-print(json.dumps({"tap_index": int(axes["tap_index"][0]), "from_cache": hits == 1}))
+print(json.dumps({"tap_index": int(law.axes["tap_index"][0]), "from_cache": hits == 1}))
 """
-"""A change of mode, whose kernel calls another in `filters.py`."""
-EDIT = ("rtloop/law/filters.py", "state.tap_index = ANEW", "state.tap_index = -2")
+"""A change of mode, whose kernel calls another in `prefilter.py`."""
+EDIT = ("rtloop/law/prefilter.py", "state.tap_index = ANEW", "state.tap_index = -2")
 
 
 @pytest.fixture

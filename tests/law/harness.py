@@ -8,12 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import axis_coefficients
+from rtloop.configuration.coefficients import DEFAULT_LAWS, axis_coefficients, controller_of, laws_of
 from rtloop.drivers.base import Channel
 from rtloop.hil.native.compiled import jit
+from rtloop.law.access import loop_of, state_of
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
-from rtloop.law.layout import CONDITIONS, Records, initial_state, records
-from rtloop.linear.discretise import discretise
+from rtloop.law.layout import CONDITIONS, Records
+from rtloop.law.memory import LawMemory, records
+from rtloop.laws.binding import functions_of
+from rtloop.laws.registry import layout_of
 from rtloop.signals import Mode
 
 PERIOD_S = 1e-4
@@ -30,6 +33,7 @@ EQ_20 = {
     "denominator": [[1.0, 8.8e4], [1.0, 974.0], [1.0, 1.0], [1.0, 1153.0, 1.6e7]],
     "method": "matched",
 }
+LAWS = DEFAULT_LAWS
 KEEP = -1
 """In `modes`: no change at this tick."""
 
@@ -47,18 +51,18 @@ class Signals(NamedTuple):
 
 
 @jit
-def run_law(coefficients, axes, loop, modes, resets, adc_v, references, conditions, out):
+def run_law(law, modes, resets, adc_v, references, conditions, out):
     """Evaluate, update and note down each tick."""
     adc, reference = np.empty(1), np.empty(1)
     for k in range(modes.size):
         if resets[k] != 0:
-            reset_trip(loop)
+            reset_trip(law)
         if modes[k] >= 0:
-            set_mode(axes, loop, modes[k], False)
+            set_mode(law, modes[k], False)
         adc[0], reference[0] = adc_v[k], references[k]
-        evaluate(coefficients, axes, loop, adc, reference, conditions[k])
-        update(coefficients, axes, loop)
-        state = axes[0]
+        evaluate(law, adc, reference, conditions[k])
+        update(law)
+        state, loop = state_of(law, 0), loop_of(law)
         out[0, k], out[1, k], out[2, k] = state.drive_v, state.demand_v, state.command_um
         out[3, k], out[4, k] = state.applied_command_um, state.error_um
         out[5, k], out[6, k] = float(loop.tick_flags), float(loop.mode)
@@ -67,18 +71,31 @@ def run_law(coefficients, axes, loop, modes, resets, adc_v, references, conditio
 def coefficients_of(output: Channel | None = None, **parts: Any) -> Records:
     """Coefficients (1,) of an axis with eq (4), 10 µm/V and the parts given as a configuration would say them."""
     axis = AxisOptions.model_validate({"name": "x", "feedforward": EQ_4, **parts})
-    controller = axis.controller
-    discrete = controller and discretise(controller.transfer(), PERIOD_S, controller.method, controller.prewarp_hz)
-    return axis_coefficients(axis, discrete or None, 10.0, 0.0, output or Channel("dac0"), PERIOD_S)
+    controller = controller_of(axis, PERIOD_S)
+    return axis_coefficients(laws_of([axis]), axis, controller, 10.0, 0.0, output or Channel("dac0"), PERIOD_S)
 
 
 class LawBench:
     """A law at rest in `mode`, and its memory from one call to the next."""
 
     def __init__(self, coefficients: Records, mode: Mode = Mode.OFF) -> None:
-        self.coefficients = coefficients
-        self.axes, self.loops = initial_state(coefficients)
-        set_mode(self.axes, self.loops[0], int(mode), True)
+        self.law = LawMemory.at_rest(layout_of(LAWS), functions_of(LAWS), coefficients)
+        set_mode(self.law.law, int(mode), True)
+
+    @property
+    def coefficients(self) -> Records:
+        """Of the axis, which take effect as they are set."""
+        return self.law.coefficients
+
+    @property
+    def axes(self) -> Records:
+        """State of the axis."""
+        return self.law.axes
+
+    @property
+    def loops(self) -> Records:
+        """State of the loop."""
+        return self.law.state
 
     def run(
         self,
@@ -107,16 +124,21 @@ class LawBench:
         conditions["driver_status"], conditions["sample_age_us"] = status, age_us
         conditions["heartbeat_lost"], conditions["lateness_us"], conditions["enable_v"] = lost, late_us, enable_v
         adc = _spread(adc_v, wanted, float)
-        run_law(self.coefficients, self.axes, self.loops[0], changes, forgiven, adc, wanted, conditions, out)
+        run_law(self.law.law, changes, forgiven, adc, wanted, conditions, out)
         return Signals(*out)
 
     def memory(self) -> dict[str, bytes]:
         """Bytes of all that the law remembers from one tick to the next, signals aside."""
-        names = (
-            *("inverse_plays_um", "model_plays_v", "dead_band_direction", "controller"),
-            *("tap_index", "tap_history", "section_history", "bump", "applied_command_um"),
-        )
-        return {name: self.axes[name].tobytes() for name in names}
+        own = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
+        memory = {name: self.axes[name].tobytes() for name in own}
+        for name in ("inverse_plays_um", "model_plays_v", "dead_band_direction"):
+            memory[name] = np.asarray(self.law.of_law(0, "feedforward", "state")[name]).tobytes()
+        return {**memory, "controller": self.law.of_law(0, "controller", "state").controller.tobytes()}
+
+    def is_finite(self) -> bool:
+        """Whether all numbers that it remembers are."""
+        numbers = [memory for name, memory in self.memory().items() if name != "tap_index"]
+        return bool(np.all(np.isfinite(np.frombuffer(b"".join(numbers)))))
 
     def state_bytes(self) -> bytes:
         """All of the state."""

@@ -10,13 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LAW, LOOP_STATE, RULE, STATE
 from rtloop.law.reference import GENERATOR
+from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 from rtloop.signals import Mode
 from tests.law.harness import EQ_20, EXACT, LawBench, coefficients_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TICKS = 600
+RECORDS = [
+    *(COEFFICIENTS, STATE, LOOP_STATE, CONTROL, FUNCTIONS, LAW, RULE, GENERATOR),
+    *(record for law in (prandtl_ishlinskii, transfer) for record in (law.COEFFICIENTS, law.STATE)),
+]
 
 
 def mixed_run() -> bytes:
@@ -39,7 +44,7 @@ def mixed_run() -> bytes:
     return np.array(signals).tobytes() + bench.state_bytes()
 
 
-@pytest.mark.parametrize("dtype", [COEFFICIENTS, STATE, LOOP_STATE, GENERATOR])
+@pytest.mark.parametrize("dtype", RECORDS)
 def test_no_field_hides_behind_an_attribute_of_a_record(dtype):
     """numpy's scalars have `flags`, `size`, `data` and more: a field of that name works compiled only."""
     assert not set(dtype.names) & set(dir(np.record))

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from rtloop.engine.messages import MESSAGE
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.layout import COEFFICIENTS, CONTROL, LOOP_STATE, STATE
 from rtloop.law.reference import GENERATOR, Generator
+from rtloop.laws.shipped import prandtl_ishlinskii, transfer
+
+RECORDS = [
+    *(COEFFICIENTS, STATE, LOOP_STATE, CONTROL, GENERATOR, MESSAGE),
+    *(record for law in (prandtl_ishlinskii, transfer) for record in (law.COEFFICIENTS, law.STATE)),
+]
 
 
-@pytest.mark.parametrize("record", [COEFFICIENTS, STATE, LOOP_STATE, GENERATOR, MESSAGE])
+@pytest.mark.parametrize("record", RECORDS)
 def test_every_byte_belongs_to_one_field(record):
     owners = np.zeros(record.itemsize, int)
     for field in record.names:

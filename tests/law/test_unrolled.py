@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtloop.law.filters import controller_output
-from rtloop.law.hysteresis import moved_plays_sum, plays_sum
-from rtloop.law.layout import BLOCK, COEFFICIENTS, LANES, MAX_ORDER, MAX_PLAYS, STATE, records
+from rtloop.law.layout import CONTROL
+from rtloop.law.memory import records
+from rtloop.laws.shipped.lanes import BLOCK, LANES
+from rtloop.laws.shipped.play_model import MAX_PLAYS
+from rtloop.laws.shipped.prandtl_ishlinskii import moved_plays_sum, plays_sum
+from rtloop.laws.shipped.transfer import COEFFICIENTS, MAX_ORDER, STATE, command
 
 RNG = np.random.default_rng(4)
 
@@ -41,11 +44,11 @@ def test_sums_of_plays(kernel, count):
 
 @pytest.mark.parametrize("order", range(0, MAX_ORDER + 1, BLOCK))
 def test_the_controllers_output(order):
-    coefficients, state = records(COEFFICIENTS, 1), records(STATE, 1)
+    coefficients, state, told = records(COEFFICIENTS, 1), records(STATE, 1), records(CONTROL, 1)
     for _ in range(20):
         c, x, error, direct = RNG.normal(size=MAX_ORDER), RNG.normal(size=MAX_ORDER), *RNG.normal(size=2)
         coefficients[0].c, coefficients[0].d, coefficients[0].order = c, direct, order
-        state[0].controller = x
+        state[0].controller, told[0].error_um = x, error
         firsts = [i for i in range(order) if i % BLOCK < LANES]
         terms = [float(c[i]) * float(x[i]) + float(c[i + LANES]) * float(x[i + LANES]) for i in firsts]
-        assert controller_output(coefficients[0], state[0], error) == summed(terms) + float(direct) * float(error)
+        assert command(coefficients[0], state[0], told[0]) == summed(terms) + float(direct) * float(error)

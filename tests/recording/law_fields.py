@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
 COUNTS = (-(2**63), -(2**31), -129, -2, -1, 0, 1, 2, 3, 4, 5, 25, 65, 129, 255, 4_000, 2**31, 2**62, 2**63 - 1)
 
@@ -23,8 +24,10 @@ class Field(NamedTuple):
 def fields_of(axes: Sequence[str]) -> list[Field]:
     """Every field of every record, and the tick in front of them."""
     offset, fields = 8, [Field("tick", np.dtype("<u8"), 0)]
-    tables = [(axis, COEFFICIENTS) for axis in axes] + [(axis, STATE) for axis in axes] + [("loop", LOOP_STATE)]
-    for owner, table in tables:
+    laws = prandtl_ishlinskii, transfer
+    coefficients, state = (COEFFICIENTS, *(law.COEFFICIENTS for law in laws)), (STATE, *(law.STATE for law in laws))
+    tables = [(axis, table) for part in (coefficients, state) for axis in axes for table in part]
+    for owner, table in [*tables, ("loop", LOOP_STATE)]:
         for name, (dtype, start, *_) in (table.fields or {}).items():
             fields.append(Field(f"{owner}.{name}", dtype, offset + start))
         offset += table.itemsize

@@ -64,8 +64,8 @@ class RealLoop:
         head = self.block.ring("ticks").head
         clock = unpaced_clock(self._context, head, self.block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
         self._driver = plan.driver()
-        facts, law = self._driver.facts, law_at_rest(plan)
-        self._assembly = Assembly(plan, self.block, facts, self._driver.open(), clock, law)
+        facts, self.law = self._driver.facts, law_at_rest(plan)
+        self._assembly = Assembly(plan, self.block, facts, self._driver.open(), clock, self.law)
         self.header = recording_header(self.prepared, {})
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rtloop.law.layout import COEFFICIENTS
+from rtloop.laws.shipped import transfer
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
@@ -126,9 +127,11 @@ def test_differences_of_state_are_named():
     loop.run(1)
     data = bytes(loop.block["snapshots_slots"][0])[8:]
     other = bytearray(data)
-    place = COEFFICIENTS.itemsize + COEFFICIENTS.fields["b"][1] + 8  # type: ignore[index]
+    law = loop.law.layout
+    within = COEFFICIENTS.itemsize + law.room("feedforward")[0] + transfer.COEFFICIENTS.fields["b"][1]  # type: ignore[index]
+    place = law.coefficients.itemsize + within + 8
     other[place] ^= 1
-    name, recorded, replayed_value = first_difference(data, bytes(other), ["x", "y"])
+    name, recorded, replayed_value = first_difference(data, bytes(other), ["x", "y"], loop.law)
     assert name == "law.y.b[1]"
     assert recorded == struct.unpack_from("<d", data, place)[0] != replayed_value
 

@@ -1,28 +1,28 @@
-"""Recordings of an earlier revision of the law replay as they were made."""
+"""Recordings of a version whose law was laid out otherwise say so; their signals are there as ever."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rtloop
-from rtloop.recording.replay import replay as replay_module
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.replay.replay import replay
+from rtloop.recording.replay.whatif import recorded_law
 
 OLD = Path(__file__).with_name("data") / "revision-1.mcap"
-"""2500 ticks through all modes, with a pre-filter of 32 taps and a section that kept its memory throughout."""
+"""2500 ticks through all modes, from before laws were plug-ins."""
 
 
-def test_a_pre_filter_that_kept_its_memory_replays():
+@pytest.mark.parametrize("use", [replay, recorded_law])
+def test_a_law_that_is_laid_out_otherwise_is_said_to_be_with_the_version_that_made_it(use):
+    with pytest.raises(RecordingError, match=r"recorded by rtloop 0\.1\.0, whose law is laid out differently"):
+        use(rtloop.load(OLD))
+
+
+def test_its_signals_are_there():
     recording = rtloop.load(OLD)
-    assert "revision" not in recording.header["law"]
-    verdict = replay(recording)
-    assert (verdict.identical, verdict.ticks) == (True, 2500)
-
-
-def test_without_regard_to_the_revision_it_would_not(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(replay_module, "FILLING_REVISION", 1)
-    first = replay(rtloop.load(OLD)).first_difference
-    assert first is not None
-    assert (first["tick"], first["signal"]) == (400, "x_error_um")
+    assert np.array_equal(recording["tick"], np.arange(2500))
+    assert set(recording["mode"]) == {0, 1, 2, 3}

@@ -8,39 +8,50 @@ from __future__ import annotations
 
 import json
 import sys
-from unittest.mock import patch
+from unittest.mock import DEFAULT, patch
 
 import numpy as np
 
-from rtloop.law import layout
+from rtloop.hil.native import uncompiled
+from rtloop.law import memory
 from rtloop.law.law import evaluate, update
-from rtloop.law.layout import CONDITIONS, records
+from rtloop.law.layout import CONDITIONS
+from rtloop.law.memory import LawMemory, records
+from rtloop.laws.binding import functions_of
+from rtloop.laws.registry import BUILT_IN, layout_of
 from rtloop.signals import Mode
 from tests.recording.law_fields import COUNTS, fields_of
 
 TICKS, SEED, TRIES = 2, 3, 400
+LAYOUT, FUNCTIONS = layout_of(tuple(BUILT_IN)), functions_of(tuple(BUILT_IN))
 
 
 def reaches_beyond(data: bytes, axes: int) -> bool:
     """Whether the law, run from a snapshot whatever it says, leaves its arrays."""
-    with patch.object(layout, "require_allowed"):
-        _, coefficients, states, loop = layout.split_snapshot(data, axes)
-    loop.mode = Mode.CLOSED_LOOP
+    unchecked = {"require_owners": DEFAULT, "require_allowed": DEFAULT}
+    with patch.object(memory.Layout, "require"), patch.multiple(memory, **unchecked):
+        _, *arrays = LAYOUT.split(data, axes)
+    numbers = arrays[0][["feedforward_law", "controller_law", "controller_axes"]].tolist()
+    if numbers != [(0, 1, 1)] * axes:
+        return True  # a function that is not there, or one of the other kind
+    law = LawMemory(LAYOUT, FUNCTIONS, *arrays)
+    uncompiled.raised.clear()
+    law.state.mode = Mode.CLOSED_LOOP
     conditions = records(CONDITIONS, 1)[0]
     try:
         with np.errstate(all="ignore"):
             for _ in range(TICKS):
-                evaluate(coefficients, states, loop[0], np.zeros(axes), np.ones(axes), conditions)
-                update(coefficients, states, loop[0])
+                evaluate(law.law, np.zeros(axes), np.ones(axes), conditions)
+                update(law.law)
     except IndexError:
         return True
-    return False
+    return any(isinstance(error, IndexError) for error in uncompiled.raised)
 
 
 def accepted(data: bytes, axes: int) -> bool:
     """Whether a snapshot is let through."""
     try:
-        layout.split_snapshot(data, axes)
+        LAYOUT.split(data, axes)
     except ValueError:
         return False
     return True

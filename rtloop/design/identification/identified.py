@@ -10,7 +10,6 @@ from typing import Any
 from pydantic import ValidationError
 
 from rtloop import __version__
-from rtloop.configuration.axis import FeedforwardOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.identify_dynamics import DynamicsFit
@@ -18,7 +17,8 @@ from rtloop.design.identification.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
 from rtloop.errors import ConfigError, OutputError
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.recording.errors import RecordingError
 
 
@@ -77,7 +77,7 @@ def with_gain(model: PlayModel, gain: float) -> PlayModel:
     return PlayModel(model.thresholds, gain * model.weights)
 
 
-def read_feedforward(path: Path, axis: str | None = None) -> FeedforwardOptions:
+def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
     """The [axis.feedforward] of a file: an identified section, or a configuration's of axis `axis` (the first).
 
     Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
@@ -85,7 +85,7 @@ def read_feedforward(path: Path, axis: str | None = None) -> FeedforwardOptions:
     return feedforward_of(read_text(path, RecordingError), str(path), axis)
 
 
-def feedforward_of(content: str, source: str, axis: str | None = None) -> FeedforwardOptions:
+def feedforward_of(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
     """The same, from TOML text. Raises ConfigError."""
     try:
         found: Any = parse_toml(content).get("axis")
@@ -96,7 +96,7 @@ def feedforward_of(content: str, source: str, axis: str | None = None) -> Feedfo
     if not isinstance(found, dict) or "feedforward" not in found:
         raise ConfigError(source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; it is needed"])
     try:
-        return FeedforwardOptions.model_validate(found["feedforward"])
+        return PrandtlIshlinskiiOptions.model_validate(found["feedforward"])
     except ValidationError as error:
         raise ConfigError(source, describe(error, "axis.feedforward", found["feedforward"])) from None
 

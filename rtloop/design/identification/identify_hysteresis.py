@@ -23,8 +23,7 @@ from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output, play_outputs, turning_points
-from rtloop.law.hysteresis import PlayModel
-from rtloop.law.layout import MAX_PLAYS
+from rtloop.laws.shipped.play_model import MAX_PLAYS, PlayModel
 
 Placement = Literal["chebyshev", "uniform"]
 Weights = Literal["invertible", "free"]

@@ -15,7 +15,7 @@ from rtloop.errors import MissingExtra, OutputError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import Residual, compensated
 from rtloop.hysteresis.plays import model_output
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 
 POINTS = 20_000
 

@@ -13,7 +13,7 @@ import numpy as np
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.margins import margins
 from rtloop.hil.modal import Complex
-from rtloop.law.layout import MAX_ORDER
+from rtloop.laws.shipped.transfer import MAX_ORDER
 from rtloop.linear.discretise import Method, discretise
 from rtloop.linear.transfer import Transfer
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from rtloop.configuration.axis import ModelOptions, TransferOptions
+from rtloop.configuration.axis import ModelOptions
 from rtloop.design.synthesis.weights import (
     DisturbanceRule,
     Weights,
@@ -20,6 +20,7 @@ from rtloop.design.synthesis.weights import (
     tracking_weight,
 )
 from rtloop.hil.options import Options
+from rtloop.linear.options import TransferOptions
 from rtloop.linear.transfer import Transfer
 
 

@@ -25,7 +25,7 @@ from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Numbers, Options
 from rtloop.hysteresis.plays import model_output
-from rtloop.law.hysteresis import PlayModel
+from rtloop.laws.shipped.play_model import PlayModel
 
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}

@@ -15,20 +15,20 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
-from rtloop.law.layout import layout_description, split_snapshot
+from rtloop.law.memory import LawMemory, Layout
+from rtloop.laws.binding import functions_of
+from rtloop.laws.registry import layout_of
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.events import GAP, RECOVERED, Event, json_value, message_of
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.load import Recording
-from rtloop.recording.replay.rerun import Law, Rerun, Rows, Tape
+from rtloop.recording.replay.rerun import Rerun, Rows, Tape
 from rtloop.recording.replay.snapshots import first_difference
 from rtloop.recording.replay.verdict import MEASURED, ReplayReport, not_judged
 from rtloop.signals import Flag
 
 FEW_PERIODS, RATE_TOLERANCE = 50, 0.05
 """Over fewer periods no rate is compared; a card's own clock may be a little off."""
-FILLING_REVISION, FILLING = 2, (Kind.SET_MODE, Kind.LOAD_LAW)
-"""Since this revision of the law these commands begin with a pre-filter filled anew."""
 LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
 OBEYED = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW)}
 Progress = Callable[[int], None]
@@ -36,28 +36,43 @@ Progress = Callable[[int], None]
 
 def replay(recording: Recording, progress: Progress | None = None) -> ReplayReport:
     """Replay up to the first difference. Raises RecordingError for a recording of another layout, or without a law."""
-    check_layout(recording)
+    layout_of_recording(recording)
     with closing(recording.snapshots()) as snapshots:
         return _Replay(recording, snapshots, progress).run()
 
 
-def check_layout(recording: Recording) -> None:
-    """Raise RecordingError where this version's law lays out its coefficients and state otherwise."""
-    if recording.header.get("law", {}).get("sha256") != layout_description()["sha256"]:
+def layout_of_recording(recording: Recording) -> Layout:
+    """The layout of the recorded law. Raises RecordingError where this version lays out its records otherwise."""
+    described = recording.header.get("law", {})
+    try:
+        layout = layout_of(law_names(recording))
+    except ValueError as error:
+        raise RecordingError(f"{recording.paths[0]}: {error}") from None
+    if described.get("sha256") != layout.description()["sha256"]:
         version = recording.header.get("versions", {}).get("rtloop", "unknown")
         raise RecordingError(
             f"{recording.paths[0]}: recorded by rtloop {version}, whose law is laid out differently; replay it with "
             "that version"
         )
+    return layout
 
 
-def law_of(snapshot: Snapshot, recording: Recording) -> Law:
+def law_names(recording: Recording) -> tuple[str, ...]:
+    """Kinds of the laws that the recorded loop knew, as far as the header says so."""
+    described = recording.header.get("law", {}).get("laws")
+    if not isinstance(described, list):
+        return ()
+    return tuple(str(law.get("name")) for law in described if isinstance(law, dict))
+
+
+def law_of(snapshot: Snapshot, recording: Recording) -> LawMemory:
     """Coefficients and state, which the kernels can work on. Raises RecordingError where they cannot."""
+    layout = layout_of_recording(recording)
     try:
-        _, *law = split_snapshot(snapshot.data, len(recording.header["axes"]))
+        _, *law = layout.split(snapshot.data, len(recording.header["axes"]))
     except ValueError as error:
         raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
-    return Law(*law)
+    return LawMemory(layout, functions_of(law_names(recording)), *law)
 
 
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
@@ -65,8 +80,6 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray
     commands = [message_of(event, recording.header["axes"]) for event in recording.events]
     parts = [command for command in commands if command is not None and command["kind"][0] in kinds]
     found = np.concatenate([np.zeros(0, MESSAGE), *parts])
-    if recording.header["law"].get("revision", 1) < FILLING_REVISION:
-        found["values"][np.isin(found["kind"], FILLING), 1] = 1.0  # as it was: the pre-filter keeps its memory
     found["values"][found["kind"] == Kind.SET_MODE, 2] = 0.0  # what was held is among the recorded references
     return found
 
@@ -199,9 +212,11 @@ class _Replay:
         replayed, recorded = rerun.snapshot()[8:], snapshot.data[8:]
         self._report.snapshots += 1
         if replayed != recorded and not self._report.first_difference:
-            self._differs(snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"]))
+            self._differs(
+                snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"], rerun.law)
+            )
 
-    def _start(self, tick: int, law: Law) -> None:
+    def _start(self, tick: int, law: LawMemory) -> None:
         header = self._recording.header
         still_to_come = self._commands[self._commands["tick"] > tick]
         self._rerun = Rerun(header, Tape(header), law, still_to_come, tick)

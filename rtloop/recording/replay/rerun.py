@@ -10,10 +10,11 @@ import numpy as np
 from rtloop import signals
 from rtloop.drivers.base import Channel, Facts, Pointers, Wiring
 from rtloop.drivers.playback import TIMING_COLUMNS, Playback
-from rtloop.engine.assembly import Assembly, LawArrays
+from rtloop.engine.assembly import Assembly
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Pacing, Plan
+from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR, Generator
 from rtloop.signals import Flag, Mode
 
@@ -22,7 +23,6 @@ SMALLEST_RING_HZ = 1.0
 """A ring of the least size: it holds a slice, and stays in the processor's cache."""
 UNLIMITED_SLACK = NEVER = 1 << 62
 TICK_BYTES = 8
-Law = LawArrays
 Rows = np.ndarray[Any, Any]
 
 
@@ -84,9 +84,9 @@ class Rerun:
     """The loop with the law `law`, about to execute `first_tick`, under commands that are still to come."""
 
     def __init__(
-        self, header: Mapping[str, Any], source: Source, law: Law, commands: np.ndarray[Any, Any], first_tick: int
+        self, header: Mapping[str, Any], source: Source, law: LawMemory, commands: np.ndarray[Any, Any], first_tick: int
     ) -> None:
-        self._law, self._source = law, source
+        self.law, self._source = law, source
         plan = _plan(header, source, law, commands)
         self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
         self._slots = self._block["ticks_slots"]
@@ -116,7 +116,7 @@ class Rerun:
 
     def expect_snapshot(self, recorded: bytes) -> None:
         """Take a snapshot in the next tick to be executed, and have its recorded coefficients at hand to be loaded."""
-        size = self._law.coefficients.nbytes
+        size = self.law.coefficients.nbytes
         self._block["staged"][:size] = np.frombuffer(recorded, np.uint8, size, TICK_BYTES)
         self._assembly.loop.next_snapshot = 0
 
@@ -128,7 +128,7 @@ class Rerun:
     def _load_references(self, rows: Rows, first_tick: int) -> None:
         """Recorded references, as a table that starts with these rows; commands cannot change them."""
         table, generators = self._block["table"], self._assembly.generators
-        for axis in range(len(self._law.axes)):
+        for axis in range(len(self.law.axes)):
             start = axis * SLICE_TICKS
             table[start : start + len(rows)] = rows[:, signals.axis_column(axis, signals.REFERENCE)]
             generators["kind"][axis] = Generator.TABLE
@@ -136,7 +136,7 @@ class Rerun:
             generators["start_tick"][axis] = generators["held_until"][axis] = first_tick
 
 
-def _plan(header: Mapping[str, Any], source: Source, law: Law, commands: np.ndarray[Any, Any]) -> Plan:
+def _plan(header: Mapping[str, Any], source: Source, law: LawMemory, commands: np.ndarray[Any, Any]) -> Plan:
     axes = tuple(header["axes"])
     return Plan(
         name="rerun",
@@ -146,6 +146,7 @@ def _plan(header: Mapping[str, Any], source: Source, law: Law, commands: np.ndar
         driver_kind="playback",
         driver_options={},
         wiring=source.wiring,
+        laws=tuple(kind.name for kind in law.layout.laws),
         coefficients=law.coefficients,
         mode=Mode.OFF,
         generators=np.zeros(len(axes), GENERATOR),

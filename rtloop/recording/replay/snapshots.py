@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.law.layout import COEFFICIENTS, LOOP_STATE, STATE
+from rtloop.law.layout import LOOP_STATE, Records
+from rtloop.law.memory import LawMemory, Which, fields
 
 
-def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str]) -> tuple[str, Any, Any]:
+def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:
     """Field and both values where the law's bytes (those of a snapshot behind its tick) first differ."""
-    for name, dtype, start in _values(axes):
+    for name, dtype, start in _values(axes, law):
         parts = [data[start : start + dtype.itemsize] for data in (recorded, replayed)]
         if parts[0] != parts[1]:
             values = [np.frombuffer(part, dtype.base) for part in parts]
@@ -23,11 +24,14 @@ def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str]) -> t
     return "law, bytes that belong to no field", None, None
 
 
-def _values(axes: Sequence[str]) -> Iterator[tuple[str, np.dtype[Any], int]]:
+def _values(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[Any], int]]:
     """Name, type and offset of every field, in the order of a snapshot."""
     offset = 0
-    tables = [(axis, COEFFICIENTS) for axis in axes] + [(axis, STATE) for axis in axes] + [("loop", LOOP_STATE)]
-    for owner, table in tables:
-        for name, (dtype, start, *_) in (table.fields or {}).items():
-            yield f"law.{owner}.{name}", dtype, offset + start
-        offset += table.itemsize
+    tables: tuple[tuple[Which, Records], ...] = (("coefficients", law.coefficients), ("state", law.axes))
+    for which, records in tables:
+        for axis, owned in zip(axes, fields(law.layout, law.coefficients, which), strict=True):
+            for name, dtype, start in owned:
+                yield f"law.{axis}.{name}", dtype, offset + start
+            offset += records.itemsize
+    for name, (dtype, start, *_) in (LOOP_STATE.fields or {}).items():
+        yield f"law.loop.{name}", dtype, offset + start

@@ -9,22 +9,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import closing
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from rtloop import signals
 from rtloop.drivers.base import Driver, Pointers
 from rtloop.law.law import set_mode
-from rtloop.law.layout import Records, initial_state
+from rtloop.law.layout import Records
+from rtloop.law.memory import LawMemory
+from rtloop.laws.binding import functions_of
+from rtloop.laws.registry import layout_of
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.outcome import Differences, Performance
-from rtloop.recording.replay.replay import LAW_COMMANDS, check_layout, consecutive, law_of, recorded_commands
-from rtloop.recording.replay.rerun import Law, Rerun, Rows, Source, Tape
+from rtloop.recording.replay.replay import (
+    LAW_COMMANDS,
+    consecutive,
+    law_names,
+    law_of,
+    layout_of_recording,
+    recorded_commands,
+)
+from rtloop.recording.replay.rerun import Rerun, Rows, Source, Tape
 from rtloop.signals import Mode
 
 Progress = Callable[[int], None]
+
+
+class Law(NamedTuple):
+    """Kinds that a loop knows, and the coefficients of its axes."""
+
+    kinds: tuple[str, ...]
+    coefficients: Records
 
 
 class Rig:
@@ -43,24 +58,24 @@ class Rig:
         """Nothing: a rig has no need of what was recorded."""
 
 
-def recorded_coefficients(recording: Recording) -> Records:
-    """The coefficients of the first snapshot. Raises RecordingError where there is none that can be used."""
-    check_layout(recording)
+def recorded_law(recording: Recording) -> Law:
+    """The law of the first snapshot. Raises RecordingError where there is none that can be used."""
+    layout_of_recording(recording)
     with closing(recording.snapshots()) as snapshots:
         first = next(snapshots, None)
     if first is None:
         raise RecordingError(f"{recording.paths[0]}: holds no snapshot of the law")
-    return law_of(first, recording).coefficients
+    return Law(law_names(recording), law_of(first, recording).coefficients)
 
 
-def other_law(recording: Recording, coefficients: Records, progress: Progress | None = None) -> dict[str, Any]:
-    """How the outputs of a law with `coefficients` differ from the recorded ones, on the recorded inputs.
+def other_law(recording: Recording, law: Law, progress: Progress | None = None) -> dict[str, Any]:
+    """How the outputs of another law differ from the recorded ones, on the recorded inputs.
 
     {ticks, signals: {name: {max, at_tick, rms}}, trips: [{tick, causes}]}. Raises RecordingError.
     """
     differences = Differences(recording.header["axes"])
     ticks = 0
-    with closing(_pairs(recording, coefficients, Tape(recording.header))) as pairs:
+    with closing(_pairs(recording, law, Tape(recording.header))) as pairs:
         for recorded, replayed in pairs:
             differences.add(recorded, replayed)
             ticks += len(replayed)
@@ -68,10 +83,8 @@ def other_law(recording: Recording, coefficients: Records, progress: Progress | 
     return {"ticks": ticks, "problems": recording.problems, **differences.report()}
 
 
-def resimulate(
-    recording: Recording, coefficients: Records, driver: Driver, progress: Progress | None = None
-) -> dict[str, Any]:
-    """How well a law with `coefficients` follows the recorded reference on a simulated rig, beside what was recorded.
+def resimulate(recording: Recording, law: Law, driver: Driver, progress: Progress | None = None) -> dict[str, Any]:
+    """How well a law follows the recorded reference on a simulated rig, beside what was recorded.
 
     {ticks, axes: [{name, recorded: {…}, resimulated: {…}}]}. Raises RecordingError.
     """
@@ -79,7 +92,7 @@ def resimulate(
     before, after = (Performance(axes, rate_hz) for _ in range(2))
     ticks = 0
     try:
-        with closing(_pairs(recording, coefficients, Rig(driver))) as pairs:
+        with closing(_pairs(recording, law, Rig(driver))) as pairs:
             for recorded, replayed in pairs:
                 before.add(recorded)
                 after.add(replayed)
@@ -96,7 +109,7 @@ def resimulate(
     }
 
 
-def _pairs(recording: Recording, coefficients: Records, source: Source) -> Generator[tuple[Rows, Rows]]:
+def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Rows, Rows]]:
     """Recorded rows and what came of executing them, stretch by stretch, up to the end of either."""
     commands, rerun = recorded_commands(recording, LAW_COMMANDS), None
     with closing(recording.blocks()) as blocks:
@@ -104,8 +117,8 @@ def _pairs(recording: Recording, coefficients: Records, source: Source) -> Gener
             while len(rows):
                 tick = int(rows[0, signals.TICK])
                 if rerun is None:
-                    law = _at_rest(coefficients, Mode(int(rows[0, signals.MODE])))
-                    rerun = Rerun(recording.header, source, law, commands[commands["tick"] >= tick], tick)
+                    memory = _at_rest(law, Mode(int(rows[0, signals.MODE])))
+                    rerun = Rerun(recording.header, source, memory, commands[commands["tick"] >= tick], tick)
                 count = min(len(rows), rerun.room(tick))
                 replayed = rerun.execute(rows[:count])
                 yield rows[: len(replayed)], replayed
@@ -116,11 +129,10 @@ def _pairs(recording: Recording, coefficients: Records, source: Source) -> Gener
         raise RecordingError(f"{recording.paths[0]}: holds no tick")
 
 
-def _at_rest(coefficients: Records, mode: Mode) -> Law:
-    coefficients = coefficients.view(np.recarray)
-    axes, state = initial_state(coefficients)
-    set_mode(axes, state[0], int(mode), True)
-    return Law(coefficients, axes, state)
+def _at_rest(law: Law, mode: Mode) -> LawMemory:
+    memory = LawMemory.at_rest(layout_of(law.kinds), functions_of(law.kinds), law.coefficients)
+    set_mode(memory.law, int(mode), True)
+    return memory
 
 
 def _tell(progress: Progress | None, ticks: int) -> None:

@@ -10,9 +10,9 @@ enum {
     COMMAND_LIMITED = 1 << 1, DRIVE_LIMITED = 1 << 2, SLEW_LIMITED = 1 << 3, RAMPING = 1 << 4, HEARTBEAT_LOST = 1 << 5,
     TRIP_NON_FINITE = 1 << 8, TRIP_SENSOR_RANGE = 1 << 9, TRIP_POSITION = 1 << 10, TRIP_DRIVER = 1 << 11,
     TRIP_HEARTBEAT = 1 << 12, TRIP_STALE = 1 << 13, TRIP_FROZEN = 1 << 14, TRIP_TRACKING = 1 << 15,
-    TRIP_OSCILLATION = 1 << 16, TRIP_LATE = 1 << 17, TRIP_ENABLE = 1 << 18,
+    TRIP_OSCILLATION = 1 << 16, TRIP_LATE = 1 << 17, TRIP_ENABLE = 1 << 18, TRIP_LAW = 1 << 19,
 };
-enum { LANES = 4, BLOCK = 8, ANOTHER_MODE = 1 };
+enum { LANES = 4, BLOCK = 8, ANOTHER_MODE = 1, CONTROLLER_OUTPUT = 2, FEEDFORWARD_OUTPUT = 8, FEEDFORWARD_UPDATE = 10 };
 
 typedef const struct law_coefficients *restrict law_c;
 typedef struct law_state *restrict law_s;
@@ -120,22 +120,43 @@ static inline double toward(double value, double target, double step) {
     return clip(target, value - step, value + step);
 }
 
+static inline double died(law_c c, double offset, bool anew, double gap) {
+    offset = anew ? gap : offset * c->bump_decay;
+    return -1e-9 < offset && offset < 1e-9 ? 0 : offset;
+}
 static inline double bump(law_c c, law_s s, double gap) {
-    s->bump = s->entering == ANOTHER_MODE ? gap : s->bump * c->bump_decay;
-    if (-1e-9 < s->bump && s->bump < 1e-9) s->bump = 0;
-    return s->bump;
+    return s->bump = died(c, s->bump, s->entering == ANOTHER_MODE, gap);
+}
+
+static inline void failed(law_s s, int64_t which, double value) {
+    if (s->failed == 0) {
+        s->failed = which;
+        s->failed_value = value;
+    }
+}
+static inline void trip_by_law(loop_s loop) {
+    loop->new_trip |= TRIP_LAW & ~loop->trip;
+    loop->trip |= TRIP_LAW;
+    loop->mode = OFF;
+}
+
+static inline bool control(law_c c, law_s s) {
+    double resting_um = c->resting_error[0] * s->applied_command_um;
+    double met_um = s->error_um - bump(c, s, s->error_um - resting_um);
+    if (s->entering) controller_enter(c, s, met_um, s->applied_command_um);
+    double command_um = controller_output(c, s, met_um);
+    bool good = usable(command_um);
+    if (!good) failed(s, CONTROLLER_OUTPUT, command_um);
+    s->command_bump_um = died(c, s->command_bump_um, s->entering != 0, s->applied_command_um - command_um);
+    s->command_um = command_um + s->command_bump_um;
+    return good;
 }
 
 static inline int64_t drive_of(law_c c, law_s s, loop_s loop, double reference) {
     double last_v = s->drive_v;
-    if (s->usable) {
-        s->error_um = prefilter(c, s, reference) - s->position_um;
-    } else {
-        s->error_um = reference - s->position_um;
-        if (loop->new_trip) {
-            s->demand_v = last_v;
-            return RAMPING;
-        }
+    if (loop->new_trip && (!s->usable || s->failed)) {
+        s->demand_v = last_v;
+        return RAMPING;
     }
     if (loop->mode == OFF) {
         s->drive_v = toward(last_v, c->safe_v, c->trip_slew_v_per_tick);
@@ -150,15 +171,16 @@ static inline int64_t drive_of(law_c c, law_s s, loop_s loop, double reference) 
     } else {
         if (loop->mode == FEEDFORWARD) {
             s->command_um = reference + bump(c, s, s->applied_command_um - reference);
-        } else {
-            double resting_um = c->resting_error * s->applied_command_um;
-            double met_um = s->error_um - bump(c, s, s->error_um - resting_um);
-            if (s->entering) controller_enter(c, s, met_um, s->applied_command_um);
-            s->command_um = controller_output(c, s, met_um);
         }
         double limited = clip(s->command_um, -c->command_limit_um, c->command_limit_um);
         if (limited != s->command_um) flags |= COMMAND_LIMITED;
         s->demand_v = inverse_drive(c, s, limited);
+        if (!usable(s->demand_v)) failed(s, FEEDFORWARD_OUTPUT, s->demand_v);
+        if (s->failed) {
+            trip_by_law(loop);
+            s->demand_v = last_v;
+            return RAMPING;
+        }
     }
     s->entering = 0;
     double allowed = clip(s->demand_v, c->drive_min_v, c->drive_max_v);
@@ -226,7 +248,8 @@ static inline void evaluate(
     const struct conditions *restrict now
 ) {
     bool lost = now->heartbeat_lost != 0;
-    int64_t causes = (now->driver_status < 0 ? TRIP_DRIVER : 0) | (lost ? TRIP_HEARTBEAT : 0);
+    int64_t causes = (now->driver_status < 0 ? TRIP_DRIVER : 0) | (lost ? TRIP_HEARTBEAT : 0) | loop->pending;
+    loop->pending = 0;
     for (int64_t a = 0; a < axes; a++) {
         double position_um = (adc_v[a] - c[a].offset_v) * c[a].um_per_v;
         s[a].position_um = position_um;
@@ -241,18 +264,37 @@ static inline void evaluate(
     loop->new_trip = causes & ~loop->trip;
     loop->trip |= causes;
     if (loop->trip) loop->mode = OFF;
-    loop->tick_flags = loop->trip | (lost ? HEARTBEAT_LOST : 0);
+    for (int64_t a = 0; a < axes; a++) {
+        double wanted_um = s[a].usable ? prefilter(&c[a], &s[a], references[a]) : references[a];
+        s[a].error_um = wanted_um - s[a].position_um;
+    }
+    if (loop->mode == CLOSED_LOOP) {
+        bool good = true;
+        for (int64_t a = 0; a < axes; a++) good = control(&c[a], &s[a]) && good;
+        if (!good) trip_by_law(loop);
+    }
+    loop->tick_flags = lost ? HEARTBEAT_LOST : 0;
     loop->settled = 1;
     for (int64_t a = 0; a < axes; a++) {
         loop->tick_flags |= drive_of(&c[a], &s[a], loop, references[a]);
         if (s[a].drive_v != c[a].safe_v) loop->settled = 0;
     }
+    loop->tick_flags |= loop->trip;
 }
 
 static inline void update(law_c c, law_s s, loop_s loop, int64_t axes) {
     for (int64_t a = 0; a < axes; a++) {
-        double applied_um = s[a].applied_command_um = follow_drive(&c[a], &s[a], s[a].drive_v);
-        if (loop->mode == CLOSED_LOOP)
-            controller_update(&c[a], &s[a], s[a].error_um - s[a].bump, c[a].tracking_share * (applied_um - s[a].command_um));
+        double applied_um = follow_drive(&c[a], &s[a], s[a].drive_v);
+        if (usable(applied_um)) {
+            s[a].applied_command_um = applied_um;
+        } else {
+            failed(&s[a], FEEDFORWARD_UPDATE, applied_um);
+            loop->pending |= TRIP_LAW;
+        }
+    }
+    if (loop->mode != CLOSED_LOOP) return;
+    for (int64_t a = 0; a < axes; a++) {
+        double shortfall_um = s[a].applied_command_um - s[a].command_um;
+        controller_update(&c[a], &s[a], s[a].error_um - s[a].bump, c[a].tracking_share * shortfall_um);
     }
 }

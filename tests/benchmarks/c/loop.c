@@ -15,7 +15,7 @@ void run_law(
         if (modes[k] >= 0) {
             loop->trip = 0;
             loop->mode = modes[k];
-            for (int64_t a = 0; a < axes; a++) s[a].entering = 1;
+            for (int64_t a = 0; a < axes; a++) s[a].entering = 1, s[a].failed = 0;
         }
         evaluate(c, s, loop, axes, &adc_v[k * axes], &references[k * axes], &now);
         update(c, s, loop, axes);

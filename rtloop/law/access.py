@@ -1,0 +1,68 @@
+"""The records of the law as compiled code finds them, from the addresses in one LAW record."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.law.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LOOP_STATE, STATE
+
+FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
+CONTROL_BYTES, FUNCTIONS_BYTES = CONTROL.itemsize, FUNCTIONS.itemsize
+
+
+class Law(NamedTuple):
+    """What a LAW record says, as values: the compiler knows that nothing that a tick writes changes them."""
+
+    coefficients: int
+    coefficients_bytes: int
+    axes: int
+    axes_bytes: int
+    loop: int
+    controls: int
+    functions: int
+    result: int
+    raised: int
+    controller_coefficients: int
+    controller_state: int
+    axis_count: int
+
+
+@jit
+def opened(law):
+    """A LAW record, read once."""
+    return Law(
+        law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.functions,
+        law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
+    )  # fmt: skip
+
+
+@jit
+def coefficients_of(law, a):
+    """Coefficients of axis number `a`."""
+    return carray(address_pointer(law.coefficients + a * law.coefficients_bytes), 1, COEFFICIENTS)[0]
+
+
+@jit
+def state_of(law, a):
+    """State of axis number `a`."""
+    return carray(address_pointer(law.axes + a * law.axes_bytes), 1, STATE)[0]
+
+
+@jit
+def loop_of(law):
+    """State common to all axes."""
+    return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
+
+
+@jit
+def control_of(law, a):
+    """What the controller of axis number `a` is told."""
+    return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
+
+
+@jit
+def functions_of(law, number):
+    """The law of this number."""
+    return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]

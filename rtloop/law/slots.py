@@ -1,0 +1,164 @@
+"""The two places of a law that plug-ins fill: calls of their functions, on records of their own.
+
+Whatever a plug-in returns or raises is a number here: a failure is noted with the axis, and the caller trips.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from rtloop.hil.native.compiled import jit, seldom
+from rtloop.hil.native.pointers import address_pointer, call_law, carray
+from rtloop.law.access import (
+    CONTROL_BYTES,
+    FEEDFORWARD_COEFFICIENTS,
+    FEEDFORWARD_STATE,
+    coefficients_of,
+    functions_of,
+    state_of,
+)
+from rtloop.law.layout import CONTROL, RULE
+from rtloop.law.safety import usable
+
+OK, NONE = 0, -2
+APPLIED = CONTROL.fields["applied_um"][1]  # type: ignore[index]
+"""Status of a compiled function that returned a value, or none."""
+
+
+class Failure(IntEnum):
+    """Which function of a law failed; one more than a multiple of 2 where it raised and returned nothing usable."""
+
+    CONTROLLER_OUTPUT = 2
+    CONTROLLER_UPDATE = 4
+    CONTROLLER_ENTER = 6
+    FEEDFORWARD_OUTPUT = 8
+    FEEDFORWARD_UPDATE = 10
+    FEEDFORWARD_ENTER = 12
+
+
+RAISED = 1
+CONTROLLER_OUTPUT, CONTROLLER_UPDATE, CONTROLLER_ENTER = (
+    int(Failure.CONTROLLER_OUTPUT), int(Failure.CONTROLLER_UPDATE), int(Failure.CONTROLLER_ENTER)
+)  # fmt: skip
+FEEDFORWARD_OUTPUT, FEEDFORWARD_UPDATE, FEEDFORWARD_ENTER = (
+    int(Failure.FEEDFORWARD_OUTPUT), int(Failure.FEEDFORWARD_UPDATE), int(Failure.FEEDFORWARD_ENTER)
+)  # fmt: skip
+
+
+@jit
+def _result(law):
+    """What the last call returned."""
+    return carray(address_pointer(law.result), 1, np.float64)[0]
+
+
+@seldom
+def note_failure(state, failure, value):
+    """The first failure of an axis since it was entered is the one that is told."""
+    if state.failed == 0:
+        state.failed, state.failed_value = failure, value
+
+
+@jit
+def _controller_call(law, a, function):
+    coefficients = law.coefficients + a * law.coefficients_bytes + law.controller_coefficients
+    state = law.axes + a * law.axes_bytes + law.controller_state
+    return call_law(function, law.result, law.raised, coefficients, state, law.controls + a * CONTROL_BYTES)
+
+
+@jit
+def _feedforward_call(law, a, function, result, value):
+    coefficients = law.coefficients + a * law.coefficients_bytes + FEEDFORWARD_COEFFICIENTS
+    state = law.axes + a * law.axes_bytes + FEEDFORWARD_STATE
+    return call_law(function, result, law.raised, coefficients, state, value)
+
+
+@jit
+def controller_output(law, a, coefficients):
+    """Whether the controller whose first axis is `a` came to its end, and what it returned."""
+    status = _controller_call(law, a, functions_of(law, coefficients.controller_law).output)
+    if status in (OK, NONE):
+        return True, _result(law)
+    note_failure(state_of(law, a), CONTROLLER_OUTPUT + RAISED, np.nan)
+    return False, np.nan
+
+
+@seldom
+def controller_enter(law, a):
+    """Have the controller whose first axis is `a`, its state at zero, go on from a command; False where it failed."""
+    functions = functions_of(law, coefficients_of(law, a).controller_law)
+    state = carray(
+        address_pointer(law.axes + a * law.axes_bytes + law.controller_state), functions.state_bytes, np.uint8
+    )
+    for i in range(functions.state_bytes):
+        state[i] = 0
+    if functions.enter == 0 or _controller_call(law, a, functions.enter) in (OK, NONE):
+        return True
+    note_failure(state_of(law, a), CONTROLLER_ENTER + RAISED, np.nan)
+    return False
+
+
+@jit
+def controller_update(law, a, coefficients):
+    """Advance the controller whose first axis is `a`; False where it failed."""
+    if _controller_call(law, a, functions_of(law, coefficients.controller_law).update) in (OK, NONE):
+        return True
+    note_failure(state_of(law, a), CONTROLLER_UPDATE + RAISED, np.nan)
+    return False
+
+
+@jit
+def feedforward_output(law, a, coefficients, state, command_um):
+    """Drive in V for a command in µm; a failure is noted."""
+    function = functions_of(law, coefficients.feedforward_law).output
+    if _feedforward_call(law, a, function, law.result, command_um) not in (OK, NONE):
+        note_failure(state, FEEDFORWARD_OUTPUT + RAISED, np.nan)
+        return np.nan
+    drive_v = _result(law)
+    if not usable(drive_v):
+        note_failure(state, FEEDFORWARD_OUTPUT, drive_v)
+    return drive_v
+
+
+@seldom
+def feedforward_enter(law, a, drive_v):
+    """The feedforward takes over at `drive_v`."""
+    functions = functions_of(law, coefficients_of(law, a).feedforward_law)
+    if functions.enter != 0 and _feedforward_call(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):
+        note_failure(state_of(law, a), FEEDFORWARD_ENTER + RAISED, np.nan)
+
+
+@jit
+def feedforward_update(law, a, coefficients, state, drive_v):
+    """Advance the feedforward by the drive applied: the command in µm that this was; NaN where it failed.
+
+    It goes straight to where the controller finds it.
+    """
+    function = functions_of(law, coefficients.feedforward_law).update
+    place = law.controls + a * CONTROL_BYTES + APPLIED
+    if _feedforward_call(law, a, function, place, drive_v) not in (OK, NONE):
+        note_failure(state, FEEDFORWARD_UPDATE + RAISED, np.nan)
+        return np.nan
+    applied_um = carray(address_pointer(place), 1, np.float64)[0]
+    if not usable(applied_um):
+        note_failure(state, FEEDFORWARD_UPDATE, applied_um)
+    return applied_um
+
+
+@seldom
+def admitted(law, number, coefficients):
+    """Whether all counts and indices in a law's coefficients, at an address, are what its kernels can work with."""
+    functions = functions_of(law, number)
+    rules = carray(address_pointer(law.rules), functions.first_rule + functions.rule_count, RULE)
+    for rule in range(functions.first_rule, functions.first_rule + functions.rule_count):
+        one = rules[rule]
+        for i in range(one.count):
+            place = coefficients + one.offset + i * one.octets
+            if one.octets == 1:
+                value = np.int64(carray(address_pointer(place), 1, np.uint8)[0])
+            else:
+                value = carray(address_pointer(place), 1, np.int64)[0]
+            if value < one.low or value > one.high or value % one.step != 0:
+                return False
+    return True

@@ -1,0 +1,134 @@
+"""The contract of a law: options, two records, and functions of numbers.
+
+To the loop a law is `output`, called before the drive is written, and `update`, called behind it. Both get the law's
+coefficients `c` and state `s` as records with attributes, and what else they may know of this tick:
+
+    controller    output(c, s, told) → command in µm
+                  update(c, s, told)
+                  told.reference_um, position_um, error_um: as the controller meets them; in `update` also
+                  command_um, what went out as its command, and applied_um, what of it was really applied
+
+    feedforward   output(c, s, command_um) → drive in V
+                  update(c, s, drive_v) → command in µm that this drive was, `drive_v` being what was really applied
+
+They are written in the Python that numba compiles, with numbers alone: no allocation, no clock, no file. Limits, slew,
+interlocks, modes and bumpless changes belong to the loop and are the same for every law.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from rtloop.law.layout import whole_lines
+from rtloop.law.memory import LawRecords, Rules
+from rtloop.laws.options import ControllerOptions, LawOptions
+
+Fields = Mapping[str, Any]
+"""Name of each number of a record: `float` or `int`, or (type, length) for an array, (type, shape) for a matrix."""
+_TYPES = {float: np.float64, int: np.int64}
+
+
+class Law(ABC):
+    """One law, with its options, on one axis at one rate."""
+
+    kind: ClassVar[str]
+    options_model: ClassVar[type[LawOptions]] = LawOptions
+    axes: ClassVar[int]
+    coefficients: ClassVar[Fields | np.dtype[Any]]
+    state: ClassVar[Fields | np.dtype[Any]] = MappingProxyType({})
+    allowed_coefficients: ClassVar[Rules] = MappingProxyType({})
+    """What whole numbers that the functions use as counts or indices may be."""
+    allowed_state: ClassVar[Rules] = MappingProxyType({})
+    shipped: ClassVar[bool] = False
+    """True where the functions are compiled kernels already, whose indices are checked where data enters."""
+    enter: ClassVar[Callable[..., None] | None] = None
+    """Of a controller, enter(c, s, told): from a state of zeros, that from which `output` gives told.command_um for
+    what it is told. Where it is missing, or does not manage, the loop adds an offset to the command, which dies out.
+    Of a feedforward, enter(c, s, drive_v): it takes over at this drive; its memory is of the actuator, and stays."""
+
+    def __init__(self, options: Any, period_s: float, model: Any) -> None:
+        """`model` is the plant from command to position that the axis was given (`configuration`'s), or None."""
+        self.options, self.period_s, self.model = options, period_s, model
+
+    @abstractmethod
+    def build(self) -> Mapping[str, Any]:
+        """A value for each coefficient; arrays may be shorter than their fields. Raises ValueError."""
+
+    @classmethod
+    def records(cls) -> LawRecords:
+        """What it keeps, as types."""
+        return LawRecords(
+            cls.kind, cls.axes, _record(cls.coefficients), _record(cls.state), cls.allowed_coefficients,
+            cls.allowed_state,
+        )  # fmt: skip
+
+
+class Controller(Law):
+    """From what one axis does to the command of its feedforward."""
+
+    options_model = ControllerOptions
+    axes = 1
+
+    @staticmethod
+    @abstractmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        """Command in µm."""
+
+    @staticmethod
+    @abstractmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        """Advance the state by a tick."""
+
+    def resting_error(self) -> float:
+        """Error in µm per µm of command at which it stays where it is: 1/C(1), and 0 for one that integrates."""
+        return 0.0
+
+
+class Feedforward(Law):
+    """From a command to a drive, with the model that says what a drive was as a command."""
+
+    axes = 0
+
+    @staticmethod
+    @abstractmethod
+    def output(c: Any, s: Any, command_um: float) -> float:
+        """Drive in V."""
+
+    @staticmethod
+    @abstractmethod
+    def update(c: Any, s: Any, drive_v: float) -> float:
+        """Advance the memory by the drive that was applied; the command in µm that it was."""
+
+
+def _record(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
+    """A record that fills whole cache lines. Raises TypeError for a type that is not allowed."""
+    if isinstance(fields, np.dtype):
+        return fields
+    found = []
+    for name, what in fields.items():
+        kind, *shape = what if isinstance(what, tuple) else (what,)
+        if kind not in _TYPES:
+            raise TypeError(f"{name}: {kind!r}; float and int are allowed")
+        lengths = shape[0] if shape and isinstance(shape[0], tuple) else tuple(shape)
+        found.append((name, _TYPES[kind], lengths))
+    return whole_lines(sorted(found, key=lambda field: -int(np.prod(field[2]))))
+
+
+def record_of(law: Law) -> Any:
+    """The coefficients that a law builds, shape (1,). Raises ValueError for a name or a shape that does not fit."""
+    dtype = law.records().coefficients
+    found = np.zeros(1, dtype)
+    for name, value in law.build().items():
+        if dtype.fields is None or name not in dtype.fields:
+            raise ValueError(f"{name}: not among the coefficients of {law.kind}, {', '.join(dtype.names or ())}")
+        numbers, target = np.asarray(value), found[name]
+        room = target.shape[1:]
+        if numbers.ndim != len(room) or any(n > most for n, most in zip(numbers.shape, room, strict=True)):
+            raise ValueError(f"{name}: {numbers.shape} numbers; at most {room} fit")
+        target[(0, *(slice(0, length) for length in numbers.shape))] = numbers
+    return found

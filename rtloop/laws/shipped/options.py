@@ -1,0 +1,68 @@
+"""What a configuration says of the shipped laws."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from rtloop.hil.options import Numbers
+from rtloop.laws.options import ControllerOptions, LawOptions
+from rtloop.laws.shipped.play_model import PlayModel, play_model
+from rtloop.linear.options import TransferOptions
+
+
+class PrandtlIshlinskiiOptions(LawOptions):
+    """Inverse hysteresis: the forward model's thresholds and weights (inverted by formula), or an explicit inverse."""
+
+    kind: str = "prandtl_ishlinskii"
+    thresholds_v: Numbers = ()
+    weights_um_per_v: Numbers = ()
+    inverse_thresholds_um: Numbers = ()
+    inverse_weights_v_per_um: Numbers = ()
+    dead_band: Literal["none", "exact"] = "none"
+    """What is done about a first threshold r_0 > 0. `exact` leaves no residual but jumps by 2 r_0 at each reversal:
+    right for smooth commands known beforehand; a noisy command (closed loop) makes it chatter."""
+    dead_band_threshold_v: float = Field(default=1e-6, ge=0)
+    """`exact` reverses only when the drive without dead band has turned by more than this."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        self.models()
+        if self.dead_band == "exact" and not self.thresholds_v:
+            raise ValueError("dead_band is 'exact': allowed only with thresholds_v, whose first value it needs")
+        return self
+
+    def actuator(self) -> PlayModel:
+        """The forward model as it was identified, its dead band included."""
+        if self.thresholds_v:
+            return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))
+        return self.models()[0]
+
+    def models(self) -> tuple[PlayModel, PlayModel]:
+        """Forward model and inverse, consistent with each other."""
+        if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
+            raise ValueError(
+                "either thresholds_v with weights_um_per_v, or inverse_thresholds_um with inverse_weights_v_per_um, "
+                "is needed"
+            )
+        if self.inverse_thresholds_um:
+            inverse = play_model("inverse", self.inverse_thresholds_um, self.inverse_weights_v_per_um)
+            if inverse.thresholds[0] != 0:
+                raise ValueError(f"inverse_thresholds_um: the first, {inverse.thresholds[0]:g}, must be 0")
+            return inverse.inverse(), inverse
+        forward = play_model("forward model", self.thresholds_v, self.weights_um_per_v)
+        behind = forward.without_dead_band()
+        return (forward if self.dead_band == "exact" else behind), behind.inverse()
+
+
+class TransferControllerOptions(ControllerOptions, TransferOptions):
+    """C(s) and how it becomes C(z)."""
+
+    kind: str = "transfer"
+    method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
+    prewarp_hz: float | None = Field(default=None, gt=0)
+    tracking_s: float = Field(default=0.0005, ge=0)
+    """Anti-windup: time constant with which the states follow a command that was limited, short against the loop's
+    response. 0 is at once, which lets even a single limited tick throw the slow states off."""

@@ -1,0 +1,64 @@
+"""Prandtl-Ishlinskii models as numbers, and their inverses.
+
+Forward model, Rakotondrabe, Aljanaideh and Al Janaideh, eqs (1), (4):  y = Σ p_i F_{r_i}[u], with the play operator
+F_r[u] = max(u − r, min(u + r, F_r[u]₋)). Inverse (Kuhnen 2003):  w = Σ g_j F_{z_j}[v] with
+
+    z_j = Σ_{i≤j} p_i (r_j − r_i),   g_0 = 1/p_0,   g_j = −p_j / (Σ_{i≤j} p_i · Σ_{i<j} p_i).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Real = npt.NDArray[np.float64]
+MAX_PLAYS = 64
+
+
+@dataclass(frozen=True)
+class PlayModel:
+    """Thresholds (n,) ascending from ≥ 0 and weights (n,) of a Prandtl-Ishlinskii operator."""
+
+    thresholds: Real
+    weights: Real
+
+    def for_json(self) -> dict[str, Real]:
+        """With the names that a configuration has for it."""
+        return {"thresholds_v": self.thresholds, "weights_um_per_v": self.weights}
+
+    def inverse(self) -> PlayModel:
+        """The inverse operator, itself a Prandtl-Ishlinskii model; a first threshold above 0 is ignored.
+
+        Raises ValueError where a partial sum of the weights is not positive: no inverse exists.
+        """
+        sums = np.cumsum(self.weights)
+        if not np.all(sums > 0):
+            first = int(np.argmax(~(sums > 0)))
+            raise ValueError(
+                f"weights: their sum up to number {first} is {sums[first]:.6g}; every partial sum must be above 0, "
+                "or the model has no inverse"
+            )
+        before = np.concatenate([[0.0], sums[:-1]])
+        moments = np.concatenate([[0.0], np.cumsum(self.weights * self.thresholds)[:-1]])
+        thresholds = before * self.thresholds - moments
+        thresholds[0] = 0.0
+        weights = np.concatenate([[1 / sums[0]], -self.weights[1:] / (sums[1:] * sums[:-1])])
+        return PlayModel(thresholds, weights)
+
+    def without_dead_band(self) -> PlayModel:
+        """The same model with all thresholds lowered by the first: what remains behind the dead band r_0."""
+        return PlayModel(self.thresholds - self.thresholds[0], self.weights)
+
+
+def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> PlayModel:
+    """A checked model. Raises ValueError naming `name`, the fault and what is allowed."""
+    r, p = np.atleast_1d(np.asarray(thresholds, float)), np.atleast_1d(np.asarray(weights, float))
+    if r.shape != p.shape or r.ndim != 1 or not 1 <= r.size <= MAX_PLAYS:
+        raise ValueError(f"{name}: {r.size} thresholds and {p.size} weights; as many of each, 1 to {MAX_PLAYS}")
+    if not (np.all(np.isfinite(r)) and np.all(np.isfinite(p))):
+        raise ValueError(f"{name}: thresholds and weights must be finite")
+    if r[0] < 0 or np.any(np.diff(r) <= 0):
+        raise ValueError(f"{name}: thresholds {r.tolist()} must be at least 0 and ascend")
+    return PlayModel(r, p)

@@ -1,0 +1,160 @@
+"""Inverse Prandtl-Ishlinskii compensation with the memory of the drive that was really applied.
+
+Model and inverse: `rtloop.laws.shipped.play_model` (Kuhnen 2003). Plays that follow v would lose the actuator's memory
+whenever the drive is limited, slewed, raw or ramped. The law therefore keeps the forward model on the applied drive,
+takes v_applied = P̂[u_applied] from it and lets the inverse's plays follow that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from rtloop.hil.native.compiled import inlined, jit
+from rtloop.law.layout import whole_lines
+from rtloop.law.validity import Allowed
+from rtloop.laws.contract import Feedforward
+from rtloop.laws.shipped.lanes import LANES, total
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+from rtloop.laws.shipped.play_model import MAX_PLAYS
+
+COEFFICIENTS = whole_lines(
+    [
+        ("inverse_thresholds_um", np.float64, (MAX_PLAYS,)),
+        ("inverse_weights_v_per_um", np.float64, (MAX_PLAYS,)),
+        ("model_thresholds_v", np.float64, (MAX_PLAYS,)),
+        ("model_weights_um_per_v", np.float64, (MAX_PLAYS,)),
+        ("play_count", np.uint8),
+        ("unused", np.uint8, (7,)),
+        ("dead_band_v", np.float64),
+        ("dead_band_threshold_v", np.float64),
+    ]
+)
+STATE = whole_lines(
+    [
+        ("inverse_plays_um", np.float64, (MAX_PLAYS,)),
+        ("model_plays_v", np.float64, (MAX_PLAYS,)),
+        ("sums", np.float64, (LANES,)),
+        ("dead_band_direction", np.float64),
+    ]
+)
+
+
+@inlined
+def play(value, threshold, last):
+    """Play operator of half-width `threshold` ≥ 0 after state `last`, by comparisons: NaN and −0 cannot surprise."""
+    low = value - threshold
+    high = value + threshold
+    raised = low if low > last else last
+    return high if high < raised else raised
+
+
+@inlined
+def four_plays(value, thresholds, last, i):
+    """Plays number i … i + 3 after `value`."""
+    return (
+        play(value, thresholds[i], last[i]),
+        play(value, thresholds[i + 1], last[i + 1]),
+        play(value, thresholds[i + 2], last[i + 2]),
+        play(value, thresholds[i + 3], last[i + 3]),
+    )
+
+
+@jit
+def plays_sum(value, thresholds, weights, plays, count, sums):
+    """Σ w_i F_i[value] in four partial sums; the plays do not move.
+
+    Plainly: s[i mod 4] += w_i F_i[value] for i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
+    """
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for block in range(count // LANES):
+        i = block * LANES
+        one, two, three, four = four_plays(value, thresholds, plays, i)
+        first += weights[i] * one
+        second += weights[i + 1] * two
+        third += weights[i + 2] * three
+        fourth += weights[i + 3] * four
+    return total(sums, first, second, third, fourth)
+
+
+@jit
+def moved_plays_sum(value, thresholds, weights, plays, count, sums):
+    """The same sum, and the plays move."""
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for block in range(count // LANES):
+        i = block * LANES
+        one, two, three, four = four_plays(value, thresholds, plays, i)
+        first += weights[i] * one
+        second += weights[i + 1] * two
+        third += weights[i + 2] * three
+        fourth += weights[i + 3] * four
+        plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = one, two, three, four
+    return total(sums, first, second, third, fourth)
+
+
+@jit
+def move_plays(value, thresholds, plays, count):
+    """Plays after `value`."""
+    for block in range(count // LANES):
+        i = block * LANES
+        plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = four_plays(value, thresholds, plays, i)
+
+
+@jit
+def drive_for(c, s, command_um):
+    """Drive in V that the inverse gives for a command in µm, dead band included; the memory does not move."""
+    drive = plays_sum(
+        command_um, c.inverse_thresholds_um, c.inverse_weights_v_per_um, s.inverse_plays_um, c.play_count, s.sums
+    )
+    if c.dead_band_v > 0.0:
+        if drive > s.model_plays_v[0] + c.dead_band_threshold_v:
+            s.dead_band_direction = 1.0
+        elif drive < s.model_plays_v[0] - c.dead_band_threshold_v:
+            s.dead_band_direction = -1.0
+        drive += s.dead_band_direction * c.dead_band_v
+    return drive
+
+
+@jit
+def follow(c, s, drive_v):
+    """Advance the memory by the drive applied, and return v_applied = P̂[u_applied] in µm."""
+    applied_um = moved_plays_sum(
+        drive_v, c.model_thresholds_v, c.model_weights_um_per_v, s.model_plays_v, c.play_count, s.sums
+    )
+    move_plays(applied_um, c.inverse_thresholds_um, s.inverse_plays_um, c.play_count)
+    return applied_um
+
+
+@jit
+def go_on(c, s, drive_v):
+    """Another mode may have left the drive anywhere within the dead band."""
+    if c.dead_band_v > 0.0:
+        s.dead_band_direction = (drive_v - s.model_plays_v[0]) / c.dead_band_v
+
+
+class PrandtlIshlinskii(Feedforward):
+    """u = P̂⁻¹[v], which undoes the actuator's hysteresis (Kuhnen 2003)."""
+
+    kind = "prandtl_ishlinskii"
+    options_model = PrandtlIshlinskiiOptions
+    coefficients, state = COEFFICIENTS, STATE
+    allowed_coefficients = MappingProxyType({"play_count": Allowed(0, MAX_PLAYS, LANES)})
+    shipped = True
+    output, update, enter = drive_for, follow, go_on
+
+    def build(self) -> Mapping[str, Any]:
+        """Thresholds and weights of the model and of its inverse, padded to whole blocks."""
+        options: PrandtlIshlinskiiOptions = self.options
+        forward, inverse = options.models()
+        return {
+            "play_count": -(-forward.weights.size // LANES) * LANES,
+            "model_thresholds_v": forward.thresholds,
+            "model_weights_um_per_v": forward.weights,
+            "inverse_thresholds_um": inverse.thresholds,
+            "inverse_weights_v_per_um": inverse.weights,
+            "dead_band_v": forward.thresholds[0] if options.dead_band == "exact" else 0.0,
+            "dead_band_threshold_v": options.dead_band_threshold_v,
+        }

@@ -1,0 +1,212 @@
+"""C(z), any linear controller from error to command, in state space: x⁺ = A x + b e, v = c x + d e.
+
+From C(s) by `rtloop.linear.discretise`, which is imported where a law is built and not where it runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.hil.native.compiled import inlined, jit
+from rtloop.law.layout import whole_lines
+from rtloop.law.validity import SWITCH, Allowed
+from rtloop.laws.contract import Controller
+from rtloop.laws.shipped.lanes import BLOCK, LANES, total
+from rtloop.laws.shipped.options import TransferControllerOptions
+from rtloop.linear.realisation import blocks, row_bands
+
+if TYPE_CHECKING:
+    from rtloop.linear.discretise import DiscreteController
+
+MAX_ORDER = 24
+# States stand in blocks of four pairs, four first ones and then their four partners; A within the pairs is `own` and
+# `partner`, `coupling` holds the rest of A, of whose rows only the columns start ≤ j < stop are non-zero.
+COEFFICIENTS = whole_lines(
+    [
+        *((name, np.float64, (MAX_ORDER,)) for name in ("own", "partner", "b", "c", "tracking", "steady_state")),
+        ("coupling", np.float64, (MAX_ORDER, MAX_ORDER)),
+        ("row_start", np.uint8, (MAX_ORDER,)),
+        ("row_stop", np.uint8, (MAX_ORDER,)),
+        ("order", np.uint8),
+        ("coupled", np.uint8),
+        ("unused", np.uint8, (6,)),
+        ("d", np.float64),
+        ("tracking_share", np.float64),
+    ]
+)
+STATE = whole_lines(
+    [
+        ("controller", np.float64, (MAX_ORDER,)),
+        ("scratch", np.float64, (MAX_ORDER,)),
+        ("sums", np.float64, (LANES,)),
+    ]
+)
+
+
+@jit
+def command(c, s, told):
+    """Command v = c x + d e in µm.
+
+    Plainly: s[i mod 4] += c_i x_i + c_i+4 x_i+4 for i = 0 … 3, 8 … 11, …, then (s0 + s1) + (s2 + s3) + d e.
+    """
+    w, x = c.c, s.controller
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for block in range(c.order // BLOCK):
+        i = block * BLOCK
+        first += w[i] * x[i] + w[i + 4] * x[i + 4]
+        second += w[i + 1] * x[i + 1] + w[i + 5] * x[i + 5]
+        third += w[i + 2] * x[i + 2] + w[i + 6] * x[i + 6]
+        fourth += w[i + 3] * x[i + 3] + w[i + 7] * x[i + 7]
+    return total(s.sums, first, second, third, fourth) + c.d * told.error_um
+
+
+@jit
+def advance(c, s, told):
+    """x⁺ = A (x + m (v_applied − v)) + b e: the state as if C had commanded what was really applied.
+
+    The vector m has c·m = 1 (observer form of anti-windup; Åström and Wittenmark, Computer-Controlled Systems, 1997).
+    """
+    error_um, shortfall_um = told.error_um, c.tracking_share * (told.applied_um - told.command_um)
+    if c.coupled != 0:
+        for i in range(c.order):
+            s.scratch[i] = s.controller[i] + c.tracking[i] * shortfall_um
+    x = s.controller
+    for block in range(c.order // BLOCK):
+        i = block * BLOCK
+        one, partner_of_one = _moved_pair(c, s, i, error_um, shortfall_um)
+        two, partner_of_two = _moved_pair(c, s, i + 1, error_um, shortfall_um)
+        three, partner_of_three = _moved_pair(c, s, i + 2, error_um, shortfall_um)
+        four, partner_of_four = _moved_pair(c, s, i + 3, error_um, shortfall_um)
+        x[i], x[i + 1], x[i + 2], x[i + 3] = one, two, three, four
+        x[i + 4], x[i + 5], x[i + 6], x[i + 7] = partner_of_one, partner_of_two, partner_of_three, partner_of_four
+    if c.coupled != 0:
+        for i in range(c.order):
+            for j in range(c.row_start[i], c.row_stop[i]):
+                s.controller[i] += c.coupling[i, j] * s.scratch[j]
+
+
+@inlined
+def _moved_pair(c, s, i, error_um, shortfall_um):
+    """States i and i + LANES after a tick, as far as they depend on each other and on the inputs."""
+    j = i + LANES
+    first = s.controller[i] + c.tracking[i] * shortfall_um
+    second = s.controller[j] + c.tracking[j] * shortfall_um
+    return (
+        c.own[i] * first + c.partner[i] * second + c.b[i] * error_um,
+        c.own[j] * second + c.partner[j] * first + c.b[j] * error_um,
+    )
+
+
+@jit
+def go_on(c, s, told):
+    """State from which C continues at a command: its steady state for the error, corrected along m."""
+    for i in range(c.order):
+        s.controller[i] = c.steady_state[i] * told.error_um
+    gap = told.command_um - command(c, s, told)
+    for i in range(c.order):
+        s.controller[i] += c.tracking[i] * gap
+
+
+class TransferController(Controller):
+    """C(s), discretised, with anti-windup by what was really applied."""
+
+    kind = "transfer"
+    options_model = TransferControllerOptions
+    coefficients, state = COEFFICIENTS, STATE
+    allowed_coefficients = MappingProxyType(
+        {
+            "order": Allowed(0, MAX_ORDER, BLOCK),
+            "coupled": SWITCH,
+            "row_start": Allowed(0, MAX_ORDER),
+            "row_stop": Allowed(0, MAX_ORDER),
+        }
+    )
+    shipped = True
+    output, update, enter = command, advance, go_on
+
+    @cached_property
+    def discrete(self) -> DiscreteController:
+        """C(z). Raises ValueError for what cannot be discretised."""
+        from rtloop.linear.discretise import discretise
+
+        options: TransferControllerOptions = self.options
+        return discretise(options.transfer(), self.period_s, options.method, options.prewarp_hz)
+
+    def build(self) -> Mapping[str, Any]:
+        """States in the kernels' order. Raises ValueError for too high an order and an unstable anti-windup."""
+        controller = self.discrete
+        order = controller.b.size
+        if order > MAX_ORDER:
+            raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
+        places = _places(controller.a)
+        a = np.zeros((MAX_ORDER, MAX_ORDER))
+        a[np.ix_(places, places)] = controller.a
+        states = np.arange(MAX_ORDER)
+        partners = states ^ LANES
+        own, partner = a[states, states], a[states, partners]
+        a[states, states] = a[states, partners] = 0.0
+        bands = row_bands(a)
+        return {
+            "order": -(-(int(places.max(initial=-1)) + 1) // BLOCK) * BLOCK,
+            "own": own,
+            "partner": partner,
+            "coupling": a,
+            "coupled": bool(a.any()),
+            "row_start": bands[:, 0],
+            "row_stop": bands[:, 1],
+            "b": _placed(controller.b, places),
+            "c": _placed(controller.c, places),
+            "d": controller.d,
+            "tracking": _placed(controller.antiwindup, places),
+            "steady_state": _placed(controller.steady_state_gain, places),
+            "tracking_share": _tracking_share(controller, self.options.tracking_s, self.period_s),
+        }
+
+    def resting_error(self) -> float:
+        """1/C(1). 0 with an integrator, and where C hardly passes 0 Hz."""
+        controller = self.discrete
+        hz = np.geomspace(1e-3, 0.5, 200) / controller.period_s
+        at_rest, largest = abs(controller.dc_gain), np.abs(controller.response(hz)).max(initial=0.0)
+        return 1 / controller.dc_gain if at_rest > 1e-3 * largest else 0.0
+
+
+def _placed(values: npt.NDArray[np.float64], places: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    vector = np.zeros(MAX_ORDER)
+    vector[places] = values
+    return vector
+
+
+def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Place of each state in the kernels' order: blocks of four pairs, a pair's two states LANES apart.
+
+    The two states of a 2×2 block of A make a pair, and so do the other states, two by two.
+    """
+    found = blocks(a)
+    pairs = [(block.start, block.start + 1) for block in found if block.stop - block.start == 2]
+    single = [block.start for block in found if block.stop - block.start == 1]
+    pairs += [tuple(single[i : i + 2]) for i in range(0, len(single), 2)]
+    places = np.zeros(a.shape[0], np.int64)
+    for number, pair in enumerate(pairs):
+        for half, state in enumerate(pair):
+            places[state] = number // LANES * BLOCK + number % LANES + half * LANES
+    return places
+
+
+def _tracking_share(controller: DiscreteController, tracking_s: float, period_s: float) -> float:
+    """Share of a shortfall that the states take up in a tick. Raises ValueError where that is not stable."""
+    share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
+    a, m, c = controller.a, controller.antiwindup, controller.c
+    radius = np.abs(np.linalg.eigvals(a - share * np.outer(a @ m, c))).max(initial=0.0)
+    if not radius < 1:
+        raise ValueError(
+            f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
+            f"(largest |pole| {radius:.6g}); a smaller one, or 0, is needed"
+        )
+    return share

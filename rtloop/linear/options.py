@@ -1,0 +1,69 @@
+"""What a user may say of a transfer function."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from rtloop.hil.options import Factor, Numbers, Options, Root
+from rtloop.linear.transfer import Transfer
+
+Matrix = Annotated[tuple[Numbers, ...], Field(strict=False)]
+
+
+class TransferOptions(Options):
+    """A transfer function in s (rad/s): factors, zeros and poles, two polynomials, or a state space."""
+
+    form: Literal["factors", "zpk", "transfer_function", "state_space"] = "factors"
+    gain: float | None = None
+    numerator: Annotated[tuple[Factor | float, ...], Field(strict=False)] = ()
+    denominator: Annotated[tuple[Factor | float, ...], Field(strict=False)] = ()
+    zeros: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    poles: Annotated[tuple[Root, ...], Field(strict=False)] = ()
+    a: Matrix = ()
+    b: Numbers = ()
+    c: Numbers = ()
+    d: float | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        allowed = {
+            "factors": {"gain", "numerator", "denominator"},
+            "zpk": {"gain", "zeros", "poles"},
+            "transfer_function": {"numerator", "denominator"},
+            "state_space": {"a", "b", "c", "d"},
+        }
+        parts = set().union(*allowed.values())
+        foreign = sorted((self.model_fields_set & parts) - allowed[self.form])
+        if foreign:
+            raise ValueError(
+                f"{', '.join(foreign)}: not part of form {self.form!r}, which takes "
+                f"{', '.join(sorted(allowed[self.form]))}"
+            )
+        self.transfer()
+        return self
+
+    def transfer(self) -> Transfer:
+        """The transfer function. Raises ValueError for an improper or malformed one."""
+        if self.form == "zpk":
+            zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
+            return Transfer.from_zpk(zeros, poles, self._gain())
+        if self.form == "state_space":
+            if self.d is None:
+                raise ValueError("d: needed in a state space; 0.0 for no direct part")
+            return Transfer.from_state_space(np.array(self.a), self.b, self.c, self.d)
+        nested = [isinstance(part, tuple) for part in (*self.numerator, *self.denominator)]
+        if self.form == "transfer_function":
+            if any(nested):
+                raise ValueError("numerator and denominator: lists of numbers in form 'transfer_function'")
+            return Transfer.from_transfer_function(self.numerator, self.denominator)
+        if not all(nested):
+            raise ValueError("numerator and denominator: lists of lists of numbers in form 'factors'")
+        return Transfer.from_factors(self._gain(), self.numerator, self.denominator)
+
+    def _gain(self) -> float:
+        if self.gain is None:
+            raise ValueError(f"gain: needed in form {self.form!r}")
+        return self.gain
