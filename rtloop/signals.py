@@ -96,6 +96,18 @@ class Flag(IntFlag):
     TRIP_LAW = 1 << 19
 
 
+class Failure(IntEnum):
+    """Which function of a law failed, and trips; RAISED is added where it raised and returned nothing."""
+
+    CONTROLLER_OUTPUT = 2
+    CONTROLLER_UPDATE = 4
+    CONTROLLER_ENTER = 6
+    FEEDFORWARD_OUTPUT = 8
+    FEEDFORWARD_UPDATE = 10
+    FEEDFORWARD_ENTER = 12
+
+
+RAISED = 1
 TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.discretise import DiscreteController, held
 from rtloop.linear.realisation import System, beside_imaginary_axis, realise
+from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
 
@@ -102,7 +103,7 @@ def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
     return Loop(realised(controller), realised(plant), (controller * plant).dc_gain, roots)
 
 
-def discrete_loop(controller: DiscreteController, plant: Transfer, delay_ticks: int = 0) -> Loop:
+def discrete_loop(controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int = 0) -> Loop:
     """The loop as it runs: D(s) behind a zero-order hold at the controller's period, `delay_ticks` samples before it.
 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.

@@ -15,6 +15,7 @@ import numpy as np
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.search import reach
 from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
 Maker = Callable[[Transfer], Loop]
@@ -37,7 +38,7 @@ class Change(NamedTuple):
     step: float
 
 
-def maker(controller: Transfer | DiscreteController, delay_ticks: int = 0) -> Maker:
+def maker(controller: Transfer | DiscreteController | Sampled, delay_ticks: int = 0) -> Maker:
     """Loops of one controller with any plant, in continuous time or as it runs."""
     if isinstance(controller, Transfer):
         return lambda plant: continuous_loop(controller, plant)

@@ -39,9 +39,18 @@ def info(files: tuple[Path, ...], as_json: bool) -> int:
 @FILES
 @click.option("--config", "other", type=OUTPUT, help="The law of this configuration on the recorded inputs instead.")
 @click.option("--resimulate", is_flag=True, help="The recorded reference in closed loop with the simulated rig.")
+@click.option("--law", "laws", type=OUTPUT, multiple=True, help="File with a law that ran, where it is not installed.")
+@click.option("--trust-recorded-law", is_flag=True, help="Run the laws' code that the recording holds: if it is yours.")
 @JSON
 @fails_clearly
-def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_json: bool) -> int:
+def replay(
+    files: tuple[Path, ...],
+    other: Path | None,
+    resimulate: bool,
+    laws: tuple[Path, ...],
+    trust_recorded_law: bool,
+    as_json: bool,
+) -> int:
     """Execute a recording again and compare it in bytes.
 
     Every output of every tick; exit 1 where one differs.
@@ -50,22 +59,23 @@ def replay(files: tuple[Path, ...], other: Path | None, resimulate: bool, as_jso
     would have followed the recorded reference on the simulated rig of its configuration (without --config: the
     recorded law and rig). Both end with 0.
     """
-    from rtloop.commands.replay import replay_on_the_rig, replay_with_other_law
+    from rtloop.commands.replay import replay_on_the_rig, replay_with_other_law, trust_in
     from rtloop.recording.load import load
     from rtloop.recording.replay.replay import replay as replay_recording
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_differences, print_replay, print_resimulation
 
+    trust = trust_in(laws, trust_recorded_law)
     with Counter("ticks replayed", sys.stderr) as counter:
         if resimulate:
-            beside = replay_on_the_rig(files, other, counter.show)
+            beside = replay_on_the_rig(files, other, counter.show, trust)
             _show(beside, as_json, print_resimulation)
             return 0
         if other is not None:
             differences = replay_with_other_law(files, other, counter.show)
             _show(differences, as_json, print_differences)
             return 0
-        report = replay_recording(load(files), counter.show)
+        report = replay_recording(load(files), counter.show, trust)
     _show(report.as_dict(), as_json, lambda _: print_replay(files[0], report))
     return 0 if report.identical else 1
 

@@ -21,6 +21,7 @@ from rtloop.configuration.prepare import AxisCheck, Prepared, prepare
 from rtloop.design.verification.text import answer, span
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
+from rtloop.laws.shipped.options import TransferControllerOptions
 from rtloop.terminal.table import console as _console
 from rtloop.values import counted
 
@@ -76,43 +77,49 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
 
 def _judged(prepared: Prepared, axis: AxisOptions) -> Verification | None:
     """The axis against the specification that it names; None where there is nothing to judge."""
-    if axis.specification is None or axis.controller is None:
+    if axis.specification is None or not isinstance(axis.controller, TransferControllerOptions):
         return None
     return verified(prepared.configuration, axis, None)[0]
 
 
 def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) -> None:
-    if check.discrete is None or check.comparison is None:
+    if check.law is None:
         console.print("no controller: feedforward, raw and off only")
         return
-    comparison = check.comparison
-    console.print(
-        f"C(z) by {check.discrete.method}, order {check.discrete.order}: differs from C(s) by at most "
-        f"{100 * comparison.max_deviation:.1f} %, at {comparison.max_deviation_hz:.0f} Hz"
-    )
-    for shift in comparison.shifts:
-        console.print(f"  {shift.kind} at {shift.frequency_hz:.1f} Hz is at {shift.discrete_hz:.1f} Hz in C(z)")
-    if check.continuous is None or check.running is None:
+    if check.discrete is not None and check.comparison is not None:
+        comparison = check.comparison
+        console.print(
+            f"C(z) by {check.discrete.method}, order {check.discrete.order}: differs from C(s) by at most "
+            f"{100 * comparison.max_deviation:.1f} %, at {comparison.max_deviation_hz:.0f} Hz"
+        )
+        for shift in comparison.shifts:
+            console.print(f"  {shift.kind} at {shift.frequency_hz:.1f} Hz is at {shift.discrete_hz:.1f} Hz in C(z)")
+    else:
+        order = "" if check.linear is None else f", linear about its rest, of order {check.linear.order}"
+        console.print(f"law {check.law.kind!r}{order}")
+    found = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}
+    found = {heading: (key, one) for heading, (key, one) in found.items() if one is not None}
+    if not found:
         return
-    table = Table("on the model", "continuous C(s)", "as it runs C(z)", box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    table = Table("on the model", *found, box=None, pad_edge=False, padding=(0, 3, 0, 0))
     for label, show in ROWS:
-        table.add_row(label, show(check.continuous), show(check.running))
+        table.add_row(label, *(show(one) for _, one in found.values() if one is not None))
     if shifts:
-        table.add_row("resonance may move by", *(span(shifts[key]) for key in ("continuous", "running")))
+        table.add_row("resonance may move by", *(span(shifts[key]) for key, _ in found.values()))
     console.print(table)
 
 
 def _shifts(check: AxisCheck) -> dict[str, Range]:
     """Shift of the model's resonance that the loop survives."""
-    if check.controller is None or check.discrete is None or check.plant is None or check.running is None:
+    if check.linear is None or check.plant is None or check.running is None:
         return {}
     resonance = changes(check.plant).get("resonance")
     if resonance is None:
         return {}
-    return {
-        "continuous": until_unstable(maker(check.controller), check.plant, resonance),
-        "running": until_unstable(maker(check.discrete, check.running.delay_ticks), check.plant, resonance),
-    }
+    running = {"running": until_unstable(maker(check.linear, check.running.delay_ticks), check.plant, resonance)}
+    if check.controller is None:
+        return running
+    return {"continuous": until_unstable(maker(check.controller), check.plant, resonance), **running}
 
 
 def _report(

@@ -21,6 +21,7 @@ from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.verification.page import page
 from rtloop.design.verification.verify import Verification, as_dict, verify
 from rtloop.errors import ConfigError, NoDesign, OutputError
+from rtloop.laws.shipped.options import TransferControllerOptions
 from rtloop.linear.discretise import discretise
 from rtloop.terminal.design import print_synthesis, print_verification
 
@@ -105,7 +106,9 @@ def _as_dict(found: Synthesis, other: float | None, out: Path | None) -> dict[st
 
 def verified(configuration: Configuration, axis: AxisOptions, spec: Path | None) -> tuple[Verification, DesignOptions]:
     """An axis against the specification at `spec`, else against its own. Raises ConfigError."""
-    assert axis.controller is not None
+    if not isinstance(axis.controller, TransferControllerOptions):
+        fault = f"axis.{axis.name}.controller: only a transfer function, the law 'transfer', can be verified"
+        raise ConfigError(configuration.source, [fault])
     if spec is None and axis.specification is not None:
         spec = configuration.folder / axis.specification
     design = DesignOptions() if spec is None else load_specification(spec).design

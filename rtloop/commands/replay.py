@@ -11,11 +11,16 @@ import numpy as np
 
 from rtloop.configuration import file as config
 from rtloop.configuration.file import Configuration
+from rtloop.configuration.laws import Library
 from rtloop.configuration.prepare import prepare
+from rtloop.configuration.text_files import read_text
 from rtloop.drivers.base import Driver
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
+from rtloop.laws.registry import laws_in
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
+from rtloop.recording.replay.laws import NOTHING, Trust
 from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
 
 Progress = Callable[[int], None]
@@ -28,18 +33,31 @@ def replay_with_other_law(files: Sequence[Path], other: Path, progress: Progress
     return {**_about(recording, other), **other_law(recording, law, progress)}
 
 
-def replay_on_the_rig(files: Sequence[Path], other: Path | None, progress: Progress | None = None) -> dict[str, Any]:
+def replay_on_the_rig(
+    files: Sequence[Path], other: Path | None, progress: Progress | None = None, trust: Trust = NOTHING
+) -> dict[str, Any]:
     """The recorded reference through a law on a simulated rig: those of `other`, or the recorded ones."""
     recording = load(files)
     if other is None:
-        path = recording.paths[0]
-        configuration = config.parse(recording.configuration, path.stem, path.parent, f"configuration in {path}")
-        law = recorded_law(recording)
+        path, law = recording.paths[0], recorded_law(recording, trust)
+        library = Library(path.parent, law.laws)
+        configuration = config.parse(
+            recording.configuration, path.stem, path.parent, f"configuration in {path}", library
+        )
     else:
         configuration = config.load(other)
         law = _law(configuration, recording)
     driver = _rig(configuration, recording)
     return {**_about(recording, other), **resimulate(recording, law, driver, progress)}
+
+
+def trust_in(files: Sequence[Path], recorded: bool) -> Trust:
+    """What a replay may run: the laws in these files, and those in the recording itself. Raises RecordingError."""
+    try:
+        laws = [law for path in files for law in laws_in(read_text(path), str(path))]
+    except ValueError as error:
+        raise RecordingError(str(error)) from None
+    return Trust(tuple(laws), recorded)
 
 
 def _about(recording: Recording, other: Path | None) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from rtloop.configuration.laws import ControllerTable, FeedforwardTable
 from rtloop.hil.options import Numbers, Options
 from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
-from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions, TransferControllerOptions
 from rtloop.linear.options import Matrix, TransferOptions
 
 
@@ -159,8 +159,8 @@ class AxisOptions(Options):
     """One axis of the law."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")
-    feedforward: PrandtlIshlinskiiOptions
-    controller: TransferControllerOptions | None = None
+    feedforward: FeedforwardTable
+    controller: ControllerTable | None = None
     model: ModelOptions | None = None
     specification: str | None = None
     """File, relative to the configuration's, with what the loop is asked to do; `rtloop design verify` judges it."""

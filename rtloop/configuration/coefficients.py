@@ -3,38 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptions, PrefilterOptions
+from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
 from rtloop.law.layout import Records
 from rtloop.law.memory import records
 from rtloop.laws.contract import Controller, Law, record_of
-from rtloop.laws.registry import law_class, layout_of
-
-DEFAULT_LAWS = ("prandtl_ishlinskii", "transfer")
-"""Known to every loop. An axis without a controller has the last one, with coefficients of 0: it commands nothing."""
-
-
-def laws_of(axes: Sequence[AxisOptions]) -> tuple[str, ...]:
-    """Kinds of all laws of these axes, each once."""
-    named = [part.kind for axis in axes for part in (axis.feedforward, axis.controller) if part is not None]
-    return tuple(dict.fromkeys((*DEFAULT_LAWS, *named)))
+from rtloop.laws.linearise import linear_part
+from rtloop.laws.options import LawOptions
+from rtloop.laws.registry import LawReference, law_class, layout_of
 
 
 def controller_of(axis: AxisOptions, period_s: float) -> Controller | None:
-    """The controller of an axis, not yet built. Raises ValueError for a kind that is not known, or no controller."""
+    """The controller of an axis, not yet built."""
     if axis.controller is None:
         return None
-    kind = law_class(axis.controller.kind)
-    if not issubclass(kind, Controller):
-        raise ValueError(f"kind: {axis.controller.kind!r} is no controller")
-    return kind(axis.controller, period_s, axis.model)
+    return _law_of(axis.controller, DEFAULT_LAWS[1])(axis.controller, period_s, axis.model)
+
+
+def _law_of(options: LawOptions, default: LawReference) -> Any:
+    """The class of the law that options are of."""
+    return law_class(options.law or default)
 
 
 def axis_coefficients(
-    laws: Sequence[str],
+    laws: Sequence[LawReference],
     axis: AxisOptions,
     controller: Controller | None,
     um_per_v: float,
@@ -48,14 +45,14 @@ def axis_coefficients(
     Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
     """
     coefficients = records(layout_of(laws).coefficients, 1)
-    feedforward = law_class(axis.feedforward.kind)(axis.feedforward, period_s, axis.model)
+    feedforward = _law_of(axis.feedforward, DEFAULT_LAWS[0])(axis.feedforward, period_s, axis.model)
     fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v, "controller_axes": 1}
-    fields |= _law("feedforward", feedforward, laws)
-    if controller is None:
-        fields["controller_law"] = laws.index(DEFAULT_LAWS[-1])
+    fields |= _law("feedforward", feedforward, laws.index(axis.feedforward.law or DEFAULT_LAWS[0]))
+    if controller is None or axis.controller is None:
+        fields["controller_law"] = laws.index(DEFAULT_LAWS[1])
     else:
-        fields |= _law("controller", controller, laws)
-        fields["resting_error"] = [controller.resting_error()]
+        fields |= _law("controller", controller, laws.index(axis.controller.law or DEFAULT_LAWS[1]))
+        fields["resting_error"] = [_resting_error(controller)]
     fields |= _prefilter(axis.prefilter)
     fields |= limit_fields(axis.limits, output, period_s)
     fields |= interlock_fields(axis.interlocks, enable)
@@ -64,9 +61,22 @@ def axis_coefficients(
     return coefficients
 
 
-def _law(slot: str, law: Law, laws: Sequence[str]) -> Mapping[str, object]:
+def _resting_error(controller: Controller) -> float:
+    """Error per command at which a controller stays where it is: 1/C(1). 0 with an integrator, where C hardly passes
+    0 Hz, and where nothing linear is known of it.
+    """
+    try:
+        linear = linear_part(controller)
+    except ValueError:
+        return 0.0
+    response = linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))
+    at_rest, largest = abs(linear.dc_gain), np.abs(response).max(initial=0.0)
+    return 1 / linear.dc_gain if at_rest > 1e-3 * largest else 0.0
+
+
+def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:
     """The law's number, and its coefficients as bytes."""
-    return {f"{slot}_law": laws.index(law.kind), slot: record_of(law).view(np.uint8)}
+    return {f"{slot}_law": number, slot: record_of(law).view(np.uint8)}
 
 
 def _assign(coefficients: Records, name: str, value: object) -> None:

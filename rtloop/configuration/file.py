@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
+from rtloop.configuration.laws import DEFAULT_LAWS, Library
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.drivers.base import Wiring
@@ -21,6 +22,8 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
 from rtloop.hil.options import LARGEST_INTEGER, Options
+from rtloop.law.layout import MAX_LAWS
+from rtloop.laws.registry import LawReference
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -44,6 +47,8 @@ class LoopOptions(Options):
     """Input channel of an enable or emergency-stop switch; its threshold is [axis.interlocks] enable_min_v."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """The loop parks by itself when its supervisor was silent for so long."""
+    laws: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Further laws that the loop loads, kinds or files, so that they may be swapped in while it runs."""
 
 
 class ChannelOptions(Options):
@@ -116,6 +121,8 @@ class Configuration:
     driver_kind: str
     driver_options: Options
     channels: Mapping[str, ChannelOptions]
+    laws: tuple[LawReference, ...] = DEFAULT_LAWS
+    """All that the loop is to know, in an order that does not depend on where they are used."""
 
     @property
     def wiring(self) -> dict[str, Wiring]:
@@ -131,15 +138,18 @@ def load(path: str | Path) -> Configuration:
     return parse(read_text(path), path.stem, path.parent, str(path))
 
 
-def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
-    """Check a configuration's text; relative paths in it start at `folder`. Raises ConfigError with all faults."""
+def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:
+    """Check a configuration's text; relative paths in it start at `folder`, where laws are found, too, unless a
+    `library` is given. Raises ConfigError with all faults."""
     try:
         raw = parse_toml(text)
     except ValueError as error:
         raise ConfigError(source, [str(error)]) from None
     driver = raw.pop("driver", None)
     faults: list[str] = []
-    sections = _validated(TypeAdapter(_Sections), raw, "", faults)
+    library = library or Library(folder)
+    sections = _validated(TypeAdapter(_Sections), raw, "", faults, {"library": library})
+    laws = () if sections is None else _laws(sections, library, faults)
     kind, options, channels = _driver(driver, faults)
     if sections is not None:
         faults += _cross_faults(sections, channels)
@@ -158,7 +168,22 @@ def parse(text: str, name: str, folder: Path, source: str) -> Configuration:
         driver_kind=kind,
         driver_options=options,
         channels=channels,
+        laws=laws,
     )
+
+
+def _laws(sections: _Sections, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
+    """The laws of the axes, and those that are to stand by."""
+    found = {options.law for axis in sections.axis for options in (axis.feedforward, axis.controller) if options}
+    for name in sections.loop.laws:
+        try:
+            found.add(library.find({"file" if name.endswith(".py") else "kind": name}, name))
+        except ValueError as error:
+            faults.append(f"loop.laws: {error}")
+    laws = (*DEFAULT_LAWS, *sorted(found - {None, *DEFAULT_LAWS}))
+    if len(laws) > MAX_LAWS:
+        faults.append(f"loop.laws: {len(laws)} laws; at most {MAX_LAWS} are allowed")
+    return laws
 
 
 def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
@@ -182,10 +207,12 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
     return kind, _validated(TypeAdapter(model), rest, "driver", faults), channels or {}
 
 
-def _validated(adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[str]) -> Any:
+def _validated(
+    adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[str], context: dict[str, Any] | None = None
+) -> Any:
     """The validated value, or None with its faults appended."""
     try:
-        return adapter.validate_python(raw)
+        return adapter.validate_python(raw, context=context)
     except ValidationError as error:
         faults += describe(error, prefix, raw, _keys(adapter.json_schema()))
         return None

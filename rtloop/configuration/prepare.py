@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_continuous, analyse_discrete
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import axis_coefficients, controller_of, joined, laws_of
+from rtloop.configuration.coefficients import axis_coefficients, controller_of, joined
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.drivers.base import Channel, Driver, Facts, index_of
@@ -24,8 +24,10 @@ from rtloop.errors import ConfigError
 from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
 from rtloop.laws.contract import Controller
+from rtloop.laws.linearise import linear_part
 from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 from rtloop.signals import Mode
 
@@ -42,6 +44,7 @@ class AxisCheck:
 
     name: str
     law: Controller | None = None
+    linear: DiscreteController | Sampled | None = None
     controller: Transfer | None = None
     discrete: DiscreteController | None = None
     comparison: Comparison | None = None
@@ -103,7 +106,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         driver_kind=configuration.driver_kind,
         driver_options=configuration.driver_options.model_dump(exclude_unset=True),
         wiring=configuration.wiring,
-        laws=laws_of(configuration.axes),
+        laws=configuration.laws,
         coefficients=joined(coefficients),
         mode=Mode[configuration.loop.mode.upper()],
         generators=generators,
@@ -151,36 +154,43 @@ def _ticks(duration_s: float | None, rate_hz: float, findings: _Findings) -> int
 
 
 def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck:
-    """C(z), its agreement with C(s), and the loop on the axis's model."""
+    """The controller, C(z)'s agreement with C(s), and the loop on the axis's model as far as the law is linear."""
     if axis.controller is None:
         return AxisCheck(axis.name)
-    where, options = f"axis.{axis.name}.controller", axis.controller
-    transfer, law, discrete = options.transfer(), None, None
-    with findings.at(f"{where}: "):
-        law = controller_of(axis, period_s)
-        if isinstance(law, TransferController):
-            discrete = law.discrete
-    if discrete is None:
-        return AxisCheck(axis.name, None, transfer)
-    comparison = compare(transfer, discrete, up_to_hz=COMPARED_PART / period_s)
-    findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
-    if axis.model is None:
+    where, linear = f"axis.{axis.name}.controller", None
+    law = controller_of(axis, period_s)
+    check = AxisCheck(axis.name, law)
+    if isinstance(law, TransferController):
+        with findings.at(f"{where}: "):
+            linear, transfer = law.discrete, law.options.transfer()
+            comparison = compare(transfer, linear, up_to_hz=COMPARED_PART / period_s)
+            findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
+            check = replace(check, controller=transfer, discrete=linear, comparison=comparison)
+        if linear is None:
+            return replace(check, law=None)
+    elif law is not None:
+        try:
+            linear = linear_part(law)
+        except ValueError as error:
+            findings.warnings.append(f"{where}: stability and margins are not checked: {error}")
+            return check
+    if axis.model is None or linear is None:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
-        return AxisCheck(axis.name, law, transfer, discrete, comparison)
+        return replace(check, linear=linear)
     plant, continuous, running = axis.model.transfer(), None, None
     with findings.at(f"axis.{axis.name}.model: "):
-        continuous = analyse_continuous(transfer, plant)
-        running = analyse_discrete(discrete, plant, axis.model.delay_ticks)
+        continuous = None if check.controller is None else analyse_continuous(check.controller, plant)
+        running = analyse_discrete(linear, plant, axis.model.delay_ticks)
     if running is not None and not running.stable:
         message_ = (
             f"{where}: the loop is unstable on axis.{axis.name}.model at {1 / period_s:g} Hz "
             f"(largest |pole| {running.max_abs_pole:.6f}, must be below 1)"
         )
-        if options.allow_unstable:
+        if axis.controller.allow_unstable:
             findings.warnings.append(message_)
         else:
             findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
-    return AxisCheck(axis.name, law, transfer, discrete, comparison, plant, continuous, running)
+    return replace(check, linear=linear, plant=plant, continuous=continuous, running=running)
 
 
 def _coefficients(
@@ -201,7 +211,7 @@ def _coefficients(
     with findings.at(f"axis.{axis.name}."):
         period_s, enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
         return axis_coefficients(
-            laws_of(configuration.axes), axis, controller, channel.um_per_v, channel.offset, output, period_s, enable
+            configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, enable
         )
     return None
 

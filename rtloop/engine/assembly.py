@@ -18,11 +18,12 @@ from rtloop.law.layout import CONDITIONS
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR
 from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import BUILT_IN, layout_of
+from rtloop.laws.registry import LawReference, layout_of
 from rtloop.signals import Mode
 
 SNAPSHOT_SECONDS = 1.0
 REHEARSED_TICKS = 100
+REHEARSED_LAWS = ("prandtl_ishlinskii", "transfer")
 UNLIMITED = np.iinfo(np.int64).max
 
 
@@ -120,10 +121,9 @@ def rehearse() -> None:
     """Compile the loop, the clocks and the simulated rig: some ticks in virtual time, within the caller's process."""
     pacing = Pacing(rate_hz=1000.0, paced=False)
     wiring = {"x": Wiring("adc0", "dac0")}
-    laws = tuple(BUILT_IN)
+    laws = tuple(map(LawReference, REHEARSED_LAWS))
     coefficients = np.zeros(1, layout_of(laws).coefficients)
-    coefficients["controller_axes"], coefficients["controller_law"] = 1, laws.index("transfer")
-    coefficients["feedforward_law"] = laws.index("prandtl_ishlinskii")
+    coefficients["controller_axes"], coefficients["controller_law"] = 1, REHEARSED_LAWS.index("transfer")
     coefficients["trip_slew_v_per_tick"] = Channel("dac0").maximum_v
     nothing = np.zeros(0, MESSAGE)
     plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, laws, coefficients, Mode.OFF,

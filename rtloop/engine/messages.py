@@ -42,7 +42,8 @@ class Kind(IntEnum):
     """values[0]: kind of the command; values[1]: its first value."""
     TRIPPED = 101
     """values[0]: the new causes as Flag bits. Of the axis named, 0 where none is to blame: values[3] the cause found
-    first, values[1] what was beyond its limit, values[2] (µm, V or µs; a count of ticks or swings)."""
+    first, values[1] what was beyond its limit, values[2] (µm, V or µs; a count of ticks or swings). A law that failed:
+    values[1] what it returned, values[2] its `Failure`, values[4] its number."""
     PARKED = 102
     """All outputs are at their safe values."""
     DRIVER_FAILED = 103

@@ -13,7 +13,7 @@ from rtloop.drivers.base import Driver, Facts, Wiring
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.memory import Sizes
 from rtloop.law.memory import Layout
-from rtloop.laws.registry import layout_of
+from rtloop.laws.registry import LawReference, layout_of
 from rtloop.signals import Mode, columns
 
 
@@ -41,8 +41,8 @@ class Plan:
     driver_kind: str
     driver_options: Mapping[str, Any]
     wiring: Mapping[str, Wiring]
-    laws: tuple[str, ...]
-    """Kinds of laws that the loop knows; the coefficients name them by their number."""
+    laws: tuple[LawReference, ...]
+    """Laws that the loop knows; the coefficients name them by their number."""
     coefficients: npt.NDArray[Any]
     mode: Mode
     generators: npt.NDArray[Any]

@@ -10,9 +10,10 @@ from rtloop.engine.context import conditions_of, floats, law_of
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.hil.native.compiled import seldom
 from rtloop.law.access import coefficients_of, state_of
-from rtloop.signals import Flag
+from rtloop.signals import Failure, Flag
 
 TRIPPED, LOOP = int(Kind.TRIPPED), int(Origin.LOOP)
+FEEDFORWARD_FAILURES = float(Failure.FEEDFORWARD_OUTPUT)
 NON_FINITE, SENSOR_RANGE, POSITION, STALE, ENABLE, FROZEN, LATE, TRACKING, OSCILLATION, LAW = (
     int(flag)
     for flag in (
@@ -28,11 +29,11 @@ def publish_trip(loop, causes):
     law = law_of(loop)
     adc_v = floats(loop.adc_v, loop.axis_count)
     for a in range(loop.axis_count):
-        cause, value, limit = _first_cause(
-            coefficients_of(law, a), state_of(law, a), adc_v[a], conditions_of(loop), causes
-        )
+        coefficients, state = coefficients_of(law, a), state_of(law, a)
+        cause, value, limit = _first_cause(coefficients, state, adc_v[a], conditions_of(loop), causes)
         if cause != 0:
-            publish_event(loop, TRIPPED, a, LOOP, 0, (float(causes), value, limit, float(cause)))
+            number = coefficients.feedforward_law if limit >= FEEDFORWARD_FAILURES else coefficients.controller_law
+            publish_event(loop, TRIPPED, a, LOOP, 0, (float(causes), value, limit, float(cause), float(number)))
             return
     publish_event(loop, TRIPPED, ALL_AXES, LOOP, 0, (float(causes), 0.0, 0.0, 0.0))
 

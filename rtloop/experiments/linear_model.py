@@ -16,8 +16,11 @@ from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
 from rtloop.analysis.perturbation import Range, changes, lightest_pair, maker, until_unstable, with_resonance_shifted
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions, PrefilterOptions
+from rtloop.configuration.coefficients import controller_of
 from rtloop.hil.modal import Complex, Real
-from rtloop.linear.discretise import DiscreteController, discretise
+from rtloop.laws.linearise import linear_part
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.sampled import Sampled
 
 GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
 
@@ -31,11 +34,11 @@ class LinearModel:
         self._delay_ticks = model.delay_ticks
         self._prefilter = axis.prefilter
         self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
-        self._controller: DiscreteController | None = None
+        self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
-        if (options := axis.controller) is not None:
-            self._controller = discretise(options.transfer(), 1 / rate_hz, options.method, options.prewarp_hz)
-            loop = discrete_loop(self._controller, self.dynamics, model.delay_ticks)
+        if (law := controller_of(axis, 1 / rate_hz)) is not None:
+            self._controller = controller = linear_part(law)
+            loop = discrete_loop(controller, self.dynamics, model.delay_ticks)
             self.loop = loop if loop.is_stable else None
 
     @property

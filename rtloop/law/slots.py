@@ -5,8 +5,6 @@ Whatever a plug-in returns or raises is a number here: a failure is noted with t
 
 from __future__ import annotations
 
-from enum import IntEnum
-
 import numpy as np
 
 from rtloop.hil.native.compiled import jit, seldom
@@ -21,24 +19,13 @@ from rtloop.law.access import (
 )
 from rtloop.law.layout import CONTROL, RULE
 from rtloop.law.safety import usable
+from rtloop.signals import RAISED, Failure
 
 OK, NONE = 0, -2
 APPLIED = CONTROL.fields["applied_um"][1]  # type: ignore[index]
 """Status of a compiled function that returned a value, or none."""
 
 
-class Failure(IntEnum):
-    """Which function of a law failed; one more than a multiple of 2 where it raised and returned nothing usable."""
-
-    CONTROLLER_OUTPUT = 2
-    CONTROLLER_UPDATE = 4
-    CONTROLLER_ENTER = 6
-    FEEDFORWARD_OUTPUT = 8
-    FEEDFORWARD_UPDATE = 10
-    FEEDFORWARD_ENTER = 12
-
-
-RAISED = 1
 CONTROLLER_OUTPUT, CONTROLLER_UPDATE, CONTROLLER_ENTER = (
     int(Failure.CONTROLLER_OUTPUT), int(Failure.CONTROLLER_UPDATE), int(Failure.CONTROLLER_ENTER)
 )  # fmt: skip

@@ -7,40 +7,60 @@ indices and divisions, so that a mistake is a status and no broken process.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import from_dtype, types
+from numba.core.errors import NumbaError
 
 from rtloop.hil.native.compiled import UNCOMPILED, checked, native_address
 from rtloop.hil.native.pointers import carray
 from rtloop.law.layout import CONTROL, FUNCTIONS
 from rtloop.law.memory import LawRecords
 from rtloop.laws.contract import Law
-from rtloop.laws.registry import law_class
+from rtloop.laws.registry import LawReference, law_class
+
+MAX_CHARACTERS = 300
 
 
-def functions_of(laws: Sequence[str]) -> npt.NDArray[Any]:
-    """FUNCTIONS records of these kinds, compiled or loaded. Raises ValueError for one that cannot be compiled."""
+def functions_of(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
+    """FUNCTIONS records of these laws, compiled or loaded. Raises ValueError for one that cannot be compiled."""
     found = np.zeros(len(laws), FUNCTIONS)
-    for one, kind in zip(found, laws, strict=True):
-        law = law_class(kind)
+    for one, reference in zip(found, laws, strict=True):
+        law = law_class(reference)
         told = from_dtype(CONTROL) if law.axes else types.float64
         returns = {"output": types.float64, "update": types.void if law.axes else types.float64, "enter": types.void}
         for name, result in returns.items():
             function = getattr(law, name)
             if function is not None:
-                one[name] = _address(law, function, told, result)
+                one[name] = _address(law, name, function, told, result)
     return found
 
 
-def _address(law: type[Law], function: Callable[..., Any], told: Any, result: Any) -> int:
+def _address(law: type[Law], name: str, function: Callable[..., Any], told: Any, result: Any) -> int:
     keeps = law.records()
     if UNCOMPILED:
         return native_address(_from_addresses(function, keeps, law.axes), None)
-    kernel = function if law.shipped else checked(function)
-    return native_address(kernel, result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told))
+    kernel = function if law.shipped else _kernel(function)
+    signature = result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
+    try:
+        return native_address(kernel, signature)
+    except NumbaError as error:
+        raise ValueError(f"law {law.kind!r}: {name} cannot be compiled: {_short(error)}") from error
+
+
+@cache
+def _kernel(function: Callable[..., Any]) -> Any:
+    return checked(function)
+
+
+def _short(error: NumbaError) -> str:
+    """What the compiler says, without its advice: the lines that say what is wrong, and where."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    kept = [line for line in lines if line and not line.startswith(("During:", "- Resolution", "Failed in", "[", "<<"))]
+    return " ".join(kept)[:MAX_CHARACTERS]
 
 
 def _from_addresses(function: Callable[..., Any], keeps: LawRecords, axes: int) -> Callable[..., Any]:

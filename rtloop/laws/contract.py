@@ -26,7 +26,7 @@ import numpy as np
 
 from rtloop.law.layout import whole_lines
 from rtloop.law.memory import LawRecords, Rules
-from rtloop.laws.options import ControllerOptions, LawOptions
+from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOptions
 
 Fields = Mapping[str, Any]
 """Name of each number of a record: `float` or `int`, or (type, length) for an array, (type, shape) for a matrix."""
@@ -37,6 +37,7 @@ class Law(ABC):
     """One law, with its options, on one axis at one rate."""
 
     kind: ClassVar[str]
+    """Its name; that of its class in lower case unless it says otherwise."""
     options_model: ClassVar[type[LawOptions]] = LawOptions
     axes: ClassVar[int]
     coefficients: ClassVar[Fields | np.dtype[Any]]
@@ -50,6 +51,10 @@ class Law(ABC):
     """Of a controller, enter(c, s, told): from a state of zeros, that from which `output` gives told.command_um for
     what it is told. Where it is missing, or does not manage, the loop adds an offset to the command, which dies out.
     Of a feedforward, enter(c, s, drive_v): it takes over at this drive; its memory is of the actuator, and stays."""
+
+    def __init_subclass__(cls) -> None:
+        if "kind" not in vars(cls):
+            cls.kind = cls.__name__.lower()
 
     def __init__(self, options: Any, period_s: float, model: Any) -> None:
         """`model` is the plant from command to position that the axis was given (`configuration`'s), or None."""
@@ -84,14 +89,18 @@ class Controller(Law):
     def update(c: Any, s: Any, told: Any) -> None:
         """Advance the state by a tick."""
 
-    def resting_error(self) -> float:
-        """Error in µm per µm of command at which it stays where it is: 1/C(1), and 0 for one that integrates."""
-        return 0.0
+    def linear(self) -> Any:
+        """From error to command, as a `rtloop.linear.sampled.Sampled`, for margins and for entering without a bump.
+
+        None has it found by running the functions about rest (`rtloop.laws.linearise`).
+        """
+        return None
 
 
 class Feedforward(Law):
     """From a command to a drive, with the model that says what a drive was as a command."""
 
+    options_model = FeedforwardOptions
     axes = 0
 
     @staticmethod

@@ -2,14 +2,56 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from pydantic import PrivateAttr
+
 from rtloop.hil.options import Options
+from rtloop.laws.shipped.play_model import PlayModel
 
 
 class LawOptions(Options):
     """Base of what a configuration says of a law."""
 
-    kind: str
-    """Name of the law."""
+    kind: str = ""
+    """Name of the law; that of the shipped one by default."""
+    file: str | None = None
+    """Python file that defines the law, relative to the configuration's."""
+    _law: Any = PrivateAttr(None)
+
+    @property
+    def law(self) -> Any:
+        """The `LawReference` that these options are of; None where they were made without one."""
+        return self._law
+
+    def bind(self, law: Any) -> None:
+        """Note what these options are of."""
+        self._law = law
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """The model of a law from a file is known to the process alone that ran the file: what was said is pickled."""
+        if self._law is None or not self._law.text:
+            return super().__reduce_ex__(protocol)
+        return _restored, (self._law, self.model_dump(exclude_unset=True))
+
+
+def _restored(law: Any, said: dict[str, Any]) -> LawOptions:
+    from rtloop.laws.registry import law_class
+
+    options = law_class(law).options_model.model_validate(said)
+    options.bind(law)
+    return options
+
+
+class FeedforwardOptions(LawOptions):
+    """Base of what it says of a feedforward."""
+
+    def actuator(self) -> PlayModel:
+        """The actuator that it undoes, as a sum of plays; one play of threshold 0 where there is no hysteresis.
+
+        Experiments and cautions are judged by it. Every feedforward's options must say it.
+        """
+        raise NotImplementedError
 
 
 class ControllerOptions(LawOptions):

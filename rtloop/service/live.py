@@ -12,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
 from rtloop.configuration.file import Configuration, describe
+from rtloop.configuration.laws import Library
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import TableOfSamples, extent, generator_values, volts
 from rtloop.engine.memory import SharedBlock
@@ -62,7 +63,7 @@ class LiveLaw:
                 raise _unsuitable(f"section {section!r}: {', '.join(SECTIONS)} may change")
             merged = options.model_dump(exclude_unset=True)
             merged[section] = {**(merged.get(section) or {}), **changes}
-            return self._swap(number, _validated_axis(merged))
+            return self._swap(number, self._validated_axis(merged))
 
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
         """Swap [axis.controller] as a whole; returns the tick. Raises ConfigError, Refused."""
@@ -70,7 +71,7 @@ class LiveLaw:
             number = self.axis_number(axis)
             merged = self.prepared.configuration.axes[number].model_dump(exclude_unset=True)
             merged["controller"] = dict(controller)
-            return self._swap(number, _validated_axis(merged))
+            return self._swap(number, self._validated_axis(merged))
 
     def set_reference(self, axis: str, reference: Mapping[str, Any]) -> int:
         """Change the generator of an axis; returns the tick. Raises ConfigError, Refused."""
@@ -148,6 +149,11 @@ class LiveLaw:
         self.prepared = replace(
             self.prepared, configuration=configuration, plan=replace(self.prepared.plan, coefficients=coefficients)
         )
+
+    def _validated_axis(self, raw: Mapping[str, Any]) -> AxisOptions:
+        """An axis with the laws that the loop has loaded. Raises ConfigError."""
+        configuration = self.prepared.configuration
+        return _validated_axis(raw, Library(configuration.folder, configuration.laws))
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
         """Build the configuration with another axis, verify it, swap its coefficients."""
@@ -239,9 +245,9 @@ def _unsuitable(message: str) -> ConfigError:
     return ConfigError("request", [message])
 
 
-def _validated_axis(raw: Mapping[str, Any]) -> AxisOptions:
+def _validated_axis(raw: Mapping[str, Any], library: Library) -> AxisOptions:
     try:
-        return AxisOptions.model_validate(raw)
+        return AxisOptions.model_validate(raw, context={"library": library})
     except ValidationError as error:
         raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
 

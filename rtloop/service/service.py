@@ -322,10 +322,17 @@ class Service:
         if self._ready:
             self.notifier.send(READY=1)
 
+    def _with_loaded_laws(self, configuration: Configuration) -> Configuration:
+        """Another configuration, for a loop that keeps the laws that it has. Raises Refused for one that it lacks."""
+        loaded = self.configuration.laws
+        if missing := [law.kind for law in configuration.laws if law not in loaded]:
+            raise Refused(f"law {', '.join(missing)}: not loaded, or changed since; that needs a restart")
+        return replace(configuration, laws=loaded)
+
     def reload_now(self) -> dict[str, Any]:
         """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""
         with self._reloading:  # one after the other: the file that was read last is the one that stays
-            configuration = load(self.config)
+            configuration = self._with_loaded_laws(load(self.config))
             prepared: Prepared = prepare_limited(configuration)
             live = self.live
             changed = [] if live is None else live.replace_all(prepared)

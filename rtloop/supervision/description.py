@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from rtloop.configuration.prepare import Prepared
+from rtloop.engine.plan import Plan
 from rtloop.hil.native.compiled import cpu_identity
 
 FORMAT = 1
@@ -33,7 +34,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "mode": plan.mode.name.lower(),
         "configuration": configuration.text,
         "configuration_sha256": hashlib.sha256(configuration.text.encode()).hexdigest(),
-        "law": plan.layout.description(),
+        "law": _laws(plan),
         "driver": {
             "kind": plan.driver_kind,
             "inputs": [channel.name for channel in prepared.facts.inputs],
@@ -44,6 +45,15 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "versions": {name: _version(name) for name in PACKAGES} | {"python": sys.version.split()[0]},
         "host": {"kernel": platform.release(), "machine": platform.machine(), "cpu": _cpu(), "cpus": os.cpu_count()},
     }
+
+
+def _laws(plan: Plan) -> dict[str, Any]:
+    """The layout of the law, with the text of each that is not shipped: whoever has no such file can replay it."""
+    described = plan.layout.description()
+    for entry, law in zip(described["laws"], plan.laws, strict=True):
+        if law.text:
+            entry |= {"sha256": law.sha256, "text": law.text}
+    return described
 
 
 def _version(package: str) -> str:

@@ -136,8 +136,9 @@ class Supervisor:
         ring = self.block.ring("events")
         events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
         copied, _, _ = drain(ring, np.uint64(max(int(ring.head[0]) - events.size, 0)), events)
+        plan = self.prepared.plan
         trips = [event for event in events[:copied] if event["kind"] == Kind.TRIPPED]
-        return trip_reason(trips[-1], self.prepared.plan.axes) if trips else None
+        return trip_reason(trips[-1], plan.axes, [law.kind for law in plan.laws]) if trips else None
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
         """Start, watch and end everything. Raises RtloopError for what prevented the run.

@@ -25,6 +25,7 @@ from rtloop.experiments.verdict import Analysis, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Numbers, Options
 from rtloop.hysteresis.plays import model_output
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import PlayModel
 
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
@@ -131,7 +132,7 @@ def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
 
 def _hysteresis_db(taken: Taken, amplitude_um: float) -> tuple[float | None, float | None]:
     feedforward = taken.axis_options.feedforward
-    if taken.model is None or feedforward.dead_band != "none":
+    if not isinstance(feedforward, PrandtlIshlinskiiOptions) or taken.model is None or feedforward.dead_band != "none":
         return None, None
     gain_db = 20 * math.log10(abs(taken.static_gain))
     raw, behind_inverse = hysteresis_db(taken.actuator_model, feedforward.models()[1], _gain(taken), amplitude_um)

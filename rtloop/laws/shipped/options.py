@@ -8,12 +8,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from rtloop.hil.options import Numbers
-from rtloop.laws.options import ControllerOptions, LawOptions
+from rtloop.laws.options import ControllerOptions, FeedforwardOptions
 from rtloop.laws.shipped.play_model import PlayModel, play_model
 from rtloop.linear.options import TransferOptions
 
 
-class PrandtlIshlinskiiOptions(LawOptions):
+class PrandtlIshlinskiiOptions(FeedforwardOptions):
     """Inverse hysteresis: the forward model's thresholds and weights (inverted by formula), or an explicit inverse."""
 
     kind: str = "prandtl_ishlinskii"

@@ -169,12 +169,9 @@ class TransferController(Controller):
             "tracking_share": _tracking_share(controller, self.options.tracking_s, self.period_s),
         }
 
-    def resting_error(self) -> float:
-        """1/C(1). 0 with an integrator, and where C hardly passes 0 Hz."""
-        controller = self.discrete
-        hz = np.geomspace(1e-3, 0.5, 200) / controller.period_s
-        at_rest, largest = abs(controller.dc_gain), np.abs(controller.response(hz)).max(initial=0.0)
-        return 1 / controller.dc_gain if at_rest > 1e-3 * largest else 0.0
+    def linear(self) -> DiscreteController:
+        """C(z)."""
+        return self.discrete
 
 
 def _placed(values: npt.NDArray[np.float64], places: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:

@@ -46,6 +46,7 @@ class Session:
 
     def __init__(self, block: SharedBlock, path: Path, header: dict[str, Any], options: Options) -> None:
         self._block, self._path, self._header, self._options = block, path, header, options
+        self._laws = [law["name"] for law in header.get("law", {}).get("laws", ())]
         self._buffer = TickBuffer(header["columns"], header["rate_hz"])
         self._written_s = time.monotonic()
         self._ticks, self._snapshots, self._events = (
@@ -81,7 +82,7 @@ class Session:
         snapshots, events = self._snapshots.take(), self._events.take()
         for message in events:
             time_ns = self._buffer.time_ns(int(message["tick"]))
-            self._pending.add_event(event_of(message, self._header["axes"], time_ns))
+            self._pending.add_event(event_of(message, self._header["axes"], time_ns, self._laws))
         self._ahead.extend(map(bytes, snapshots))
         while self._ahead and (tick := tick_of(self._ahead[0])) <= self.cursor:
             self._cut_if_due(tick)

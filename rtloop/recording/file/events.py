@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
-from rtloop.signals import Mode, trip_causes
+from rtloop.signals import Failure, Mode, trip_causes
 
 Event = dict[str, Any]
 GAP, FINISHED, ROTATED, RECOVERED = "gap", "finished", "rotated", "recovered"
@@ -31,15 +31,15 @@ FINAL = (FINISHED, ROTATED, RECOVERED)
 """One of these ends a file; its `what` holds the totals."""
 
 
-def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
-    """The event of one record of MESSAGE; `time_ns` since the start of the run."""
+def event_of(message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = ()) -> Event:
+    """The event of one record of MESSAGE; `time_ns` since the start of the run, `laws` the names of those it knows."""
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
     meaning: dict[str, Any] = {}
     if kind == Kind.SET_MODE:
         meaning = {"mode": _name(Mode, values[0])}
     elif kind == Kind.TRIPPED:
-        meaning = {"causes": trip_causes(values[0]), "reason": trip_reason(message, axes)}
+        meaning = {"causes": trip_causes(values[0]), "reason": trip_reason(message, axes, laws)}
     elif kind == Kind.PERIODS_MISSED:
         meaning = {"periods": json_value(values[0])}
     elif kind == Kind.LATENESS_OVER:
@@ -54,15 +54,24 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int) -> Event:
     }
 
 
-def trip_reason(message: np.void, axes: Sequence[str]) -> str | None:
+def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
     """Axis, value and limit of a TRIPPED message in words; None where no axis is to blame."""
-    _, value, limit, bit = (float(one) for one in message["values"][:4])
+    _, value, limit, bit, number = (float(one) for one in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
         return None
+    if causes == ["law"]:
+        which = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
+        return f"{axes[axis]}: law {which!r} {_failure(int(limit), value)}"
     unit = UNITS.get(causes[0], "")
     beside = "" if causes == ["non_finite"] else f", its limit {limit:g}{unit}"
     return f"{axes[axis]}: {causes[0]} {value:.6g}{unit}{beside}"
+
+
+def _failure(code: int, value: float) -> str:
+    """What a law did, by its `Failure`."""
+    slot, _, function = _name(Failure, code - code % 2).partition("_")
+    return f"raised in {function} of the {slot}" if code % 2 else f"returned {value:g} from {function} of the {slot}"
 
 
 def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:

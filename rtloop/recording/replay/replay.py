@@ -15,13 +15,14 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
-from rtloop.law.memory import LawMemory, Layout
+from rtloop.law.memory import LawMemory
 from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import layout_of
+from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.events import GAP, RECOVERED, Event, json_value, message_of
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.load import Recording
+from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.rerun import Rerun, Rows, Tape
 from rtloop.recording.replay.snapshots import first_difference
 from rtloop.recording.replay.verdict import MEASURED, ReplayReport, not_judged
@@ -34,45 +35,21 @@ OBEYED = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW)}
 Progress = Callable[[int], None]
 
 
-def replay(recording: Recording, progress: Progress | None = None) -> ReplayReport:
+def replay(recording: Recording, progress: Progress | None = None, trust: Trust = NOTHING) -> ReplayReport:
     """Replay up to the first difference. Raises RecordingError for a recording of another layout, or without a law."""
-    layout_of_recording(recording)
+    laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
-        return _Replay(recording, snapshots, progress).run()
+        return _Replay(recording, laws, snapshots, progress).run()
 
 
-def layout_of_recording(recording: Recording) -> Layout:
-    """The layout of the recorded law. Raises RecordingError where this version lays out its records otherwise."""
-    described = recording.header.get("law", {})
-    try:
-        layout = layout_of(law_names(recording))
-    except ValueError as error:
-        raise RecordingError(f"{recording.paths[0]}: {error}") from None
-    if described.get("sha256") != layout.description()["sha256"]:
-        version = recording.header.get("versions", {}).get("rtloop", "unknown")
-        raise RecordingError(
-            f"{recording.paths[0]}: recorded by rtloop {version}, whose law is laid out differently; replay it with "
-            "that version"
-        )
-    return layout
-
-
-def law_names(recording: Recording) -> tuple[str, ...]:
-    """Kinds of the laws that the recorded loop knew, as far as the header says so."""
-    described = recording.header.get("law", {}).get("laws")
-    if not isinstance(described, list):
-        return ()
-    return tuple(str(law.get("name")) for law in described if isinstance(law, dict))
-
-
-def law_of(snapshot: Snapshot, recording: Recording) -> LawMemory:
+def law_of(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference]) -> LawMemory:
     """Coefficients and state, which the kernels can work on. Raises RecordingError where they cannot."""
-    layout = layout_of_recording(recording)
+    layout = layout_of(laws)
     try:
         _, *law = layout.split(snapshot.data, len(recording.header["axes"]))
+        return LawMemory(layout, functions_of(laws), *law)
     except ValueError as error:
         raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
-    return LawMemory(layout, functions_of(law_names(recording)), *law)
 
 
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
@@ -108,7 +85,14 @@ def consecutive(rows: Rows) -> list[Rows]:
 
 
 class _Replay:
-    def __init__(self, recording: Recording, snapshots: Iterator[Snapshot], progress: Progress | None) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        laws: Sequence[LawReference],
+        snapshots: Iterator[Snapshot],
+        progress: Progress | None,
+    ) -> None:
+        self._laws = laws
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
         self._commands = recorded_commands(recording, (*LAW_COMMANDS, Kind.LOAD_LAW))
         self._next: Snapshot | None = next(snapshots, None)
@@ -200,7 +184,7 @@ class _Replay:
         if self._next is None or self._next.tick != tick:
             return None
         snapshot, self._next = self._next, next(self._snapshots, None)
-        law = law_of(snapshot, self._recording)
+        law = law_of(snapshot, self._recording, self._laws)
         if self._rerun is None:
             self._start(snapshot.tick, law)
             return None
@@ -219,7 +203,7 @@ class _Replay:
     def _start(self, tick: int, law: LawMemory) -> None:
         header = self._recording.header
         still_to_come = self._commands[self._commands["tick"] > tick]
-        self._rerun = Rerun(header, Tape(header), law, still_to_come, tick)
+        self._rerun = Rerun(header, Tape(header), self._laws, law, still_to_come, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
         self._compare_rate(recorded)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Pacing, Plan
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR, Generator
+from rtloop.laws.registry import LawReference
 from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048
@@ -84,10 +85,16 @@ class Rerun:
     """The loop with the law `law`, about to execute `first_tick`, under commands that are still to come."""
 
     def __init__(
-        self, header: Mapping[str, Any], source: Source, law: LawMemory, commands: np.ndarray[Any, Any], first_tick: int
+        self,
+        header: Mapping[str, Any],
+        source: Source,
+        laws: Sequence[LawReference],
+        law: LawMemory,
+        commands: np.ndarray[Any, Any],
+        first_tick: int,
     ) -> None:
         self.law, self._source = law, source
-        plan = _plan(header, source, law, commands)
+        plan = _plan(header, source, laws, law, commands)
         self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
         self._slots = self._block["ticks_slots"]
         self._context = clock_context(header["rate_hz"])
@@ -136,7 +143,13 @@ class Rerun:
             generators["start_tick"][axis] = generators["held_until"][axis] = first_tick
 
 
-def _plan(header: Mapping[str, Any], source: Source, law: LawMemory, commands: np.ndarray[Any, Any]) -> Plan:
+def _plan(
+    header: Mapping[str, Any],
+    source: Source,
+    laws: Sequence[LawReference],
+    law: LawMemory,
+    commands: np.ndarray[Any, Any],
+) -> Plan:
     axes = tuple(header["axes"])
     return Plan(
         name="rerun",
@@ -146,7 +159,7 @@ def _plan(header: Mapping[str, Any], source: Source, law: LawMemory, commands: n
         driver_kind="playback",
         driver_options={},
         wiring=source.wiring,
-        laws=tuple(kind.name for kind in law.layout.laws),
+        laws=tuple(laws),
         coefficients=law.coefficients,
         mode=Mode.OFF,
         generators=np.zeros(len(axes), GENERATOR),

@@ -17,18 +17,12 @@ from rtloop.law.law import set_mode
 from rtloop.law.layout import Records
 from rtloop.law.memory import LawMemory
 from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import layout_of
+from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
+from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.outcome import Differences, Performance
-from rtloop.recording.replay.replay import (
-    LAW_COMMANDS,
-    consecutive,
-    law_names,
-    law_of,
-    layout_of_recording,
-    recorded_commands,
-)
+from rtloop.recording.replay.replay import LAW_COMMANDS, consecutive, law_of, recorded_commands
 from rtloop.recording.replay.rerun import Rerun, Rows, Source, Tape
 from rtloop.signals import Mode
 
@@ -36,9 +30,9 @@ Progress = Callable[[int], None]
 
 
 class Law(NamedTuple):
-    """Kinds that a loop knows, and the coefficients of its axes."""
+    """Laws that a loop knows, and the coefficients of its axes."""
 
-    kinds: tuple[str, ...]
+    laws: tuple[LawReference, ...]
     coefficients: Records
 
 
@@ -58,14 +52,14 @@ class Rig:
         """Nothing: a rig has no need of what was recorded."""
 
 
-def recorded_law(recording: Recording) -> Law:
+def recorded_law(recording: Recording, trust: Trust = NOTHING) -> Law:
     """The law of the first snapshot. Raises RecordingError where there is none that can be used."""
-    layout_of_recording(recording)
+    laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         first = next(snapshots, None)
     if first is None:
         raise RecordingError(f"{recording.paths[0]}: holds no snapshot of the law")
-    return Law(law_names(recording), law_of(first, recording).coefficients)
+    return Law(laws, law_of(first, recording, laws).coefficients)
 
 
 def other_law(recording: Recording, law: Law, progress: Progress | None = None) -> dict[str, Any]:
@@ -118,7 +112,7 @@ def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Ro
                 tick = int(rows[0, signals.TICK])
                 if rerun is None:
                     memory = _at_rest(law, Mode(int(rows[0, signals.MODE])))
-                    rerun = Rerun(recording.header, source, memory, commands[commands["tick"] >= tick], tick)
+                    rerun = Rerun(recording.header, source, law.laws, memory, commands[commands["tick"] >= tick], tick)
                 count = min(len(rows), rerun.room(tick))
                 replayed = rerun.execute(rows[:count])
                 yield rows[: len(replayed)], replayed
@@ -130,7 +124,7 @@ def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Ro
 
 
 def _at_rest(law: Law, mode: Mode) -> LawMemory:
-    memory = LawMemory.at_rest(layout_of(law.kinds), functions_of(law.kinds), law.coefficients)
+    memory = LawMemory.at_rest(layout_of(law.laws), functions_of(law.laws), law.coefficients)
     set_mode(memory.law, int(mode), True)
     return memory
 

@@ -1,0 +1,80 @@
+"""Which law a table of a configuration means, and its options by that law's own model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
+
+from rtloop.configuration.text_files import InputFileError, read_text
+from rtloop.laws.contract import Controller, Feedforward, Law
+from rtloop.laws.options import ControllerOptions, FeedforwardOptions
+from rtloop.laws.registry import LawReference, from_text, law_class, reference
+
+FEEDFORWARD, CONTROLLER = "prandtl_ishlinskii", "transfer"
+"""Where a table names no law."""
+DEFAULT_LAWS = (LawReference(FEEDFORWARD), LawReference(CONTROLLER))
+"""Known to every loop. An axis without a controller has the last one, with coefficients of 0: it commands nothing."""
+
+
+@dataclass(frozen=True)
+class Library:
+    """Where laws may come from: files below `folder`; or, where a loop runs, those alone that it has loaded."""
+
+    folder: Path = Path()
+    loaded: tuple[LawReference, ...] | None = None
+
+    def find(self, named: Mapping[str, Any], default: str) -> LawReference:
+        """The law that a table names by `kind`, `file` or neither. Raises ValueError."""
+        kind, file = named.get("kind") or None, named.get("file")
+        for value, key in ((kind, "kind"), (file, "file")):
+            if value is not None and not isinstance(value, str):
+                raise ValueError(f"{key}: {value!r}; a name is needed")
+        path = str(self.folder / file) if file else ""
+        if self.loaded is None:
+            return from_text(_text(Path(path)), path, kind) if file else reference(kind or default)
+        wanted = [law for law in self.loaded if law.file == path or (not file and law.kind == (kind or default))]
+        wanted = [law for law in wanted if kind is None or law.kind == kind]
+        if len(wanted) != 1:
+            loaded = ", ".join(law.kind for law in self.loaded)
+            raise ValueError(f"{file or kind or default!r} is no law that the running loop has loaded; it has {loaded}")
+        return wanted[0]
+
+
+HERE = Library()
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path)
+    except InputFileError as error:
+        raise ValueError(str(error)) from None
+
+
+def chosen(value: Any, info: ValidationInfo, base: type[Law], default: str) -> Any:
+    """A table as the options of the law that it names. Raises ValueError, ValidationError."""
+    if not isinstance(value, Mapping):
+        return value
+    library = (info.context or {}).get("library", HERE)
+    law = library.find(value, default)
+    kind = law_class(law)
+    if not issubclass(kind, base):
+        raise ValueError(f"{law.kind!r} is no {base.__name__.lower()}")
+    options = kind.options_model.model_validate(dict(value), context=info.context)
+    options.bind(law)
+    return options
+
+
+def _controller(value: Any, info: ValidationInfo) -> Any:
+    return chosen(value, info, Controller, CONTROLLER)
+
+
+def _feedforward(value: Any, info: ValidationInfo) -> Any:
+    return chosen(value, info, Feedforward, FEEDFORWARD)
+
+
+ControllerTable = Annotated[SerializeAsAny[ControllerOptions], BeforeValidator(_controller)]
+FeedforwardTable = Annotated[SerializeAsAny[FeedforwardOptions], BeforeValidator(_feedforward)]

@@ -1,0 +1,46 @@
+"""A controller that is known by its matrices alone, as the analysis of a loop takes it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rtloop.hil.modal import Complex
+from rtloop.linear.realisation import System
+from rtloop.linear.zeros import zeros_and_gain
+
+AT_ONE = 1e-9
+"""A pole this close to z = 1 integrates."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """x⁺ = A x + b e, v = c·x + d e at one period."""
+
+    system: System
+    period_s: float
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.system.b.size
+
+    @cached_property
+    def zeros(self) -> Complex:
+        """Finite zeros, (m,)."""
+        return zeros_and_gain(self.system)[0]
+
+    @cached_property
+    def poles(self) -> Complex:
+        """Poles, (n,)."""
+        return np.linalg.eigvals(self.system.a).astype(complex) if self.order else np.empty(0, complex)
+
+    @cached_property
+    def dc_gain(self) -> float:
+        """C(z = 1); `inf` with an integrator."""
+        if np.any(np.abs(self.poles - 1) < AT_ONE):
+            return math.inf
+        return float(self.system.response(1.0)[0].real)

@@ -1,0 +1,76 @@
+"""The laws of a recording, as they may be run here.
+
+A recording never makes code run by itself. A law that is not shipped is taken from what is installed, or from a file
+that the user names, if it is the recorded one to the letter; from the recording's own text only if the user trusts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rtloop.laws.registry import BUILT_IN, LawReference, kinds, layout_of, reference
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import Recording
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What may be run: laws from files that the user named, and the texts in the recording."""
+
+    files: tuple[LawReference, ...] = ()
+    recorded: bool = False
+
+
+NOTHING = Trust()
+
+
+def recorded_laws(recording: Recording, trust: Trust = NOTHING) -> tuple[LawReference, ...]:
+    """The laws that the recorded loop knew. Raises RecordingError for one that is not here, or not as it was recorded,
+    and where this version lays out their records otherwise.
+    """
+    described = recording.header.get("law", {}).get("laws")
+    entries = [entry for entry in described if isinstance(entry, dict)] if isinstance(described, list) else []
+    laws = tuple(_law(entry, recording, trust) for entry in entries)
+    if recording.header.get("law", {}).get("sha256") != layout_of(laws).description()["sha256"]:
+        version = recording.header.get("versions", {}).get("rtloop", "unknown")
+        raise RecordingError(
+            f"{recording.paths[0]}: recorded by rtloop {version}, whose law is laid out differently; replay it with "
+            "that version"
+        )
+    return laws
+
+
+def _law(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:
+    name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
+    where = f"{recording.paths[0]}: law {name!r}"
+    if digest is None:
+        if name not in BUILT_IN:
+            raise RecordingError(f"{where}: is not one of this version's, {', '.join(BUILT_IN)}")
+        return LawReference(name)
+    for law in (*trust.files, *_installed(name)):
+        if law.kind == name and law.sha256 == digest:
+            return law
+    if not trust.recorded:
+        raise RecordingError(
+            f"{where}: is not installed here as it ran there (sha256 {str(digest)[:12]}…); --law FILE names the file, "
+            "and --trust-recorded-law runs the text that the recording holds"
+        )
+    law = LawReference(name, str(text), f"law {name!r} in {recording.paths[0]}")
+    if law.sha256 != digest:
+        raise RecordingError(f"{where}: its recorded text is not the one that ran: the sha256 differs")
+    try:
+        layout_of([law])
+    except (ValueError, KeyError) as error:
+        raise RecordingError(f"{where}: {error}") from None
+    return law
+
+
+def _installed(name: str) -> tuple[LawReference, ...]:
+    if name in BUILT_IN or name not in kinds():
+        return ()
+    try:
+        return (reference(name),)
+    except ValueError:
+        return ()
