@@ -36,7 +36,7 @@ class Library:
         path = str(self.folder / file) if file else ""
         if self.loaded is None:
             return from_text(_text(Path(path)), path, kind) if file else reference(kind or default)
-        wanted = [law for law in self.loaded if law.file == path or (not file and law.kind == (kind or default))]
+        wanted = [law for law in self.loaded if (law.file == path if file else law.kind == (kind or default))]
         wanted = [law for law in wanted if kind is None or law.kind == kind]
         if len(wanted) != 1:
             loaded = ", ".join(law.kind for law in self.loaded)

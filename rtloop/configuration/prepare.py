@@ -23,6 +23,7 @@ from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
 from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
+from rtloop.laws.binding import functions_of
 from rtloop.laws.contract import Controller
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.shipped.transfer import TransferController
@@ -85,6 +86,10 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     if configuration.loop.enable_input is not None:
         with findings.at("loop.enable_input: "):
             index_of(facts.inputs, configuration.loop.enable_input)
+    for law in configuration.laws:
+        if law.text:  # what is shipped compiles
+            with findings.at(""):
+                functions_of([law])
     checks, coefficients = [], []
     for axis in configuration.axes:
         check = _check(axis, 1.0 / rate_hz, findings)

@@ -20,6 +20,7 @@ from rtloop.hil.native.pointers import carray
 from rtloop.law.layout import CONTROL, FUNCTIONS
 from rtloop.law.memory import LawRecords
 from rtloop.laws.contract import Law
+from rtloop.laws.purity import foreign_calls
 from rtloop.laws.registry import LawReference, law_class
 
 MAX_CHARACTERS = 300
@@ -46,9 +47,13 @@ def _address(law: type[Law], name: str, function: Callable[..., Any], told: Any,
     kernel = function if law.shipped else _kernel(function)
     signature = result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
     try:
-        return native_address(kernel, signature)
-    except NumbaError as error:
+        address = native_address(kernel, signature)
+    except Exception as error:  # whatever the compiler comes upon
         raise ValueError(f"law {law.kind!r}: {name} cannot be compiled: {_short(error)}") from error
+    if not law.shipped:
+        for called, reason in foreign_calls(kernel, signature, law.libm).items():
+            raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
+    return address
 
 
 @cache
@@ -56,8 +61,10 @@ def _kernel(function: Callable[..., Any]) -> Any:
     return checked(function)
 
 
-def _short(error: NumbaError) -> str:
+def _short(error: Exception) -> str:
     """What the compiler says, without its advice: the lines that say what is wrong, and where."""
+    if not isinstance(error, NumbaError):
+        return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [line for line in lines if line and not line.startswith(("During:", "- Resolution", "Failed in", "[", "<<"))]
     return " ".join(kept)[:MAX_CHARACTERS]

@@ -18,7 +18,7 @@ interlocks, modes and bumpless changes belong to the loop and are the same for e
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -47,7 +47,9 @@ class Law(ABC):
     allowed_state: ClassVar[Rules] = MappingProxyType({})
     shipped: ClassVar[bool] = False
     """True where the functions are compiled kernels already, whose indices are checked where data enters."""
-    enter: ClassVar[Callable[..., None] | None] = None
+    libm: ClassVar[bool] = False
+    """True where sin, exp and the like are wanted, although a replay on another processor may then differ."""
+    enter: Any = None
     """Of a controller, enter(c, s, told): from a state of zeros, that from which `output` gives told.command_um for
     what it is told. Where it is missing, or does not manage, the loop adds an offset to the command, which dies out.
     Of a feedforward, enter(c, s, drive_v): it takes over at this drive; its memory is of the actuator, and stays."""

@@ -23,7 +23,11 @@ from rtloop.laws.contract import Law
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
 BUILT_IN = {
+    "integral_resonant": f"{SHIPPED}.integral_resonant:IntegralResonant",
+    "pid": f"{SHIPPED}.pid:Pid",
+    "positive_position": f"{SHIPPED}.positive_position:PositivePosition",
     "prandtl_ishlinskii": f"{SHIPPED}.prandtl_ishlinskii:PrandtlIshlinskii",
+    "repetitive": f"{SHIPPED}.repetitive:Repetitive",
     "transfer": f"{SHIPPED}.transfer:TransferController",
 }
 

@@ -12,18 +12,19 @@ from unittest.mock import DEFAULT, patch
 
 import numpy as np
 
+from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.hil.native import uncompiled
 from rtloop.law import memory
 from rtloop.law.law import evaluate, update
 from rtloop.law.layout import CONDITIONS
 from rtloop.law.memory import LawMemory, records
 from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import BUILT_IN, layout_of
+from rtloop.laws.registry import layout_of
 from rtloop.signals import Mode
 from tests.recording.law_fields import COUNTS, fields_of
 
 TICKS, SEED, TRIES = 2, 3, 400
-LAYOUT, FUNCTIONS = layout_of(tuple(BUILT_IN)), functions_of(tuple(BUILT_IN))
+LAYOUT, FUNCTIONS = layout_of(DEFAULT_LAWS), functions_of(DEFAULT_LAWS)
 
 
 def reaches_beyond(data: bytes, axes: int) -> bool:

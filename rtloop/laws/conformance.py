@@ -1,0 +1,200 @@
+"""The conformance suite of laws: what the loop relies on, as tests that a law's own suite inherits.
+
+    from rtloop.laws.conformance import LawConformance
+
+    class TestMine(LawConformance):
+        law = Mine(MineOptions(gain=2.0), 1e-4, None)
+
+Then run pytest on it. Nothing is driven: the functions are called on records alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import from_dtype, types
+
+from rtloop.hil.native.compiled import checked
+from rtloop.law.layout import CONTROL
+from rtloop.law.memory import records
+from rtloop.laws.contract import Controller, Law, record_of
+from rtloop.laws.purity import foreign_calls
+
+TICKS, SEED = 400, 7
+COST_TICKS = 4_000
+REACH_UM = 60.0
+BUMP = 1e-6
+"""Of the command that a law is told to go on from, and of the error that it meets."""
+
+
+class LawConformance:
+    """Set `law`: an instance, with options as a user would give them."""
+
+    law: Law
+
+    @pytest.fixture
+    def bench(self) -> Bench:
+        """The law on records of its own."""
+        return Bench(self.law)
+
+    def test_it_builds_numbers_that_can_be_computed_with(self) -> None:
+        """Every coefficient is finite, and the same options give the same bytes."""
+        built = record_of(self.law)
+        for name in built.dtype.names or ():
+            assert np.all(np.isfinite(built[name].astype(float))), f"coefficient {name} is not finite: {built[name]}"
+        assert built.tobytes() == record_of(self.law).tobytes(), "the same options gave other coefficients"
+
+    def test_whole_numbers_are_bounded(self) -> None:
+        """Whatever the functions use as an index has its range in `allowed_coefficients` and `allowed_state`."""
+        keeps = self.law.records()
+        for what, allowed in (("coefficients", keeps.allowed_coefficients), ("state", keeps.allowed_state)):
+            table = getattr(keeps, what)
+            whole = {
+                name for name in table.names if table[name].base.kind in "iu" and name not in ("unused", "reserved")
+            }
+            assert set(allowed) == whole, f"allowed_{what} must name {sorted(whole)}; it names {sorted(allowed)}"
+
+    def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
+        """Results and state, over ticks with wild errors and limited commands."""
+        other = Bench(self.law, compiled=False)
+        for number, (one, two) in enumerate(zip(bench.run(TICKS), other.run(TICKS), strict=True)):
+            assert one == two, f"tick {number}: compiled {one}, uncompiled {two}"
+
+    def test_its_state_is_in_its_record(self, bench: Bench) -> None:
+        """From the same bytes it goes on the same, compiled or not: nothing is remembered anywhere else."""
+        for one in (bench, Bench(self.law, compiled=False)):
+            list(one.run(TICKS))
+            kept = one.state.copy()
+            first = list(one.run(TICKS, SEED + 1))
+            one.state[:] = kept
+            assert list(one.run(TICKS, SEED + 1)) == first, "from the same state it went on otherwise"
+
+    def test_its_coefficients_are_read_only(self, bench: Bench) -> None:
+        """They are what a recording says of the law."""
+        before = bench.coefficients.tobytes()
+        list(bench.run(TICKS))
+        assert bench.coefficients.tobytes() == before, "a function wrote to its coefficients"
+
+    def test_it_stays_finite(self, bench: Bench) -> None:
+        """Bounded errors and commands that are applied give commands that are numbers, far from the end of numbers."""
+        for number, (value, _) in enumerate(bench.run(20 * TICKS, wild=False)):
+            assert abs(value) < 1e9, f"tick {number}: {value}"
+
+    def test_no_number_that_is_none_outlives_an_entry(self, bench: Bench) -> None:
+        """After NaN and infinity, entered anew, it works."""
+        bench.poison()
+        bench.enter(3.0, 1.0, 5.0)
+        for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
+            assert np.isfinite(value), f"tick {number} after the entry: {value}"
+
+    def test_it_goes_on_where_it_is_told_to(self, bench: Bench) -> None:
+        """Its `enter` leaves no more than BUMP; without one the loop's own offset does it."""
+        if not isinstance(self.law, Controller) or type(self.law).enter is None:
+            pytest.skip("the law has no enter of its own")
+        random = np.random.default_rng(SEED)
+        for _ in range(50):
+            position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, 3)
+            found = bench.enter(position_um, error_um, command_um)
+            room = BUMP * (1 + abs(command_um) + abs(error_um))
+            assert abs(found - command_um) <= room, f"told to go on at {command_um}, it gave {found}"
+
+    def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:
+        """No memory taken, nothing printed, no interpreter, no mathematics that differs between processors."""
+        for name, calls in bench.foreign():
+            assert not calls, f"{name}: " + "; ".join(f"{called} {reason}" for called, reason in calls.items())
+
+    def test_what_a_tick_costs(self, bench: Bench, record_property: Any) -> None:
+        """Noted as `ns_per_tick`, called from Python: to compare laws, and no verdict."""
+        began_ns = time.perf_counter_ns()
+        deque = [value for value, _ in bench.run(COST_TICKS)]
+        record_property("ns_per_tick", (time.perf_counter_ns() - began_ns) / COST_TICKS)
+        assert len(deque) == COST_TICKS
+
+
+@cache
+def _compiled(function: Any, signature: Any) -> Any:
+    kernel = checked(function)
+    kernel.compile(signature)
+    return kernel
+
+
+class Bench:
+    """A law's functions on records of its own, compiled as the loop has them or as they are written."""
+
+    def __init__(self, law: Law, compiled: bool = True) -> None:
+        keeps, self._law = law.records(), law
+        self.coefficients: Any = records(keeps.coefficients, 1)
+        self.coefficients[:] = record_of(law)
+        self.state: Any = records(keeps.state, 1)
+        self._told: Any = records(CONTROL, 1)
+        self._kernels: dict[str, Any] = {}
+        told = from_dtype(CONTROL) if keeps.axes else types.float64
+        returns = {"output": types.float64, "update": types.void if keeps.axes else types.float64, "enter": types.void}
+        self._signatures: dict[str, Any] = {}
+        for name, result in returns.items():
+            written = getattr(type(law), name)
+            if written is None:
+                continue
+            self._signatures[name] = result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
+            plain = getattr(written, "py_func", written)
+            self._kernels[name] = _compiled(plain, self._signatures[name]) if compiled else plain
+
+    def _call(self, name: str, told: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return self._kernels[name](self.coefficients[0], self.state[0], told)
+
+    def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[float, bytes]]:
+        """What each tick gives, and the state after it."""
+        random = np.random.default_rng(seed)
+        for number in range(ticks):
+            if self._law.axes == 0:
+                value = float(self._call("output", random.uniform(-REACH_UM, REACH_UM)))
+                followed = float(self._call("update", random.uniform(-10, 10)))
+                yield value + followed, self.state.tobytes()
+                continue
+            told = self._told[0]
+            reach = 1e6 if wild and number % 97 == 0 else REACH_UM
+            told.position_um = random.uniform(-reach, reach)
+            told.reference_um = random.uniform(-reach, reach)
+            told.error_um = told.reference_um - told.position_um
+            told.command_um = told.applied_um = random.uniform(-REACH_UM, REACH_UM)
+            value = float(self._call("output", told))
+            told.command_um, told.applied_um = value, min(max(value, -REACH_UM), REACH_UM)
+            self._call("update", told)
+            yield value, self.state.tobytes()
+
+    def poison(self) -> None:
+        """Ticks with what is no number; what it returns or raises then is its own affair."""
+        for value in (np.nan, np.inf, -np.inf):
+            try:
+                if self._law.axes == 0:
+                    self._call("output", value)
+                    continue
+                for name in self._told.dtype.names:
+                    self._told[name] = value
+                self._call("output", self._told[0])
+                self._call("update", self._told[0])
+            except (ArithmeticError, IndexError, ValueError):
+                continue
+
+    def enter(self, position_um: float, error_um: float, command_um: float) -> float:
+        """As the loop lets a controller in, from a state of zeros; the command of its first tick."""
+        if self._law.axes == 0:
+            return 0.0
+        self.state.view(np.uint8)[:] = 0
+        told = self._told[0]
+        told.position_um, told.error_um, told.reference_um = position_um, error_um, position_um + error_um
+        told.command_um = told.applied_um = command_um
+        if "enter" in self._kernels:
+            self._call("enter", told)
+        return float(self._call("output", told))
+
+    def foreign(self) -> Iterator[tuple[str, dict[str, str]]]:
+        """Of each function what it calls that a law may not."""
+        for name, kernel in self._kernels.items():
+            yield name, foreign_calls(kernel, self._signatures[name], self._law.libm)

@@ -1,0 +1,46 @@
+"""What a compiled law calls outside of itself: nothing that takes memory, waits, or differs between processors."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_DEFINED = re.compile(r'^define [^@]*@"?([^"(]+)"?\(.*?^\}', re.MULTILINE | re.DOTALL)
+_CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
+LIBM = "differs between processors in its last bits, so that a replay might"
+_MATHEMATICS = {
+    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "sincos"),
+    *("exp", "exp2", "exp10", "log", "log2", "log10", "pow", "powi", "ldexp", "frexp"),
+}
+"""Of LLVM's intrinsics, those that become calls of the processor's own library."""
+
+
+def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, str]:
+    """What a compiled kernel calls that a law may not, and why not; `libm` allows the processor's own mathematics."""
+    found = kernel.overloads[signature.args]
+    text = found.library.get_llvm_str()
+    bodies = {match.group(1): match.group(0) for match in _DEFINED.finditer(text)}
+    pending, seen, outside = [found.fndesc.llvm_func_name], set[str](), set[str]()
+    while pending:
+        name = pending.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        for called in _CALLED.findall(bodies[name]):
+            if called in bodies:
+                pending.append(called)
+            else:
+                outside.add(called)
+    reasons = {name: _reason(name) for name in sorted(outside)}
+    return {name: reason for name, reason in reasons.items() if reason and not (libm and reason == LIBM)}
+
+
+def _reason(name: str) -> str:
+    if name.startswith("llvm."):
+        function = name.split(".")[1]
+        return LIBM if function in _MATHEMATICS else ""
+    if name.startswith(("NRT_", "numba_runtime")):
+        return "takes memory, which may wait"
+    if name.startswith(("Py", "numba_")):
+        return "needs the interpreter, which may wait"
+    return LIBM

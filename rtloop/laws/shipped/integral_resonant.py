@@ -1,0 +1,74 @@
+"""Integral resonant control: damping by a lag in positive feedback, and an integrator around it.
+
+    C₂(s) = k / (s + k d),    v = C₂ (w + x),    w' = ki e
+
+A. J. Fleming, S. S. Aphale and S. O. R. Moheimani, A new method for robust damping and tracking control of scanning
+probe microscope positioning stages, IEEE Trans. Nanotechnology 9(4), 2010, eqs (10) to (17), with d = −D_f. It wants
+d above the plant's gain at 0 Hz. The lag is held exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from pydantic import Field
+
+from rtloop.laws.contract import Controller
+from rtloop.laws.options import ControllerOptions
+
+
+class IntegralResonantOptions(ControllerOptions):
+    """Of the lag and of the integrator around it."""
+
+    gain_per_s: float = Field(gt=0)
+    """k."""
+    feedthrough: float = Field(gt=0)
+    """d, above the plant's gain at 0 Hz in µm per µm."""
+    ki_per_s: float = Field(ge=0)
+    tracking_s: float = Field(default=1e-3, gt=0)
+    """With which the integrator follows a command that was limited."""
+
+
+class IntegralResonant(Controller):
+    """A lag in positive feedback damps the resonance; an integrator tracks."""
+
+    kind = "integral_resonant"
+    options_model = IntegralResonantOptions
+    coefficients = MappingProxyType({name: float for name in ("ki", "feedthrough", "decay", "tracking")})
+    state = MappingProxyType({"integral_um": float, "lag_um": float})
+
+    def build(self) -> Mapping[str, Any]:
+        """Gains of a tick. Raises ValueError for a feedthrough that the plant's gain exceeds."""
+        options: IntegralResonantOptions = self.options
+        if self.model is not None and (gain := abs(self.model.transfer().dc_gain)) >= options.feedthrough:
+            raise ValueError(
+                f"feedthrough: {options.feedthrough:g}; the plant's gain at 0 Hz, {gain:.4g}, must be less"
+            )
+        return {
+            "ki": options.ki_per_s * self.period_s,
+            "feedthrough": options.feedthrough,
+            "decay": math.exp(-options.gain_per_s * options.feedthrough * self.period_s),
+            "tracking": min(self.period_s / options.tracking_s, 1.0),
+        }
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        """The lag's state."""
+        return s.lag_um
+
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        """The lag takes up integral and position; both follow what was really applied."""
+        shortfall_um = told.applied_um - told.command_um
+        target_um = (s.integral_um + told.position_um) / c.feedthrough
+        s.lag_um = c.decay * s.lag_um + (1.0 - c.decay) * target_um + c.tracking * shortfall_um
+        s.integral_um += c.ki * told.error_um + c.tracking * c.feedthrough * shortfall_um
+
+    @staticmethod
+    def enter(c: Any, s: Any, told: Any) -> None:
+        """Lag and integral at rest with the command in force."""
+        s.lag_um = told.command_um
+        s.integral_um = c.feedthrough * told.command_um - told.position_um

@@ -1,0 +1,70 @@
+"""PID with a filtered derivative of the position and anti-windup by back-calculation.
+
+    v = kp e + I − D,    I' = ki e + (v_applied − v) / T_t,    D = kd s / (1 + T_f s) · x
+
+K. J. Åström and T. Hägglund, Advanced PID Control, ISA, 2006, sections 3.3 to 3.5 and 13.4: I by Euler's rule, D by
+backward differences, which stay stable for any T_f. The derivative is of the position, so that no step of the reference
+kicks it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from pydantic import Field
+
+from rtloop.laws.contract import Controller
+from rtloop.laws.options import ControllerOptions
+
+
+class PidOptions(ControllerOptions):
+    """Gains in µm of command per µm of error."""
+
+    kp: float = 0.0
+    ki_per_s: float = Field(default=0.0, ge=0)
+    kd_s: float = Field(default=0.0, ge=0)
+    filter_s: float = Field(default=1e-3, gt=0)
+    """T_f, of the derivative."""
+    tracking_s: float = Field(default=1e-3, gt=0)
+    """T_t, with which the integral follows a command that was limited."""
+
+
+class Pid(Controller):
+    """Proportional, integral and filtered derivative action."""
+
+    options_model = PidOptions
+    coefficients = MappingProxyType({name: float for name in ("kp", "ki", "decay", "kd", "tracking")})
+    state = MappingProxyType({"integral_um": float, "derivative_um": float, "last_um": float})
+
+    def build(self) -> Mapping[str, Any]:
+        """Gains of a tick."""
+        options: PidOptions = self.options
+        filtered_s = options.filter_s + self.period_s
+        return {
+            "kp": options.kp,
+            "ki": options.ki_per_s * self.period_s,
+            "decay": options.filter_s / filtered_s,
+            "kd": options.kd_s / filtered_s,
+            "tracking": min(self.period_s / options.tracking_s, 1.0),
+        }
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        """kp e + I − D."""
+        derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
+        return c.kp * told.error_um + s.integral_um - derivative_um
+
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        """I and D of the next tick."""
+        s.integral_um += c.ki * told.error_um + c.tracking * (told.applied_um - told.command_um)
+        s.derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
+        s.last_um = told.position_um
+
+    @staticmethod
+    def enter(c: Any, s: Any, told: Any) -> None:
+        """The position stands still, and I makes up for the rest."""
+        s.last_um = told.position_um
+        s.integral_um = told.command_um - c.kp * told.error_um

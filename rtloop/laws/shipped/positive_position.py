@@ -1,0 +1,91 @@
+"""Positive position feedback: a tuned filter in positive feedback damps the resonance, and an integrator tracks.
+
+    F(s) = g ω² / (s² + 2 ζ ω s + ω²),    v = I + F x,    I' = ki e
+
+J. L. Fanson and T. K. Caughey, Positive position feedback control for large space structures, AIAA Journal 28(4), 1990,
+eqs (5), (6). The loop through F is stable at 0 Hz as long as g times the plant's gain stays below 1. F is held exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rtloop.laws.contract import Controller
+from rtloop.laws.options import ControllerOptions
+
+
+class PositivePositionOptions(ControllerOptions):
+    """Of the filter and of the integrator beside it."""
+
+    gain: float = Field(gt=0)
+    """g, in µm of command per µm of position."""
+    filter_hz: float = Field(gt=0)
+    damping: float = Field(gt=0, lt=1)
+    """ζ."""
+    ki_per_s: float = Field(ge=0)
+    tracking_s: float = Field(default=1e-3, gt=0)
+    """With which the integral follows a command that was limited."""
+
+
+class PositivePosition(Controller):
+    """A resonant filter in positive feedback, beside an integrator."""
+
+    kind = "positive_position"
+    options_model = PositivePositionOptions
+    coefficients = MappingProxyType(
+        {"a": (float, (2, 2)), "b": (float, 2), "gain": float, "ki": float, "tracking": float}
+    )
+    state = MappingProxyType({"filter": (float, 2), "integral_um": float})
+
+    def build(self) -> Mapping[str, Any]:
+        """The filter held over a tick. Raises ValueError for a gain with which the loop diverges at 0 Hz."""
+        options: PositivePositionOptions = self.options
+        if self.model is not None and (gain := options.gain * abs(self.model.transfer().dc_gain)) >= 1:
+            raise ValueError(
+                f"gain: {options.gain:g}; times the plant's gain at 0 Hz it is {gain:.4g}, and must be below 1"
+            )
+        a, b = held_resonance(2 * math.pi * options.filter_hz, options.damping, self.period_s)
+        return {
+            "a": a,
+            "b": b,
+            "gain": options.gain,
+            "ki": options.ki_per_s * self.period_s,
+            "tracking": min(self.period_s / options.tracking_s, 1.0),
+        }
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        """I + F x."""
+        return s.integral_um + c.gain * s.filter[0]
+
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        """Filter and integral of the next tick."""
+        first, second = s.filter[0], s.filter[1]
+        s.filter[0] = c.a[0, 0] * first + c.a[0, 1] * second + c.b[0] * told.position_um
+        s.filter[1] = c.a[1, 0] * first + c.a[1, 1] * second + c.b[1] * told.position_um
+        s.integral_um += c.ki * told.error_um + c.tracking * (told.applied_um - told.command_um)
+
+    @staticmethod
+    def enter(c: Any, s: Any, told: Any) -> None:
+        """The filter at rest with the position, and I makes up for the rest."""
+        s.filter[0] = told.position_um
+        s.integral_um = told.command_um - c.gain * told.position_um
+
+
+def held_resonance(omega: float, damping: float, period_s: float) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²) behind a hold; the states are its output, and its rate over ω."""
+    decay, moved = math.exp(-damping * omega * period_s), omega * math.sqrt(1 - damping**2) * period_s
+    share = damping / math.sqrt(1 - damping**2)
+    cosine, sine = decay * math.cos(moved), decay * math.sin(moved)
+    a = np.array([
+        [cosine + share * sine, sine / math.sqrt(1 - damping**2)],
+        [-sine / math.sqrt(1 - damping**2), cosine - share * sine],
+    ])  # fmt: skip
+    return a, (np.eye(2) - a) @ np.array([1.0, 0.0])

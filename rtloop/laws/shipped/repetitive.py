@@ -1,0 +1,125 @@
+"""Repetitive control: what an error was a period ago is added to it, and an integrator works on the sum.
+
+    ê_k = e_k + w_k,    w_k = g Σ_j q_j ê_{k − N + L + j},    v' = ki ê
+
+A plug-in internal model (S. Hara, Y. Yamamoto, T. Omata and M. Nakano, IEEE Trans. Automatic Control 33(7), 1988) with
+a smoothing filter Q of no phase (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111, 1989). With T
+the closed loop of the integrator alone, it is stable where that is and |g Q (1 − z^L T)| < 1 at every frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rtloop.law.validity import Allowed
+from rtloop.laws.contract import Controller
+from rtloop.laws.options import ControllerOptions
+from rtloop.linear.realisation import System
+from rtloop.linear.sampled import Sampled
+
+MAX_PLACES = 16384
+MAX_WIDTH = 32
+GRID = 4096
+
+
+class RepetitiveOptions(ControllerOptions):
+    """Of the integrator, and of the memory of a period."""
+
+    ki_per_s: float = Field(gt=0)
+    repeat_s: float = Field(gt=0)
+    """Period of the reference, or of the disturbance: a whole number of ticks."""
+    gain: float = Field(default=0.9, gt=0, le=1)
+    """g: below 1 forgets, which forgives."""
+    lead_ticks: int = Field(default=1, ge=0)
+    """L: how far the memory is read ahead, for the loop's own delay."""
+    smooth_ticks: int = Field(default=8, ge=0, le=MAX_WIDTH)
+    """Q averages over so many ticks to either side, by a triangle."""
+
+
+class Repetitive(Controller):
+    """An integrator with the memory of a period."""
+
+    options_model = RepetitiveOptions
+    coefficients = MappingProxyType(
+        {"ki": float, "weights": (float, 2 * MAX_WIDTH + 1), "count": int, "ahead": int, "places": int}
+    )
+    state = MappingProxyType({"past_um": (float, MAX_PLACES), "integral_um": float, "at": int})
+    allowed_coefficients = MappingProxyType(
+        {
+            "count": Allowed(1, 2 * MAX_WIDTH + 1),
+            "ahead": Allowed(0, MAX_PLACES - 1),
+            "places": Allowed(1, MAX_PLACES),
+        }
+    )
+    allowed_state = MappingProxyType({"at": Allowed(0, MAX_PLACES - 1)})
+
+    def build(self) -> Mapping[str, Any]:
+        """Raises ValueError for a period that is too long or no whole number of ticks, and where it does not settle."""
+        options: RepetitiveOptions = self.options
+        ticks, width = options.repeat_s / self.period_s, options.smooth_ticks
+        repeat = round(ticks)
+        if abs(ticks - repeat) > 1e-6 * ticks or not width + options.lead_ticks < repeat <= MAX_PLACES - width:
+            raise ValueError(
+                f"repeat_s: {options.repeat_s:g} s are {ticks:g} ticks; a whole number above smooth_ticks + lead_ticks "
+                f"and up to {MAX_PLACES - width} is needed"
+            )
+        weights = options.gain * np.bartlett(2 * width + 3)[1:-1] / (width + 1)
+        if self.model is not None and not options.allow_unstable:
+            self._require_contraction(weights)
+        return {
+            "ki": options.ki_per_s * self.period_s,
+            "weights": weights,
+            "count": weights.size,
+            "ahead": 2 * width + options.lead_ticks,
+            "places": repeat + width,
+        }
+
+    def _require_contraction(self, weights: np.ndarray[Any, Any]) -> None:
+        """Raise ValueError where the memory adds to an error from one period to the next, at some frequency."""
+        from rtloop.linear.discretise import held
+
+        turns = np.linspace(1e-6, 0.5, GRID)
+        z = np.exp(2j * np.pi * turns)
+        plant = held(self.model.transfer(), self.period_s).response(z) * z ** -float(self.model.delay_ticks)
+        loop = self.options.ki_per_s * self.period_s / (z - 1) * plant
+        width = weights.size // 2
+        smoothed = np.sum(weights * np.cos(2 * np.pi * np.outer(turns, np.arange(-width, width + 1))), axis=1)
+        left = np.abs(smoothed * (1 - z**self.options.lead_ticks * loop / (1 + loop)))
+        if left.max() >= 1:
+            hz = turns[np.argmax(left)] / self.period_s
+            raise ValueError(
+                f"gain: at {hz:.4g} Hz an error grows to {left.max():.3g} of itself from one period to the next; a "
+                "smaller gain, more smooth_ticks or another lead_ticks is needed (or allow_unstable)"
+            )
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        """The integral."""
+        return s.integral_um
+
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        """Read a period ago, add, integrate, remember."""
+        place, recalled_um = s.at + c.ahead, 0.0
+        for j in range(c.count):
+            recalled_um += c.weights[j] * s.past_um[(place - j) % c.places]
+        total_um = told.error_um + recalled_um
+        s.past_um[s.at] = total_um
+        s.at = (s.at + 1) % c.places
+        s.integral_um += c.ki * total_um + told.applied_um - told.command_um
+
+    def linear(self) -> Any:
+        """Of the integrator alone: the memory is judged where it is built."""
+        return Sampled(
+            System(np.eye(1), np.array([self.options.ki_per_s * self.period_s]), np.ones(1), 0.0), self.period_s
+        )
+
+    @staticmethod
+    def enter(c: Any, s: Any, told: Any) -> None:
+        """Nothing is remembered yet."""
+        s.integral_um = told.command_um

@@ -1,0 +1,58 @@
+"""Laws that go wrong while they run, as a laboratory would write them; each becomes a file beside a configuration."""
+
+from __future__ import annotations
+
+HEAD = """
+from rtloop.laws import Controller, ControllerOptions
+from rtloop.law.validity import Allowed
+
+class Mine(Controller):
+    coefficients = {"ki": float, "limits": (float, 4)}
+    state = {"integral_um": float, "seen": float, "past_um": (float, 4)}
+
+    def build(self):
+        return {"ki": 100.0 * self.period_s, "limits": [1.0, 2.0, 3.0, 4.0]}
+
+    def enter(c, s, told):
+        s.integral_um = told.command_um
+"""
+OUTPUT = "    def output(c, s, told):\n{}        return s.integral_um\n"
+UPDATE = (
+    "    def update(c, s, told):\n{}        s.seen += 1.0\n"
+    "        s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um\n"
+)
+LATER = "        if s.seen == 200.0:\n            {}\n"
+"""At tick 200."""
+
+
+def text(output: str = "", update: str = "") -> str:
+    """A law's file; `output` and `update` are what is done at tick 200."""
+    bodies = (LATER.format(body) if body else "" for body in (output, update))
+    return HEAD + "".join(part.format(body) for part, body in zip((OUTPUT, UPDATE), bodies, strict=True))
+
+
+FAILING = {
+    "divides by zero": (text("return 1.0 / (s.seen - 200.0)"), 200, "raised in output of the controller"),
+    "divides a whole number by zero": (text("return 1.0 * (7 // (int(s.seen) - 200))"), 200, "raised in output"),
+    "returns NaN": (text("return 1e308 * 1e308 * 0.0"), 200, "returned nan from output"),
+    "returns infinity": (text("return 1e308 * 1e308"), 200, "returned inf from output of the controller"),
+    "returns too much": (text("return -2e9"), 200, "returned -2e+09 from output of the controller"),
+    "grows without bound": (text("", "s.integral_um = 1e12"), 201, "returned 1e+12 from output of the controller"),
+    "reads beyond its array": (text("return c.limits[int(s.seen)]"), 200, "raised in output of the controller"),
+    "writes beyond its array": (text("", "s.past_um[int(s.seen)] = 1.0"), 201, "raised in update of the controller"),
+    "writes before its array": (text("", "s.past_um[-int(s.seen)] = 1.0"), 201, "raised in update of the controller"),
+    "raises": (text("raise ValueError('too late')"), 200, "raised in output of the controller"),
+}
+"""Text, the tick of the trip, what is said of it."""
+REFUSED = {
+    "prints": (text("print(s.seen)"), "needs the interpreter"),
+    "takes memory": ("import numpy as np\n" + text("return np.zeros(3)[0]"), "takes memory"),
+    "calls libm": ("import math\n" + text("return math.sin(told.error_um)"), "differs between processors"),
+    "sleeps": ("import time\n" + text("time.sleep(1.0)"), "cannot be compiled"),
+    "opens a file": (text("open('x')"), "cannot be compiled"),
+    "names what is not there": (text("return s.nothing"), "cannot be compiled"),
+    "is no Python": ("def f(:\n", "SyntaxError in line 1"),
+    "defines no law": ("x = 1\n", "defines no law"),
+    "raises when it is read": ("1 / 0\n", "ZeroDivisionError"),
+}
+"""Text, and what `check` says."""

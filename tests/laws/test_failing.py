@@ -1,0 +1,99 @@
+"""A mistake in a law is a trip that names law, axis and tick, or is refused before anything runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
+from rtloop.engine.loop import Outcome
+from rtloop.engine.messages import Kind
+from rtloop.errors import ConfigError
+from rtloop.recording.file.events import event_of
+from rtloop.signals import Mode
+from tests.engine.harness import AXIS, LoopBench, text
+from tests.laws.failing import FAILING, REFUSED
+from tests.laws.failing import text as law_text
+
+HOLD = '[axis.controller]\nfile = "mine.py"\n[axis.reference]\nkind = "hold"\nvalue = 5.0\n'
+CANARY = 0xA5
+
+
+def plan_of(folder: Path, law: str):
+    """The plan of a loop with a law from a file."""
+    (folder / "mine.py").write_text(law)
+    return prepare(parse(text(AXIS, HOLD), "test", folder, "test"), paced=False).plan
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_it_trips_and_the_outputs_come_down(name, tmp_path):
+    law, tick, said = FAILING[name]
+    plan = plan_of(tmp_path, law)
+    bench = LoopBench(plan)
+    rows = bench.run(1000)
+    trips = [event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED]
+    assert bench.outcome is Outcome.DONE
+    assert [int(event["tick"]) for event in trips] == [tick]
+    found = event_of(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
+    assert found["causes"] == ["law"]
+    assert found["reason"].startswith("x: law 'mine' ")
+    assert said in found["reason"]
+    drive_v = bench.column(rows, "x_drive_v")
+    assert np.all(np.abs(drive_v) <= 10.0)
+    assert np.max(np.abs(np.diff(drive_v[tick:]))) <= 0.1 + 1e-12
+    assert drive_v[tick] == drive_v[tick - 1]
+    assert drive_v[-1] == 0.0
+    assert set(bench.column(rows, "mode")[tick:]) == {float(Mode.OFF)}
+
+
+@pytest.mark.parametrize("name", ["writes beyond its array", "writes before its array"])
+def test_no_memory_but_its_own_is_written(name, tmp_path):
+    """Bytes behind and before the law's records stay as they are, and so do its coefficients."""
+    bench = LoopBench(plan_of(tmp_path, FAILING[name][0]))
+    law = bench.law.layout.laws[-1]
+    room = bench.law.layout.room("controller")[1]
+    behind = bench.law.axes["controller"][0, law.state.itemsize : room]
+    behind[:] = CANARY
+    before = bench.law.coefficients.tobytes(), bench.law.axes["feedforward"].tobytes()
+    bench.run(199)
+    own = bench.law.axes["feedforward"].tobytes()
+    bench.run(50)
+    assert np.all(behind == CANARY)
+    assert bench.law.coefficients.tobytes() == before[0]
+    assert own != before[1]  # the loop ran
+
+
+def test_after_a_reset_it_may_be_entered_again(tmp_path):
+    """The state begins at zeros: what went wrong before is forgotten."""
+    bench = LoopBench(plan_of(tmp_path, FAILING["grows without bound"][0]))
+    bench.run(400)
+    bench.send(Kind.RESET_TRIP)
+    bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP)
+    rows = bench.run(190)
+    assert set(bench.column(rows, "mode")) == {float(Mode.CLOSED_LOOP)}
+    assert np.all(np.isfinite(bench.column(rows, "x_command_um")))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_it_is_refused_before_anything_runs(name, tmp_path):
+    law, said = REFUSED[name]
+    with pytest.raises(ConfigError, match=said):
+        plan_of(tmp_path, law)
+
+
+def test_a_law_without_enter_is_entered_without_a_bump(tmp_path):
+    """From raw at 3 V into closed loop: no step of the drive beyond that of a tick of either."""
+    law = law_text().replace("    def enter(c, s, told):\n        s.integral_um = told.command_um\n", "")
+    assert "enter" not in law
+    bench = LoopBench(plan_of(tmp_path, law))
+    bench.send(Kind.SET_REFERENCE, 0, 3.0)
+    bench.send(Kind.SET_MODE, Mode.RAW)
+    bench.run(2000)
+    bench.send(Kind.SET_REFERENCE, 0, 5.0)
+    bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP)
+    drive_v = bench.column(bench.run(4000), "x_drive_v")
+    assert np.max(np.abs(np.diff(drive_v))) < 0.05
+    assert abs(drive_v[0] - 3.0) < 0.05

@@ -1,0 +1,41 @@
+"""The conformance suite finds what it is there to find: each mutant fails it at the promise that it breaks."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+from _pytest.outcomes import Failed
+from numba.core.errors import NumbaError
+
+from rtloop.laws import ControllerOptions
+from rtloop.laws.conformance import Bench, LawConformance
+from tests.laws.mutants import BROKEN, Good
+
+TESTS = [name for name in vars(LawConformance) if name.startswith("test_")]
+
+
+def outcome(kind: type[Any], name: str) -> str | None:
+    """What a test of the suite says of a law; None where it passes."""
+    suite = LawConformance()
+    suite.law = kind(ControllerOptions(), 1e-4, None)
+    given = {"record_property": lambda *_: None}
+    try:
+        if "bench" in inspect.signature(getattr(suite, name)).parameters:
+            given["bench"] = Bench(suite.law)
+        wanted = inspect.signature(getattr(suite, name)).parameters
+        getattr(suite, name)(**{key: value for key, value in given.items() if key in wanted})
+    except (AssertionError, Failed, ArithmeticError, NumbaError) as error:
+        return str(error) or type(error).__name__
+    return None
+
+
+@pytest.mark.parametrize("name", TESTS)
+def test_a_law_that_keeps_them_all_passes(name):
+    assert outcome(Good, name) is None
+
+
+@pytest.mark.parametrize(("kind", "name"), BROKEN.items(), ids=[kind.__name__ for kind in BROKEN])
+def test_a_mutant_fails_where_it_breaks_its_promise(kind, name):
+    assert outcome(kind, name) is not None

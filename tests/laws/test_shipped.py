@@ -1,0 +1,92 @@
+"""The shipped laws pass the conformance suite, with the options of their examples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.file import load
+from rtloop.laws.conformance import LawConformance
+from rtloop.laws.registry import BUILT_IN
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+from rtloop.laws.shipped.prandtl_ishlinskii import PrandtlIshlinskii
+from tests.law.harness import EQ_4, EXACT, PERIOD_S
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+EXAMPLES = {path.stem.replace("-", "_"): path for path in sorted((DEPLOY / "laws").glob("*.toml"))}
+
+
+def example(path: Path):
+    """The controller of a configuration."""
+    return controller_of(load(path).axes[0], PERIOD_S)
+
+
+def test_every_controller_that_is_shipped_has_an_example():
+    assert {*EXAMPLES, "transfer", "prandtl_ishlinskii"} == set(BUILT_IN)
+    assert all(load(path).axes[0].controller.law.kind == kind for kind, path in EXAMPLES.items())
+
+
+class TestTransfer(LawConformance):
+    law = example(DEPLOY / "paper.toml")
+
+
+class TestPid(LawConformance):
+    law = example(EXAMPLES["pid"])
+
+
+class TestIntegralResonant(LawConformance):
+    law = example(EXAMPLES["integral_resonant"])
+
+
+class TestPositivePosition(LawConformance):
+    law = example(EXAMPLES["positive_position"])
+
+
+class TestRepetitive(LawConformance):
+    law = example(EXAMPLES["repetitive"])
+
+
+class TestPrandtlIshlinskii(LawConformance):
+    law = PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EQ_4), PERIOD_S, None)
+
+
+class TestPrandtlIshlinskiiWithADeadBand(LawConformance):
+    law = PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EXACT), PERIOD_S, None)
+
+
+def resonance(omega: float, damping: float, s: np.ndarray) -> np.ndarray:
+    return omega**2 / (s**2 + 2 * damping * omega * s + omega**2)
+
+
+def reference_responses(hz: np.ndarray) -> dict[str, np.ndarray]:
+    """From error to command, from the equations in continuous time; an error is a position of the other sign."""
+    s = 2j * np.pi * hz
+    lag = 400.0 / (s + 400.0 * 3.0)
+    return {
+        "pid": 150.0 / s + 1e-5 * s / (1 + 2e-4 * s),
+        "integral_resonant": lag * (200.0 / s - 1),
+        "positive_position": 200.0 / s - 0.1 * resonance(2 * np.pi * 595.5, 0.5, s),
+    }
+
+
+@pytest.mark.parametrize("kind", ["pid", "integral_resonant", "positive_position"])
+def test_its_linear_part_is_that_of_its_equation(kind):
+    """Far below the rate; half a tick of hold, or a tick, between the two."""
+    hz = np.geomspace(0.1, 100.0, 50)
+    from rtloop.laws.linearise import linear_part
+
+    linear = linear_part(example(EXAMPLES[kind]))
+    found = linear.system.response(np.exp(2j * np.pi * hz * PERIOD_S))
+    expected = reference_responses(hz)[kind]
+    assert np.max(np.abs(found - expected) / np.abs(expected)) < 2 * np.pi * 100.0 * 1.5 * PERIOD_S
+
+
+def test_the_linear_part_of_c_of_z_is_found_by_running_it():
+    from rtloop.laws.linearise import linearised
+
+    law = example(DEPLOY / "paper.toml")
+    z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 200) * PERIOD_S)
+    np.testing.assert_allclose(linearised(law).system.response(z), law.discrete.system.response(z), rtol=1e-6)
