@@ -20,7 +20,7 @@ from rtloop.errors import ConfigError
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
-from rtloop.recording.replay.laws import NOTHING, Trust
+from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
 
 Progress = Callable[[int], None]
@@ -39,15 +39,14 @@ def replay_on_the_rig(
     """The recorded reference through a law on a simulated rig: those of `other`, or the recorded ones."""
     recording = load(files)
     if other is None:
-        path, law = recording.paths[0], recorded_law(recording, trust)
-        library = Library(path.parent, law.laws)
-        configuration = config.parse(
-            recording.configuration, path.stem, path.parent, f"configuration in {path}", library
-        )
+        path = recording.paths[0]
+        library = Library(path.parent, recorded_laws(recording, trust))
+        source = f"configuration in {path}"
+        configuration = config.parse(recording.configuration, path.stem, path.parent, source, library)
     else:
         configuration = config.load(other)
-        law = _law(configuration, recording)
     driver = _rig(configuration, recording)
+    law = recorded_law(recording, trust) if other is None else _law(configuration, recording)
     return {**_about(recording, other), **resimulate(recording, law, driver, progress)}
 
 

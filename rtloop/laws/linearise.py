@@ -43,14 +43,20 @@ def linearised(law: Controller) -> Sampled:
     scale = np.abs(wide).max(axis=1, keepdims=True, initial=0.0) + 1e-12
     if not np.all(np.abs(wide - narrow) <= AGREEMENT * scale):
         raise ValueError("it is not smooth at rest")
-    n, moving = tick.size, _moving(narrow[:-1])
+    n = tick.size
     a, b, c, d = narrow[:n, :n], narrow[:n, n], narrow[n, :n], float(narrow[n, n])
-    return Sampled(System(a[np.ix_(moving, moving)], b[moving], c[moving], d), law.period_s)
+    kept = np.flatnonzero(_reached(a, b) & _reached(a.T, c))
+    return Sampled(System(a[np.ix_(kept, kept)], b[kept], c[kept], d), law.period_s)
 
 
-def _moving(rows: Real) -> npt.NDArray[np.intp]:
-    """States that depend on something: the others, scratch and settings, are 0 for ever."""
-    return np.flatnonzero(np.any(rows != 0, axis=1))
+def _reached(a: Real, b: Real) -> npt.NDArray[np.bool_]:
+    """States that the input reaches at all, (n,); with Aᵀ and c those that the output sees. Counters are neither."""
+    reached = b != 0
+    while True:
+        wider = reached | np.any((a != 0) & reached, axis=1)
+        if np.array_equal(wider, reached):
+            return reached
+        reached = wider
 
 
 def _derivatives(tick: _Tick, step: float) -> Real:

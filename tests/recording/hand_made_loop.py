@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.ring import claim, publish
+from rtloop.laws.registry import layout_of
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import event_of, recorder_event
 from rtloop.recording.file.format import EVENTS, LAW, chunk_rows
@@ -76,7 +78,7 @@ def make_header(**changes: Any) -> dict[str, Any]:
         "paced": True,
         "ticks_expected": None,
         "configuration": "[loop]\nrate_hz = 10000.0\n# µ\n",
-        "law": {},
+        "law": layout_of(DEFAULT_LAWS).description(),
         "driver": {"kind": "sim"},
         "realtime": {"scheduler": "other", "priority": 0, "mlock": False, "affinity": [0], "kernel": "test"},
         "versions": {},

@@ -54,8 +54,8 @@ def changed(*changes: tuple[str, str]) -> str:
 class RealLoop:
     """The compiled loop of a configuration in virtual time, which waits for nobody."""
 
-    def __init__(self, text: str) -> None:
-        self.prepared = prepare(parse(text, "test", ROOT / "deploy", "test"), paced=False)
+    def __init__(self, text: str, folder: Path = ROOT / "deploy") -> None:
+        self.prepared = prepare(parse(text, "test", folder, "test"), paced=False)
         plan = self.prepared.plan
         self.block = SharedBlock.create(plan.sizes)
         os.set_inheritable(self.block.fd, True)

@@ -1,0 +1,163 @@
+"""A recording with a law of somebody's own: replayed where the law is, refused where it is not, never run by itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import rtloop
+from rtloop.cli import main
+from rtloop.configuration.laws import Library
+from rtloop.law.memory import LawRecords
+from rtloop.laws.registry import LawReference, laws_in
+from rtloop.recording.capture.session import Session
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.replay import replay
+from tests.laws.failing import text as law_text
+from tests.recording.real_loop import Options, RealLoop
+
+CONFIGURATION = """
+[loop]
+rate_hz = 10000
+laws = ["pid"]
+[driver]
+kind = "sim"
+seed = 3
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.0]
+[axis.controller]
+file = "mine.py"
+[axis.reference]
+kind = "sine"
+amplitude = 5.0
+frequency_hz = 20.0
+"""
+TICKS = 12_000
+
+
+def recorded(folder: Path, law: str, change=lambda header: None) -> Path:
+    """A recording of a law from a file that is gone afterwards."""
+    (folder / "mine.py").write_text(law)
+    loop = RealLoop(CONFIGURATION, folder)
+    change(loop.header)
+    path = folder / "run.mcap"
+    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0))
+    for _ in range(4):
+        loop.run(TICKS // 4)
+        session.drain()
+        session.write_due()
+    loop.end()
+    session.finish("finished")
+    (folder / "mine.py").unlink()
+    return path
+
+
+def marker(folder: Path) -> str:
+    """A law whose file leaves a trace when it is run."""
+    return f"import pathlib\npathlib.Path({str(folder / 'was-run')!r}).write_text('run')\n" + law_text()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("law")
+    path = recorded(folder, marker(folder))
+    (folder / "was-run").unlink()
+    return path
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, [str(one) for one in arguments])
+
+
+def test_the_header_holds_the_text_and_its_digest(made: Path):
+    laws = {law["name"]: law for law in rtloop.load(made).header["law"]["laws"]}
+    assert set(laws) == {"prandtl_ishlinskii", "transfer", "pid", "mine"}
+    assert laws["mine"]["text"] == marker(made.parent)
+    assert "text" not in laws["pid"]
+
+
+def test_a_law_that_is_not_here_is_said_and_not_run(made: Path):
+    for arguments in (("replay", made), ("replay", made, "--resimulate")):
+        result = run(*arguments)
+        assert result.exit_code == 66, result.output
+        assert "law 'mine': is not installed here as it ran there" in result.output
+        assert "--trust-recorded-law" in result.output
+    for arguments in (("info", made), ("export", made, "--to", "npz", "--out", made.parent / "out.npz")):
+        assert run(*arguments).exit_code == 0
+    assert not (made.parent / "was-run").exists()
+
+
+def test_a_file_beside_the_recording_is_not_run_either(made: Path):
+    (made.parent / "mine.py").write_text(marker(made.parent).replace("was-run", "was-run-too"))
+    try:
+        assert run("replay", made, "--resimulate").exit_code == 66
+        assert not (made.parent / "was-run-too").exists()
+    finally:
+        (made.parent / "mine.py").unlink()
+
+
+def test_the_recorded_text_is_identical_where_it_is_trusted(made: Path):
+    result = run("replay", made, "--trust-recorded-law", "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert (report["identical"], report["ticks"]) == (True, TICKS)
+
+
+def test_the_law_in_a_file_that_is_named(made: Path, tmp_path: Path):
+    (tmp_path / "law.py").write_text(marker(made.parent))
+    assert run("replay", made, "--law", tmp_path / "law.py").exit_code == 0
+    (tmp_path / "law.py").write_text(marker(made.parent) + "# another\n")
+    result = run("replay", made, "--law", tmp_path / "law.py")
+    assert result.exit_code == 66
+    assert "is not installed here as it ran there" in result.output
+
+
+def tampered(header: dict) -> None:
+    law = next(law for law in header["law"]["laws"] if law["name"] == "mine")
+    law["text"] = law["text"].replace("100.0", "101.0")
+
+
+def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
+    path = recorded(tmp_path, law_text(), tampered)
+    with pytest.raises(RecordingError, match="its recorded text is not the one that ran"):
+        replay(rtloop.load(path), trust=Trust(recorded=True))
+
+
+def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
+    """The text decides: the digest of another one is not that of the recording."""
+    path = recorded(tmp_path, law_text())
+    other = laws_in(law_text().replace("100.0", "99.0"), "other.py")
+    with pytest.raises(RecordingError, match="not installed here"):
+        replay(rtloop.load(path), trust=Trust(other))
+    assert replay(rtloop.load(path), trust=Trust(laws_in(law_text(), "x.py"))).identical
+
+
+def test_a_loop_knows_the_laws_alone_that_it_has_loaded(tmp_path: Path):
+    loaded = (LawReference("transfer"), LawReference("pid"))
+    library = Library(tmp_path, loaded)
+    assert library.find({"kind": "pid"}, "transfer").kind == "pid"
+    (tmp_path / "evil.py").write_text(marker(tmp_path))
+    with pytest.raises(ValueError, match="is no law that the running loop has loaded; it has transfer, pid"):
+        library.find({"file": "evil.py"}, "transfer")
+    assert not (tmp_path / "was-run").exists()
+
+
+def test_records_are_made_of_whole_lines():
+    law = laws_in(law_text(), "law.py")[0]
+    from rtloop.laws.registry import layout_of
+
+    records: LawRecords = layout_of([law]).laws[0]
+    assert records.coefficients.itemsize % 64 == records.state.itemsize % 64 == 0
+    assert np.dtype(records.state).names is not None
