@@ -21,7 +21,7 @@ class Target(NamedTuple):
 
 
 TARGETS = {
-    "law ratio": Target(1.2),
+    "law ratio": Target(1.25),
     "loop ratio": Target(1.3),
     "loop times_real_time": Target(700.0, most=False),
     "recorded times_real_time": Target(100.0, most=False),

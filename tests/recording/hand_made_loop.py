@@ -78,7 +78,7 @@ def make_header(**changes: Any) -> dict[str, Any]:
         "paced": True,
         "ticks_expected": None,
         "configuration": "[loop]\nrate_hz = 10000.0\n# µ\n",
-        "law": layout_of(DEFAULT_LAWS).description(),
+        "law": json.loads(json.dumps(layout_of(DEFAULT_LAWS).description())),
         "driver": {"kind": "sim"},
         "realtime": {"scheduler": "other", "priority": 0, "mlock": False, "affinity": [0], "kernel": "test"},
         "versions": {},

@@ -1,0 +1,130 @@
+"""`rtloop laws`, `rtloop law new`: what there is, and the beginning of one of one's own."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import Any
+
+from rtloop.errors import OutputError
+from rtloop.laws.registry import BUILT_IN, kinds, law_class, reference
+
+LAW = '''"""{title}: what it does, and where its equation is from.
+
+    v = kp e + I,    I' = ki e + (what was applied of v, less v)
+"""
+
+from rtloop.laws import Controller, ControllerOptions
+
+
+class {title}Options(ControllerOptions):
+    kp: float = 0.0
+    ki_per_s: float
+
+
+class {title}(Controller):
+    options_model = {title}Options
+    coefficients = {{"kp": float, "ki": float}}
+    state = {{"integral_um": float}}
+
+    def build(self):
+        return {{"kp": self.options.kp, "ki": self.options.ki_per_s * self.period_s}}
+
+    def output(c, s, told):
+        return c.kp * told.error_um + s.integral_um
+
+    def update(c, s, told):
+        s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um
+
+    def enter(c, s, told):
+        s.integral_um = told.command_um - c.kp * told.error_um
+'''
+TEST = '''"""{title} keeps what the loop relies on: pytest test_{name}.py"""
+
+from {name} import {title}, {title}Options
+
+from rtloop.laws.conformance import LawConformance
+
+
+class Test{title}(LawConformance):
+    law = {title}({title}Options(ki_per_s=150.0), 1e-4, None)
+'''
+EXAMPLE = """# {title} on the simulated rig: rtloop check {name}.toml; rtloop run {name}.toml --duration 2
+
+[loop]
+rate_hz = 10000
+# laws = ["pid"]               # further laws, to be swapped in while the loop runs
+
+[driver]
+kind = "sim"
+
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+
+[[axis]]
+name = "x"
+
+# The rig's actuator; yours: rtloop identify hysteresis
+[axis.feedforward]
+thresholds_v = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
+weights_um_per_v = [
+    2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09,
+]
+
+[axis.controller]
+file = "{name}.py"
+ki_per_s = 150.0
+
+# The rig's dynamics, for margins; yours: rtloop identify dynamics
+[axis.model]
+gain = -20.7
+numerator = [
+    [1.0, -1.22e5], [1.0, 2.99e4], [1.0, -2.776e4], [1.0, -1.07e4], [1.0, 1430.0], [1.0, 4.3e4, 3.2e9],
+]
+denominator = [[1.0, 925.0, 4.59e5], [1.0, 55.0, 1.4e7], [1.0, 1.54e4, 4.0e9], [1.0, 964.0, 3.95e9]]
+
+[axis.reference]
+kind = "steps"
+levels = [20.0, 0.0, -20.0, 0.0]
+dwell_s = 0.2
+"""
+
+
+def known_laws() -> list[dict[str, Any]]:
+    """Every registered kind: where it belongs, what it is, or the `problem` that keeps it from being used."""
+    found = []
+    for kind, where in kinds().items():
+        entry: dict[str, Any] = {
+            "kind": kind,
+            "slot": None,
+            "about": None,
+            "shipped": kind in BUILT_IN,
+            "problem": None,
+        }
+        try:
+            law = law_class(reference(kind))
+            about = next(iter((law.__doc__ or "").strip().splitlines()), None)
+            entry |= {"slot": law.records().slot, "about": about}
+        except ValueError as error:
+            entry["problem"] = str(error)
+        found.append({**entry, "shipped": kind in BUILT_IN, "defined_in": where})
+    return found
+
+
+def new_law(name: str, folder: Path) -> list[Path]:
+    """Write a law, its test and a configuration; the files. Raises OutputError for one that is there already."""
+    title = "".join(part.capitalize() for part in name.split("_"))
+    texts = {f"{name}.py": LAW, f"test_{name}.py": TEST, f"{name}.toml": EXAMPLE}
+    paths = [folder / file for file in texts]
+    for path in paths:
+        if path.exists():
+            raise OutputError(f"{path}: is there already; it is not overwritten", errno.EEXIST)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in zip(paths, texts.values(), strict=True):
+            path.write_text(text.format(title=title, name=name), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: {error.strerror}", error.errno or 0) from None
+    return paths

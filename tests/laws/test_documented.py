@@ -1,0 +1,89 @@
+"""The way of docs/laws.md, gone as it is written, in an empty folder outside of the project."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "laws.md").read_text()
+COMMANDS = re.findall(r"^    \$ (rtloop .*)$", PAGE, re.MULTILINE)
+FILE = re.compile(r"^    # (\w+\.py)\n((?:    .*\n|\n)+)", re.MULTILINE)
+MOST_LINES = 25
+PATIENCE_S = 120.0
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path
+
+
+def environment(folder: Path) -> dict[str, str]:
+    (folder / "run").mkdir(exist_ok=True)
+    return os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}", "RUNTIME_DIRECTORY": str(folder / "run")}
+
+
+def ran(folder: Path, command: str) -> str:
+    """What a command of the page prints; it ends well."""
+    words = [sys.executable, "-m", *command.split()]
+    done = subprocess.run(words, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, (command, done.stdout, done.stderr)
+    return done.stdout
+
+
+def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
+    offline, live = [one for one in COMMANDS if " ctl " not in one and "serve" not in one], COMMANDS[-3:]
+    assert [one.split()[1] for one in offline] == ["laws", "law", "check", "run", "replay"]
+    said = [ran(folder, command) for command in offline]
+    assert "integral_resonant" in said[0]
+    assert "law 'damping', linear about its rest, of order 1" in said[2]
+    assert "identical" in said[4]
+    example = folder / "damping.toml"
+    example.write_text(example.read_text().replace("# laws = ", "laws = "))
+    (folder / "other.toml").write_text(example.read_text().replace('file = "damping.py"', 'kind = "pid"'))
+    service = subprocess.Popen(
+        [sys.executable, "-m", *live[0].removesuffix(" &").split()], cwd=folder, env=environment(folder)
+    )
+    try:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while state(folder) != "running":
+            assert time.monotonic() < deadline_s
+            time.sleep(0.5)
+        ticks = [json.loads(ran(folder, command))["tick"] for command in live[1:]]
+    finally:
+        service.terminate()
+        assert service.wait(60.0) == 0
+    assert ticks == sorted(ticks)
+    newest = max((folder / "recordings").glob("*.mcap"), key=lambda path: path.stat().st_mtime)
+    report = json.loads(ran(folder, f"rtloop replay {newest} --law damping.py --json"))
+    assert report["identical"]
+    assert report["ticks"] > ticks[-1]
+
+
+def state(folder: Path) -> str | None:
+    words = [sys.executable, "-m", "rtloop", "ctl", "status"]
+    done = subprocess.run(words, cwd=folder, env=environment(folder), capture_output=True, text=True)
+    return json.loads(done.stdout)["state"] if done.returncode == 0 else None
+
+
+def test_the_pages_law_is_the_new_one_and_fits_on_a_screen(folder: Path):
+    ran(folder, "rtloop law new damping")
+    files = {name: "\n".join(line[4:] for line in text.splitlines()).strip() for name, text in FILE.findall(PAGE)}
+    for name, text in files.items():
+        written = (folder / name).read_text()
+        assert written.strip().endswith(text), name
+    lines = [line for line in files["damping.py"].splitlines() if line.strip()]
+    assert len(lines) <= MOST_LINES
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_damping.py"],
+        cwd=folder, env=environment(folder), capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert re.search(r"\d+ passed", done.stdout), done.stdout
+    assert "failed" not in done.stdout
