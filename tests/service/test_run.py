@@ -146,7 +146,7 @@ def test_a_killed_recorder_is_replaced_and_nothing_is_lost(tmp_path: Path) -> No
     assert "recorder died" in err
     assert "was replaced" in err
     assert len(summary["recordings"]) == 2
-    assert (summary["complete"], summary["ticks_lost"]) == (True, 0)
+    assert (summary["complete"], summary["ticks_lost"]) == (True, 0), (summary["problems"], err)
     recording = rtloop.load(summary["recordings"])
     assert np.array_equal(recording["tick"], np.arange(60_000))
     verdict = replay(recording)
