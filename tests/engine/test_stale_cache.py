@@ -19,13 +19,11 @@ PROGRAM = """
 import json
 import numpy as np
 from rtloop.law.law import set_mode
-from rtloop.law.memory import LawMemory
-from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import LawReference, layout_of
+from rtloop.law.layout import FUNCTIONS
+from rtloop.law.memory import LawMemory, Layout
 
-laws = [LawReference("prandtl_ishlinskii"), LawReference("transfer")]
-layout, coefficients = layout_of(laws), np.zeros(1, layout_of(laws).coefficients)
-law = LawMemory.at_rest(layout, functions_of(laws), coefficients)
+layout = Layout(())
+law = LawMemory.at_rest(layout, np.zeros(0, FUNCTIONS), np.zeros(1, layout.coefficients))
 set_mode(law.law, 1, False)
 hits = sum(set_mode.stats.cache_hits.values())
 print(json.dumps({"tap_index": int(law.axes["tap_index"][0]), "from_cache": hits == 1}))
