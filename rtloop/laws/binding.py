@@ -28,24 +28,35 @@ MAX_CHARACTERS = 300
 
 def functions_of(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
     """FUNCTIONS records of these laws, compiled or loaded. Raises ValueError for one that cannot be compiled."""
-    found = np.zeros(len(laws), FUNCTIONS)
-    for one, reference in zip(found, laws, strict=True):
-        law = law_class(reference)
-        told = from_dtype(CONTROL) if law.axes else types.float64
-        returns = {"output": types.float64, "update": types.void if law.axes else types.float64, "enter": types.void}
-        for name, result in returns.items():
-            function = getattr(law, name)
-            if function is not None:
-                one[name] = _address(law, name, function, told, result)
+    return np.concatenate([np.zeros(0, FUNCTIONS), *map(_bound, laws)])
+
+
+@cache
+def _bound(reference: LawReference) -> npt.NDArray[Any]:
+    """One law, shape (1,): compiled and looked through once in a process, however often it is asked for."""
+    law, found = law_class(reference), np.zeros(1, FUNCTIONS)
+    for name, signature in signatures_of(law).items():
+        found[name] = _address(law, name, signature)
     return found
 
 
-def _address(law: type[Law], name: str, function: Callable[..., Any], told: Any, result: Any) -> int:
+def signatures_of(law: type[Law]) -> dict[str, Any]:
+    """What each function that a law has takes and returns, for the compiler."""
     keeps = law.records()
+    told = from_dtype(CONTROL) if law.axes else types.float64
+    returns = {"output": types.float64, "update": types.void if law.axes else types.float64, "enter": types.void}
+    return {
+        name: result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
+        for name, result in returns.items()
+        if getattr(law, name) is not None
+    }
+
+
+def _address(law: type[Law], name: str, signature: Any) -> int:
+    function = getattr(law, name)
     if UNCOMPILED:
-        return native_address(_from_addresses(function, keeps, law.axes), None)
+        return native_address(_from_addresses(function, law.records(), law.axes), None)
     kernel = function if law.shipped else _kernel(function)
-    signature = result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
     try:
         address = native_address(kernel, signature)
     except Exception as error:  # whatever the compiler comes upon
@@ -58,6 +69,7 @@ def _address(law: type[Law], name: str, function: Callable[..., Any], told: Any,
 
 @cache
 def _kernel(function: Callable[..., Any]) -> Any:
+    """Compiled code lives as long as its kernel, which is kept for as long as somebody may call its address."""
     return checked(function)
 
 

@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba import from_dtype, types
 
 from rtloop.hil.native.compiled import checked
 from rtloop.law.layout import CONTROL
 from rtloop.law.memory import records
+from rtloop.laws.binding import signatures_of
 from rtloop.laws.contract import Controller, Law, record_of
+from rtloop.laws.linearise import as_written
 from rtloop.laws.purity import foreign_calls
 
 TICKS, SEED = 400, 7
@@ -133,16 +134,10 @@ class Bench:
         self.state: Any = records(keeps.state, 1)
         self._told: Any = records(CONTROL, 1)
         self._kernels: dict[str, Any] = {}
-        told = from_dtype(CONTROL) if keeps.axes else types.float64
-        returns = {"output": types.float64, "update": types.void if keeps.axes else types.float64, "enter": types.void}
-        self._signatures: dict[str, Any] = {}
-        for name, result in returns.items():
-            written = getattr(type(law), name)
-            if written is None:
-                continue
-            self._signatures[name] = result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
-            plain = getattr(written, "py_func", written)
-            self._kernels[name] = _compiled(plain, self._signatures[name]) if compiled else plain
+        self._signatures = signatures_of(type(law))
+        for name, signature in self._signatures.items():
+            plain = as_written(getattr(type(law), name))
+            self._kernels[name] = _compiled(plain, signature) if compiled else plain
 
     def _call(self, name: str, told: Any) -> Any:
         with np.errstate(all="ignore"):

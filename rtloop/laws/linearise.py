@@ -79,7 +79,7 @@ class _Tick:
         self._state = records(keeps.state, 1)
         self._fields = [name for name in keeps.state.names or () if keeps.state[name].base == np.float64]
         self._fields = [name for name in self._fields if name not in ("reserved", "scratch")]
-        self._output, self._update = _plain(type(law).output), _plain(type(law).update)
+        self._output, self._update = as_written(type(law).output), as_written(type(law).update)
         self.size = sum(int(np.prod(keeps.state[name].shape)) for name in self._fields)
 
     def __call__(self, states: Real, error_um: float) -> Real:
@@ -98,6 +98,6 @@ class _Tick:
         return np.concatenate([*(self._state[name].reshape(-1) for name in self._fields), [command_um]])
 
 
-def _plain(function: Any) -> Callable[..., Any]:
+def as_written(function: Any) -> Callable[..., Any]:
     """What a kernel was compiled from."""
     return getattr(function, "py_func", function)

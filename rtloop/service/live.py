@@ -153,7 +153,11 @@ class LiveLaw:
     def _validated_axis(self, raw: Mapping[str, Any]) -> AxisOptions:
         """An axis with the laws that the loop has loaded. Raises ConfigError."""
         configuration = self.prepared.configuration
-        return _validated_axis(raw, Library(configuration.folder, configuration.laws))
+        library = Library(configuration.folder, configuration.laws)
+        try:
+            return AxisOptions.model_validate(raw, context={"library": library})
+        except ValidationError as error:
+            raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
         """Build the configuration with another axis, verify it, swap its coefficients."""
@@ -243,13 +247,6 @@ class LiveLaw:
 def _unsuitable(message: str) -> ConfigError:
     """The error of a request that could be granted in no state."""
     return ConfigError("request", [message])
-
-
-def _validated_axis(raw: Mapping[str, Any], library: Library) -> AxisOptions:
-    try:
-        return AxisOptions.model_validate(raw, context={"library": library})
-    except ValidationError as error:
-        raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
 
 
 def _with_axis(configuration: Configuration, number: int, axis: AxisOptions) -> Configuration:
