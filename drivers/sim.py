@@ -41,9 +41,7 @@ def sim_write(context, values):
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
-    out = carray(values, rig.count)
-    for i in range(rig.count):
-        advance(coefficients[i], state[i], out[i])
+    advance(coefficients, state, carray(values, rig.count))
     return 0
 
 

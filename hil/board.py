@@ -181,6 +181,7 @@ def _run(
     count,
 ):
     """`count` periods of the board's fixed grid; periods that a stall swallowed still move the rig. Next index."""
+    actuator_v = np.zeros(coefficients.shape[0])
     for _ in range(count):
         wake_ns = start_ns + np.int64(index * period_ns)
         now_ns = monotonic_ns(timespec)
@@ -207,7 +208,8 @@ def _run(
         for i in range(coefficients.shape[0]):
             volts = seen[i].last_v if fault == STUCK_OUTPUT else dac_codes[i] * LSB_V
             _witness(seen[i], volts, look_ns, period_ns)
-            advance(coefficients[i], state[i], volts)
+            actuator_v[i] = volts
+        advance(coefficients, state, actuator_v)
         index += 1
     return index
 

@@ -181,6 +181,9 @@ class RigOptions(Options):
     plants: dict[str, PlantOptions] = {}
     seed: int = Field(default=0, ge=0)
     """Of all noise. Each axis has a stream of its own, by its name."""
+    coupling: dict[str, dict[str, float]] = {}
+    """Of an axis, and of another one that moves it: µm of its own displacement per µm of the other's, before the
+    dynamics. None: each axis moves alone."""
     latency_ticks: int = Field(default=0, ge=0, le=MAX_LATENCY)
     """Periods more than the one that a held output always takes: 0 is written in tick k, seen from k + 1."""
 

@@ -1,7 +1,10 @@
 """The rig: coefficients and state of every axis as fixed records, and the two kernels that move them.
 
-    sample    at the instant of tick k: what the ADC reads
-    advance   from tick k to k + 1, the DAC at the value written in tick k
+    sample    at the instant of tick k: what the ADC of an axis reads
+    advance   of all axes from tick k to k + 1, the DACs at the values written in tick k
+
+Axes may be coupled, as those of a stage are whose guides give way: what drives the dynamics of axis i is its own
+displacement and a share of each other one's, y_i + Σ k_ij y_j.
 
 One record has room for every rig that the options allow, so that the kernels compile once. The rig holds no clock
 and no thread; time is the number of calls of `advance`.
@@ -20,9 +23,18 @@ from rtloop.hil.native.compiled import jit
 from rtloop.hil.options import DynamicsOptions, PlantOptions, RigOptions
 from rtloop.hil.stages import converters, creep, disturbance, dynamics, hysteresis, noise, sensor
 
+MAX_COUPLED = 16
+"""Axes of a rig in which any are coupled."""
 _STAGES = (converters, hysteresis, creep, disturbance, dynamics, sensor, noise)
 
-COEFFICIENTS = np.dtype([field for stage in _STAGES for field in stage.COEFFICIENTS], align=True)
+COEFFICIENTS = np.dtype(
+    [
+        *(field for stage in _STAGES for field in stage.COEFFICIENTS),
+        ("coupled_count", "i8"),  # how many axes of the rig may move this one: all or none
+        ("coupling", "f8", (MAX_COUPLED,)),
+    ],
+    align=True,
+)
 """What an axis is; no kernel writes it."""
 
 STATE = np.dtype(
@@ -62,17 +74,35 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
         state["cosine_um"][i] = plant.disturbance.sine_um
         if plant.hysteresis.history_v:
             _rest_after(plant.hysteresis.history_v, coefficients[i], state[i])
+    _couple(options, axes, coefficients)
+    for i in range(len(axes)):
+        if (input_um := _moved_um(coefficients, state, i)) != 0:
+            dynamics.settle(coefficients[i], state[i], input_um)
     return coefficients, state
 
 
+def _couple(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
+    """Note what moves what. Raises ValueError for a name that is no axis, and for more axes than may be coupled."""
+    for name, others in options.coupling.items():
+        for other in (name, *others):
+            if other not in axes:
+                raise ValueError(f"coupling.{name}: {other!r} is no axis; there are {', '.join(axes) or 'none'}")
+        if name in others:
+            raise ValueError(f"coupling.{name}.{name}: an axis moves itself by 1 µm per µm; other axes are allowed")
+        if len(axes) > MAX_COUPLED:
+            raise ValueError(f"coupling: {len(axes)} axes; at most {MAX_COUPLED} may be coupled")
+        coefficients["coupled_count"][axes.index(name)] = len(axes)
+        for other, share in others.items():
+            coefficients["coupling"][axes.index(name), axes.index(other)] = share
+
+
 def _rest_after(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
-    """Leave the axis as the drives `history_v` and then a long rest at 0 V leave it."""
+    """Leave the axis's actuator as the drives `history_v` and then a long rest at 0 V leave it."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
         displacement_um = hysteresis.step(coefficients, state, drive_v)
     state.lags_um[:] = displacement_um
     state.hysteresis_um = creep.step(coefficients, state, displacement_um)
-    dynamics.settle(coefficients, state, state.hysteresis_um)
 
 
 def _coefficients_of(plant: PlantOptions, period_s: float) -> dict[str, object]:
@@ -137,7 +167,20 @@ def sample(coefficients, state):
 
 @jit
 def advance(coefficients, state, dac_v):
-    """One period with `dac_v` [V] written to the DAC at its beginning; NaN holds what was written before."""
-    actuator_v = converters.drive(coefficients, state, dac_v)
-    state.hysteresis_um = creep.step(coefficients, state, hysteresis.step(coefficients, state, actuator_v))
-    dynamics.step(coefficients, state, state.hysteresis_um + disturbance.step(coefficients, state))
+    """One period of all axes, `dac_v` [V] written to their DACs at its beginning; NaN holds what was written before."""
+    for i in range(coefficients.shape[0]):
+        actuator_v = converters.drive(coefficients[i], state[i], dac_v[i])
+        displacement_um = hysteresis.step(coefficients[i], state[i], actuator_v)
+        state[i].hysteresis_um = creep.step(coefficients[i], state[i], displacement_um)
+    for i in range(coefficients.shape[0]):
+        input_um = _moved_um(coefficients, state, i) + disturbance.step(coefficients[i], state[i])
+        dynamics.step(coefficients[i], state[i], input_um)
+
+
+@jit
+def _moved_um(coefficients, state, i):
+    """Displacement of axis `i`, with what the others add to it [µm]."""
+    moved_um = state[i].hysteresis_um
+    for j in range(coefficients[i].coupled_count):
+        moved_um += coefficients[i].coupling[j] * state[j].hysteresis_um
+    return moved_um

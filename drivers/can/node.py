@@ -139,7 +139,7 @@ def serve(
 @jit
 def _run(coefficients, state, drive_v, sample_v, periods):
     """The rig after `periods` of its grid with the outputs held, and what its converters read then."""
+    for _ in range(periods):
+        advance(coefficients, state, drive_v)
     for i in range(coefficients.shape[0]):
-        for _ in range(periods):
-            advance(coefficients[i], state[i], drive_v[i])
         sample_v[i] = sample(coefficients[i], state[i])

@@ -51,7 +51,7 @@ class Rig:
         """The rig driven from rest."""
         coefficients, state = build_rig(self.options, ["x"], period_s)
         adc_v = np.empty(drive_v.size)
-        _record(coefficients[0], state[0], drive_v, adc_v)
+        _record(coefficients, state, drive_v, adc_v)
         position = SENSOR_UM_PER_V * adc_v
         return Measured("rig", period_s, drive_v, position, position, True, "", "")
 
@@ -169,8 +169,8 @@ def tightness(rig: Rig, actuator: PlayModel, error_um: float) -> tuple[float, fl
 @jit
 def _record(coefficients, state, drive_v, adc_v):
     for k in range(drive_v.size):
-        adc_v[k] = sample(coefficients, state)
-        advance(coefficients, state, drive_v[k])
+        adc_v[k] = sample(coefficients[0], state[0])
+        advance(coefficients, state, drive_v[k : k + 1])
 
 
 @jit

@@ -28,7 +28,7 @@ def excitation(hz: float, damping: float, delay_ticks: int, drive_v: np.ndarray)
     )
     coefficients, state = build_rig(rig, ["x"], PERIOD_S)
     adc_v = np.empty(drive_v.size)
-    _record(coefficients[0], state[0], drive_v, adc_v)
+    _record(coefficients, state, drive_v, adc_v)
     return Excitation("rig", GAIN_UM_PER_V * drive_v, 10.0 * adc_v, PERIOD_S)
 
 

@@ -31,10 +31,10 @@ class Run(NamedTuple):
 @jit
 def _run(coefficients, state, drive_v, adc_v, true_um, hysteresis_um):
     for k in range(drive_v.size):
-        adc_v[k] = sample(coefficients, state)
-        true_um[k] = state.true_position_um
-        hysteresis_um[k] = state.hysteresis_um
-        advance(coefficients, state, drive_v[k])
+        adc_v[k] = sample(coefficients[0], state[0])
+        true_um[k] = state[0].true_position_um
+        hysteresis_um[k] = state[0].hysteresis_um
+        advance(coefficients, state, drive_v[k : k + 1])
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +45,7 @@ def run() -> Callable[..., Run]:
         drive = np.asarray(drive_v, dtype=float)
         coefficients, state = build_rig(options or RigOptions(), ["x"], period_s)
         signals = Run(*(np.empty(drive.size) for _ in Run._fields))
-        _run(coefficients[0], state[0], drive, *signals)
+        _run(coefficients, state, drive, *signals)
         return signals
 
     return run_rig

@@ -34,9 +34,8 @@ plant = PlantOptions(
 coefficients, state = build_rig(RigOptions(plant=plant, latency_ticks=2, seed=5), ["x", "y"], 1e-4)
 out = []
 for k in range(400):
-    for i in range(2):
-        out.append(float(sample(coefficients[i], state[i])))
-        advance(coefficients[i], state[i], float("nan") if k == 77 else (k * 37 % 500) / 25.0 - 10.0)
+    out += [float(sample(coefficients[i], state[i])) for i in range(2)]
+    advance(coefficients, state, np.full(2, float("nan") if k == 77 else (k * 37 % 500) / 25.0 - 10.0))
 print(hasattr(sample, "py_func"), hashlib.sha256(np.array(out).tobytes() + state.tobytes()).hexdigest())
 """
 
@@ -86,7 +85,7 @@ def test_disturbance_is_added_after_the_hysteresis(ideal):
     coefficients, state = build_rig(ideal(), ["x"], 1e-4)
     state[0].disturbance_um = 2.0
     for _ in range(10_000):
-        advance(coefficients[0], state[0], 3.0)
+        advance(coefficients, state, np.array([3.0]))
     sample(coefficients[0], state[0])
     assert state[0].hysteresis_um == 3.0
     # D(0) of eq (5).
@@ -114,7 +113,7 @@ def test_nan_leaves_the_rig_as_holding_does():
     rigs = [build_rig(RigOptions(), ["x"], 1e-4) for _ in range(2)]
     for (coefficients, state), value in zip(rigs, (float("nan"), 5.0), strict=True):
         for drive in (5.0, value, value, 1.0):
-            advance(coefficients[0], state[0], drive)
+            advance(coefficients, state, np.array([drive]))
     assert rigs[0][1].tobytes() == rigs[1][1].tobytes()
 
 
@@ -139,7 +138,7 @@ def test_axes_are_independent():
     assert coefficients[0].weights_um_per_v[0] == 2.3834
     assert coefficients[1].weights_um_per_v[0] == 2.55
     before = state[1].tobytes()
-    advance(coefficients[0], state[0], 10.0)
+    advance(coefficients, state, np.array([10.0, np.nan]))
     assert state[1].tobytes() == before
     assert state[0].tobytes() != before
 
@@ -149,7 +148,7 @@ def test_kernels_leave_the_coefficients_alone():
     before = coefficients.tobytes()
     for k in range(100):
         sample(coefficients[0], state[0])
-        advance(coefficients[0], state[0], k / 10)
+        advance(coefficients, state, np.array([k / 10]))
     assert coefficients.tobytes() == before
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rtloop.drivers.base import Channel, Facts, Wiring
 from rtloop.drivers.python import PythonDriver
 from rtloop.hil.options import RigOptions
@@ -18,17 +20,16 @@ class BenchCard(PythonDriver):
         return Facts((Channel("in"),), (Channel("out"),), observed=("x_true_position_um",), max_rate_hz=20_000.0)
 
     def start(self) -> None:
-        coefficients, state = build_rig(self.options, ["x"], 1.0 / self.rate_hz)
-        self.rig = coefficients[0], state[0]
+        self.coefficients, self.state = build_rig(self.options, ["x"], 1.0 / self.rate_hz)
 
     def read(self) -> list[float]:
-        return [sample(*self.rig)]
+        return [sample(self.coefficients[0], self.state[0])]
 
     def observe(self) -> list[float]:
-        return [self.rig[1].true_position_um]
+        return [self.state[0].true_position_um]
 
     def write(self, volts: list[float]) -> None:
-        advance(*self.rig, volts[0])
+        advance(self.coefficients, self.state, np.array(volts))
 
     def stop(self) -> None:
         pass
