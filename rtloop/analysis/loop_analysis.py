@@ -56,7 +56,7 @@ class LoopAnalysis:
 
 def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
     """C(s) and D(s) without sampling or delay. Raises ValueError for a plant with direct feedthrough."""
-    return _analyse(continuous_loop(controller, plant), 0, times_s)
+    return analyse(continuous_loop(controller, plant), 0, times_s)
 
 
 def analyse_discrete(
@@ -67,10 +67,11 @@ def analyse_discrete(
     No delay is the least there can be: a command computed from a sample shows in the next one. Raises ValueError for
     a plant with direct feedthrough.
     """
-    return _analyse(discrete_loop(controller, plant, delay_ticks), delay_ticks, times_s)
+    return analyse(discrete_loop(controller, plant, delay_ticks), delay_ticks, times_s)
 
 
-def _analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float]) -> LoopAnalysis:
+def analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
+    """A loop that is put together already."""
     continuous = loop.period_s is None
     poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]
     with_margins = margins(loop)._asdict()

@@ -31,7 +31,7 @@ def margins(loop: Loop) -> Margins:
     crossed = crossings(loop)
     phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossed]
     gain, gain_hz = _gain_margin(loop, hz, response)
-    peak, peak_hz = _highest(loop.sensitivity, hz)
+    peak, peak_hz = highest(loop.sensitivity, hz)
     crossover = crossed[0] if crossed else math.nan
     return Margins(crossover, min(phases, default=math.inf), gain, gain_hz, peak, peak_hz)
 
@@ -60,7 +60,7 @@ def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
     return [(float(hz[i]), float(hz[i + 1])) for i in at]
 
 
-def _highest(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
+def highest(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
     """Maximum of `function` and where: every peak of the grid that comes near the highest is refined by itself."""
     values = function(hz)
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1

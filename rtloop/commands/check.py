@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +13,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rtloop.analysis.coupled_loop import TogetherMargins
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
 from rtloop.commands.design import verified
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.cautions import cautions
+from rtloop.configuration.checks import AxisCheck, Together
 from rtloop.configuration.file import load
-from rtloop.configuration.prepare import AxisCheck, Prepared, prepare
+from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.verification.text import answer, span
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
@@ -86,7 +90,9 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) ->
     if check.law is None:
         console.print("no controller: feedforward, raw and off only")
         return
-    if check.discrete is not None and check.comparison is not None:
+    if check.together is not None:
+        console.print(_described_together(check.together))
+    elif check.discrete is not None and check.comparison is not None:
         comparison = check.comparison
         console.print(
             f"C(z) by {check.discrete.method}, order {check.discrete.order}: differs from C(s) by at most "
@@ -101,21 +107,50 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) ->
     found = {heading: (key, one) for heading, (key, one) in found.items() if one is not None}
     if not found:
         return
-    table = Table("on the model", *found, box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for label, show in ROWS:
+    heading = "on the model" if check.together is None else "on the models, broken alone"
+    table = Table(heading, *found, box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for label, show in ROWS if check.together is None else ROWS[:-1]:
         table.add_row(label, *(show(one) for _, one in found.values() if one is not None))
     if shifts:
         table.add_row("resonance may move by", *(span(shifts[key]) for key, _ in found.values()))
     console.print(table)
+    if check.together is not None and check.together.margins is not None and check.together.place == 0:
+        console.print(_table_together(check.together.axes, check.together.margins))
+
+
+def _described_together(found: Together) -> str:
+    """Whose controller it is, and which."""
+    if found.place > 0:
+        return f"shares the controller of axis {found.axes[0]}"
+    order = "" if found.linear is None else f", linear about its rest, of order {found.linear.order}"
+    return f"law {found.law.kind!r} of axes {', '.join(found.axes)}{order}"
+
+
+def _table_together(axes: Sequence[str], margins: TogetherMargins) -> Table:
+    """What all axes of a controller together bear."""
+    table = Table(f"{' and '.join(axes)} together", "as they run", box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    table.add_row("largest σ(S)", f"{margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz")
+    table.add_row("largest σ(T)", f"{margins.max_tracking:.3f}")
+    for label, disk, hz in (
+        ("disk margin, sensors", margins.disk_margin, margins.disk_margin_hz),
+        ("disk margin, commands", margins.command_disk_margin, margins.command_disk_margin_hz),
+    ):
+        low, high = (1 - disk / 2) / (1 + disk / 2), (1 + disk / 2) / (1 - disk / 2) if disk < 2 else math.inf
+        phase_deg = math.degrees(2 * math.atan(disk / 2))
+        table.add_row(label, f"{disk:.3f} at {hz:.1f} Hz: gains × {low:.2f} … {high:.2f}, phases ± {phase_deg:.1f}°")
+    return table
 
 
 def _shifts(check: AxisCheck) -> dict[str, Range]:
     """Shift of the model's resonance that the loop survives."""
-    if check.linear is None or check.plant is None or check.running is None:
+    if check.plant is None or check.running is None:
         return {}
     resonance = changes(check.plant).get("resonance")
     if resonance is None:
         return {}
+    if check.together is not None:
+        return {"running": until_unstable(check.together.alone, check.plant, resonance)}
+    assert check.linear is not None
     running = {"running": until_unstable(maker(check.linear, check.running.delay_ticks), check.plant, resonance)}
     if check.controller is None:
         return running
@@ -142,12 +177,17 @@ def _report(
                 "comparison": check.comparison and check.comparison.as_dict(),
                 "continuous": _analysis(check.continuous),
                 "running": _analysis(check.running),
+                "together": check.together and _together(check.together),
                 "missed": None if (found := judged[check.name]) is None else [row.label for row in found.missed],
                 "resonance_shift_tolerated_percent": {name: list(value) for name, value in shifts[check.name].items()},
             }
             for check in prepared.checks
         ],
     }
+
+
+def _together(found: Together) -> dict[str, Any]:
+    return {"axes": list(found.axes), "margins": found.margins and found.margins.as_dict()}
 
 
 def _analysis(analysis: LoopAnalysis | None) -> dict[str, Any] | None:

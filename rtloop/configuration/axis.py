@@ -18,6 +18,8 @@ class ModelOptions(TransferOptions):
 
     delay_ticks: int = Field(default=0, ge=0, le=16)
     """Periods of delay beyond the one that a held output always takes."""
+    coupling: dict[str, float] = Field(default_factory=dict)
+    """Of another axis: µm that this one is moved, before its dynamics, per µm that the other one is commanded."""
 
 
 class PrefilterOptions(Options):

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import ChannelOptions, Configuration
-from rtloop.configuration.prepare import AxisCheck, Prepared
+from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, volts
 from rtloop.engine.messages import ALL_AXES, Kind
 from rtloop.hil.options import RigOptions

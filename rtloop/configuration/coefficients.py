@@ -7,22 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptions, PrefilterOptions
+from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptions, ModelOptions, PrefilterOptions
 from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
+from rtloop.hil.modal import Real
 from rtloop.law.layout import Records
 from rtloop.law.memory import records
 from rtloop.laws.contract import Controller, Law, record_of
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import LawOptions
 from rtloop.laws.registry import LawReference, law_class, layout_of
+from rtloop.linear.together import SampledTogether
 
 
-def controller_of(axis: AxisOptions, period_s: float) -> Controller | None:
-    """The controller of an axis, not yet built."""
+def controller_of(axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()) -> Controller | None:
+    """The controller of an axis, not yet built; `models` are those of all its axes, where it has several."""
     if axis.controller is None:
         return None
-    return _law_of(axis.controller, DEFAULT_LAWS[1])(axis.controller, period_s, axis.model)
+    model = tuple(models) if len(models) > 1 else axis.model
+    return _law_of(axis.controller, DEFAULT_LAWS[1])(axis.controller, period_s, model)
 
 
 def _law_of(options: LawOptions, default: LawReference) -> Any:
@@ -39,20 +42,24 @@ def axis_coefficients(
     output: Channel,
     period_s: float,
     enable: bool = False,
+    place: int = 0,
 ) -> Records:
     """Coefficients (1,) of one axis in a loop that knows `laws`; `enable` where the loop has an enable input.
 
+    Of several axes that share a `controller` it is number `place`, and the first one has its records.
     Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
     """
     coefficients = records(layout_of(laws).coefficients, 1)
     feedforward = _law_of(axis.feedforward, DEFAULT_LAWS[0])(axis.feedforward, period_s, axis.model)
-    fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v, "controller_axes": 1}
+    fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v}
     fields |= _law("feedforward", feedforward, laws.index(axis.feedforward.law or DEFAULT_LAWS[0]))
-    if controller is None or axis.controller is None:
+    if controller is None or place > 0:
         fields["controller_law"] = laws.index(DEFAULT_LAWS[1])
     else:
-        fields |= _law("controller", controller, laws.index(axis.controller.law or DEFAULT_LAWS[1]))
-        fields["resting_error"] = [_resting_error(controller)]
+        fields |= _law("controller", controller, laws.index(controller.options.law or DEFAULT_LAWS[1]))
+    if controller is not None:
+        fields["resting_error"] = _resting_errors(controller)[place]
+    fields["controller_axes"] = 0 if place > 0 else 1 if controller is None else controller.count
     fields |= _prefilter(axis.prefilter)
     fields |= limit_fields(axis.limits, output, period_s)
     fields |= interlock_fields(axis.interlocks, enable)
@@ -61,17 +68,20 @@ def axis_coefficients(
     return coefficients
 
 
-def _resting_error(controller: Controller) -> float:
-    """Error per command at which a controller stays where it is: 1/C(1). 0 with an integrator, where C hardly passes
-    0 Hz, and where nothing linear is known of it.
+def _resting_errors(controller: Controller) -> Real:
+    """Errors per command at which a controller stays where it is, C(1)⁻¹, (axes, axes). 0 with an integrator, where C
+    hardly passes 0 Hz, and where nothing linear is known of it.
     """
+    nothing: Real = np.zeros((controller.count, controller.count))
     try:
         linear = linear_part(controller)
     except ValueError:
-        return 0.0
-    response = linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))
-    at_rest, largest = abs(linear.dc_gain), np.abs(response).max(initial=0.0)
-    return 1 / linear.dc_gain if at_rest > 1e-3 * largest else 0.0
+        return nothing
+    largest = np.abs(linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))).max(initial=0.0)
+    if not isinstance(linear, SampledTogether):
+        return nothing + 1 / linear.dc_gain if abs(linear.dc_gain) > 1e-3 * largest else nothing
+    smallest = np.linalg.svd(linear.at_rest, compute_uv=False).min()
+    return nothing + np.linalg.inv(linear.at_rest) if smallest > 1e-3 * largest else nothing
 
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:

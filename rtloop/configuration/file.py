@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -23,7 +23,8 @@ from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
 from rtloop.hil.options import LARGEST_INTEGER, Options
 from rtloop.law.layout import MAX_LAWS
-from rtloop.laws.registry import LawReference
+from rtloop.laws.contract import ANY_NUMBER
+from rtloop.laws.registry import LawReference, law_class
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -125,6 +126,20 @@ class Configuration:
     """All that the loop is to know, in an order that does not depend on where they are used."""
 
     @property
+    def owners(self) -> tuple[int, ...]:
+        """Of each axis, the number of the one whose controller it has: its own, unless that has several axes."""
+        found: list[int] = []
+        for number, axis in enumerate(self.axes):
+            owner = number if axis.controller or not found else found[-1]
+            controller = self.axes[owner].controller
+            found.append(owner if controller and axis.name in controller.axes else number)
+        return tuple(found)
+
+    def together(self, number: int) -> tuple[int, ...]:
+        """The axes that share the controller of axis `number`, itself included."""
+        return tuple(i for i, owner in enumerate(self.owners) if owner == self.owners[number])
+
+    @property
     def wiring(self) -> dict[str, Wiring]:
         """Channels of each axis, in the order of the axes."""
         return {
@@ -175,11 +190,17 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
 def _laws(sections: _Sections, library: Library, faults: list[str]) -> tuple[LawReference, ...]:
     """The laws of the axes, and those that are to stand by."""
     found = {options.law for axis in sections.axis for options in (axis.feedforward, axis.controller) if options}
+    together = {len(axis.controller.axes) for axis in sections.axis if axis.controller} - {0, 1}
     for name in sections.loop.laws:
         try:
-            found.add(library.find({"file" if name.endswith(".py") else "kind": name}, name))
+            law = library.find({"file" if name.endswith(".py") else "kind": name}, name)
         except ValueError as error:
             faults.append(f"loop.laws: {error}")
+            continue
+        counts = together if law_class(law).axes == ANY_NUMBER else {0}
+        if not counts:
+            faults.append(f"loop.laws: {law.kind!r} is for several axes, and no controller here has more than one")
+        found |= {replace(law, axes=count) for count in counts}
     laws = (*DEFAULT_LAWS, *sorted(found - {None, *DEFAULT_LAWS}))
     if len(laws) > MAX_LAWS:
         faults.append(f"loop.laws: {len(laws)} laws; at most {MAX_LAWS} are allowed")
@@ -278,6 +299,21 @@ def _short(fault: str) -> str:
     return fault if len(fault) <= MAX_CHARACTERS else f"{fault[:MAX_CHARACTERS]}…"
 
 
+def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
+    """What is wrong with controllers of several axes: which axes they have."""
+    names, faults = [axis.name for axis in axes], list[str]()
+    for number, axis in enumerate(axes):
+        wanted = axis.controller.axes if axis.controller else ()
+        where = f"axis.{axis.name}.controller.axes: {', '.join(wanted)}"
+        there = tuple(names[number : number + max(len(wanted), 1)])
+        if wanted and wanted != there:
+            faults.append(f"{where}; this axis first, then those that stand behind it, are needed: {', '.join(there)}")
+        for other in axes[number + 1 : number + len(wanted)]:
+            if other.controller:
+                faults.append(f"{where}; but {other.name} has a controller of its own")
+    return faults
+
+
 def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -> list[str]:
     """What concerns names in more than one section."""
     names = [axis.name for axis in sections.axis]
@@ -288,6 +324,7 @@ def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -
         if name not in channels
     ]
     faults += [f"driver.channels.{name}: there is no axis of this name" for name in channels if name not in names]
+    faults += shared_faults(sections.axis)
     for entry in sections.schedule:
         if entry.axis is not None and entry.axis not in names:
             faults.append(f"schedule.axis: {entry.axis!r} is not an axis; there are {', '.join(names)}")

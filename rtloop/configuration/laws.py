@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 
 from rtloop.configuration.text_files import InputFileError, read_text
-from rtloop.laws.contract import Controller, Feedforward, Law
+from rtloop.law.layout import MAX_COUPLED
+from rtloop.laws.contract import ANY_NUMBER, Controller, CoupledController, Feedforward, Law
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
 from rtloop.laws.registry import LawReference, from_text, law_class, reference
 
@@ -28,7 +29,7 @@ class Library:
     loaded: tuple[LawReference, ...] | None = None
 
     def find(self, named: Mapping[str, Any], default: str) -> LawReference:
-        """The law that a table names by `kind`, `file` or neither. Raises ValueError."""
+        """The law that a table names by `kind`, `file` or neither, for however many axes. Raises ValueError."""
         kind, file = named.get("kind") or None, named.get("file")
         for value, key in ((kind, "kind"), (file, "file")):
             if value is not None and not isinstance(value, str):
@@ -36,11 +37,12 @@ class Library:
         path = str(self.folder / file) if file else ""
         if self.loaded is None:
             return from_text(_text(Path(path)), path, kind) if file else reference(kind or default)
-        wanted = [law for law in self.loaded if (law.file == path if file else law.kind == (kind or default))]
+        loaded = dict.fromkeys(replace(law, axes=0) for law in self.loaded)
+        wanted = [law for law in loaded if (law.file == path if file else law.kind == (kind or default))]
         wanted = [law for law in wanted if kind is None or law.kind == kind]
         if len(wanted) != 1:
-            loaded = ", ".join(law.kind for law in self.loaded)
-            raise ValueError(f"{file or kind or default!r} is no law that the running loop has loaded; it has {loaded}")
+            there = ", ".join(law.kind for law in loaded)
+            raise ValueError(f"{file or kind or default!r} is no law that the running loop has loaded; it has {there}")
         return wanted[0]
 
 
@@ -64,8 +66,27 @@ def chosen(value: Any, info: ValidationInfo, base: type[Law], default: str) -> A
     if not issubclass(kind, base):
         raise ValueError(f"{law.kind!r} is no {base.__name__.lower()}")
     options = kind.options_model.model_validate(dict(value), context=info.context)
+    law = replace(law, axes=_axes(law, kind, options))
+    if library.loaded is not None and law not in library.loaded:
+        raise ValueError(f"{law.kind!r} for {law.axes} axes is no law that the running loop has loaded")
     options.bind(law)
     return options
+
+
+def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
+    """How many axes a law for any number of them has here; 0 for the others. Raises ValueError for too many or few."""
+    if not issubclass(kind, Controller):
+        return 0
+    said = len(options.axes)
+    if not issubclass(kind, CoupledController):
+        if said > 1:
+            raise ValueError(f"axes: {said}; law {law.kind!r} is for one axis")
+        return 0
+    fewest, most = (2, MAX_COUPLED) if kind.axes == ANY_NUMBER else (kind.axes, kind.axes)
+    if not fewest <= said <= most:
+        allowed = f"{fewest} to {most}" if fewest < most else f"{fewest}"
+        raise ValueError(f"axes: {said} are named; law {law.kind!r} is for {allowed}")
+    return said if kind.axes == ANY_NUMBER else 0
 
 
 def _controller(value: Any, info: ValidationInfo) -> Any:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rtloop.analysis.comparison import Comparison, compare
-from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_continuous, analyse_discrete
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import axis_coefficients, controller_of, joined
+from rtloop.configuration.checks import AxisCheck, Findings, check_axes
+from rtloop.configuration.coefficients import axis_coefficients, joined
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.drivers.base import Channel, Driver, Facts, index_of
@@ -25,33 +22,10 @@ from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
 from rtloop.laws.binding import functions_of
 from rtloop.laws.contract import Controller
-from rtloop.laws.linearise import linear_part
-from rtloop.laws.shipped.transfer import TransferController
-from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.sampled import Sampled
-from rtloop.linear.transfer import Transfer
 from rtloop.signals import Mode
-
-COMPARED_PART = 0.2
-"""C(z) is compared with C(s) up to this part of the rate; toward half of it every method must differ."""
 
 MOST_TICKS = 2**53
 """A recording numbers its ticks by floating-point numbers."""
-
-
-@dataclass(frozen=True)
-class AxisCheck:
-    """What is known of an axis before it runs; None where there is no controller or no model."""
-
-    name: str
-    law: Controller | None = None
-    linear: DiscreteController | Sampled | None = None
-    controller: Transfer | None = None
-    discrete: DiscreteController | None = None
-    comparison: Comparison | None = None
-    plant: Transfer | None = None
-    continuous: LoopAnalysis | None = None
-    running: LoopAnalysis | None = None
 
 
 @dataclass(frozen=True)
@@ -65,23 +39,9 @@ class Prepared:
     warnings: tuple[str, ...]
 
 
-@dataclass
-class _Findings:
-    faults: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-
-    @contextmanager
-    def at(self, where: str) -> Iterator[None]:
-        """A ValueError raised within is a fault at `where`, and what follows goes on."""
-        try:
-            yield
-        except ValueError as error:
-            self.faults.append(f"{where}{error}")
-
-
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
     """Build law, references and schedule. Raises ConfigError with all faults, DriverError for a missing library."""
-    findings, rate_hz = _Findings(), configuration.loop.rate_hz
+    findings, rate_hz = Findings(), configuration.loop.rate_hz
     facts = _facts(configuration, paced, findings)
     if configuration.loop.enable_input is not None:
         with findings.at("loop.enable_input: "):
@@ -90,12 +50,11 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         if law.text:  # what is shipped compiles
             with findings.at(""):
                 functions_of([law])
-    checks, coefficients = [], []
-    for axis in configuration.axes:
-        check = _check(axis, 1.0 / rate_hz, findings)
-        checks.append(check)
-        coefficients.append(_coefficients(configuration, axis, check.law, facts, findings))
-        if axis.controller is None and _uses_closed_loop(configuration):
+    checks, coefficients = check_axes(configuration, findings), []
+    for number, axis in enumerate(configuration.axes):
+        owner = configuration.owners[number]
+        coefficients.append(_coefficients(configuration, axis, checks[owner].law, facts, findings, number - owner))
+        if configuration.axes[owner].controller is None and _uses_closed_loop(configuration):
             findings.faults.append(f"axis.{axis.name}.controller: missing; mode closed_loop needs it")
     table = TableOfSamples()
     generators = _generators(configuration, facts, table, findings)
@@ -123,7 +82,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
 
 
-def _facts(configuration: Configuration, paced: bool, findings: _Findings) -> Facts:
+def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Facts:
     """What the driver says of itself. Raises ConfigError where it cannot be made: nothing else can be judged then."""
     with findings.at("driver."):
         driver = _driver(configuration)
@@ -147,7 +106,7 @@ def _pacing(configuration: Configuration, paced: bool) -> Pacing:
     )
 
 
-def _ticks(duration_s: float | None, rate_hz: float, findings: _Findings) -> int | None:
+def _ticks(duration_s: float | None, rate_hz: float, findings: Findings) -> int | None:
     if duration_s is None:
         return None
     ticks = duration_s * rate_hz
@@ -158,52 +117,13 @@ def _ticks(duration_s: float | None, rate_hz: float, findings: _Findings) -> int
     return round(ticks)
 
 
-def _check(axis: AxisOptions, period_s: float, findings: _Findings) -> AxisCheck:
-    """The controller, C(z)'s agreement with C(s), and the loop on the axis's model as far as the law is linear."""
-    if axis.controller is None:
-        return AxisCheck(axis.name)
-    where, linear = f"axis.{axis.name}.controller", None
-    law = controller_of(axis, period_s)
-    check = AxisCheck(axis.name, law)
-    if isinstance(law, TransferController):
-        with findings.at(f"{where}: "):
-            linear, transfer = law.discrete, law.options.transfer()
-            comparison = compare(transfer, linear, up_to_hz=COMPARED_PART / period_s)
-            findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
-            check = replace(check, controller=transfer, discrete=linear, comparison=comparison)
-        if linear is None:
-            return replace(check, law=None)
-    elif law is not None:
-        try:
-            linear = linear_part(law)
-        except ValueError as error:
-            findings.warnings.append(f"{where}: stability and margins are not checked: {error}")
-            return check
-    if axis.model is None or linear is None:
-        findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
-        return replace(check, linear=linear)
-    plant, continuous, running = axis.model.transfer(), None, None
-    with findings.at(f"axis.{axis.name}.model: "):
-        continuous = None if check.controller is None else analyse_continuous(check.controller, plant)
-        running = analyse_discrete(linear, plant, axis.model.delay_ticks)
-    if running is not None and not running.stable:
-        message_ = (
-            f"{where}: the loop is unstable on axis.{axis.name}.model at {1 / period_s:g} Hz "
-            f"(largest |pole| {running.max_abs_pole:.6f}, must be below 1)"
-        )
-        if axis.controller.allow_unstable:
-            findings.warnings.append(message_)
-        else:
-            findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
-    return replace(check, linear=linear, plant=plant, continuous=continuous, running=running)
-
-
 def _coefficients(
     configuration: Configuration,
     axis: AxisOptions,
     controller: Controller | None,
     facts: Facts,
-    findings: _Findings,
+    findings: Findings,
+    place: int,
 ) -> Records | None:
     channel, where = configuration.channels[axis.name], f"driver.channels.{axis.name}."
     output: Channel | None = None
@@ -216,7 +136,7 @@ def _coefficients(
     with findings.at(f"axis.{axis.name}."):
         period_s, enable = 1.0 / configuration.loop.rate_hz, configuration.loop.enable_input is not None
         return axis_coefficients(
-            configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, enable
+            configuration.laws, axis, controller, channel.um_per_v, channel.offset, output, period_s, enable, place
         )
     return None
 
@@ -227,7 +147,7 @@ def _uses_closed_loop(configuration: Configuration) -> bool:
 
 
 def _generators(
-    configuration: Configuration, facts: Facts, table: TableOfSamples, findings: _Findings
+    configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
     generators = np.zeros(len(configuration.axes), GENERATOR)
     for i, axis in enumerate(configuration.axes):
@@ -242,7 +162,7 @@ def _generators(
 
 
 def _schedule(
-    configuration: Configuration, facts: Facts, table: TableOfSamples, findings: _Findings
+    configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> np.ndarray[Any, Any]:
     """Commands in the order of their ticks; entries of one tick keep the file's order."""
     names = [axis.name for axis in configuration.axes]

@@ -36,7 +36,8 @@ class LinearModel:
         self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
-        if (law := controller_of(axis, 1 / rate_hz)) is not None:
+        shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
+        if not shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
             loop = discrete_loop(controller, self.dynamics, model.delay_ticks)
             self.loop = loop if loop.is_stable else None

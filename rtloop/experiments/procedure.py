@@ -121,7 +121,8 @@ class Experiment:
 
     def unsuitable(self, configuration: Configuration, axis: AxisOptions, rig: bool) -> str | None:
         """Why this experiment cannot be done with a configuration; None where it can."""
-        if self.needs_controller and axis.controller is None:
+        number = [one.name for one in configuration.axes].index(axis.name)
+        if self.needs_controller and configuration.axes[configuration.owners[number]].controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment closes the loop"
         if self.both_ways and axis.limits.lowest_v == 0.0:
             return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment drives to both sides"

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.native.pointers import address_pointer, carray
 from rtloop.law.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LOOP_STATE, STATE
 
 FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
 CONTROL_BYTES, FUNCTIONS_BYTES = CONTROL.itemsize, FUNCTIONS.itemsize
+CONTROL_FIELDS = len(CONTROL.names or ())
 
 
 class Law(NamedTuple):
@@ -21,6 +24,7 @@ class Law(NamedTuple):
     axes_bytes: int
     loop: int
     controls: int
+    together: int
     functions: int
     result: int
     raised: int
@@ -33,8 +37,8 @@ class Law(NamedTuple):
 def opened(law):
     """A LAW record, read once."""
     return Law(
-        law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.functions,
-        law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
+        law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
+        law.functions, law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
     )  # fmt: skip
 
 
@@ -60,6 +64,12 @@ def loop_of(law):
 def control_of(law, a):
     """What the controller of axis number `a` is told."""
     return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
+
+
+@jit
+def together_of(law, first, count):
+    """What the controller of `count` axes from `first` on is told, (fields of CONTROL, count)."""
+    return carray(address_pointer(law.together + first * CONTROL_BYTES), (CONTROL_FIELDS, count), np.float64)
 
 
 @jit

@@ -18,6 +18,8 @@ import numpy as np
 from rtloop.hil.native.compiled import jit, seldom
 from rtloop.hil.native.pointers import address_pointer, carray
 from rtloop.law.access import (
+    CONTROL_BYTES,
+    CONTROL_FIELDS,
     FEEDFORWARD_COEFFICIENTS,
     coefficients_of,
     control_of,
@@ -25,8 +27,9 @@ from rtloop.law.access import (
     loop_of,
     opened,
     state_of,
+    together_of,
 )
-from rtloop.law.layout import COEFFICIENTS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS
+from rtloop.law.layout import COEFFICIENTS, CONTROL, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS
 from rtloop.law.prefilter import fill_prefilter_anew, prefilter
 from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
 from rtloop.law.slots import (
@@ -50,6 +53,7 @@ SLEW_LIMITED = int(Flag.SLEW_LIMITED)
 RAMPING = int(Flag.RAMPING)
 HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
 TRIP_LAW = int(Flag.TRIP_LAW)
+COMMAND = (CONTROL.names or ()).index("command_um")
 NEGLIGIBLE_BUMP = 1e-9
 ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
 
@@ -142,12 +146,12 @@ def evaluate(record, adc_v, references, conditions):
     loop.settled = 1
     for a in range(law.axis_count):
         count = np.int64(coefficients_of(law, a).controller_axes)
-        if count != 0 and loop.mode == CLOSED_LOOP and not _control(law, a, count):
-            _trip_by_law(loop)
-        if count != 0:
-            _drive(law, a, loop, references[a])
         if count > 1:
-            _drive_others(law, a, count, loop, references)
+            _evaluate_together(law, a, count, loop, references)
+        elif count == 1:
+            if loop.mode == CLOSED_LOOP and not _control(law, a):
+                _trip_by_law(loop)
+            _drive(law, a, loop, references[a])
     loop.tick_flags |= loop.trip
 
 
@@ -160,38 +164,57 @@ def _trip_by_law(loop):
 
 
 @jit
-def _control(law, first, count):
-    """Commands of the axes from `first` on, which share a controller; False where it failed."""
-    coefficients, state = coefficients_of(law, first), state_of(law, first)
-    if count > 1:
-        _tell_together(law, first, count)
-    else:
-        _tell(law, first, coefficients, state, coefficients.resting_error[0] * state.applied_command_um)
-    good = state.entering == 0 or controller_enter(law, first)
-    succeeded, command_um = controller_output(law, first, coefficients)
+def _control(law, a):
+    """Command of one axis that has a controller of its own; False where that failed."""
+    coefficients, state = coefficients_of(law, a), state_of(law, a)
+    _tell(law, a, coefficients, state, coefficients.resting_error[0] * state.applied_command_um)
+    good = state.entering == 0 or controller_enter(law, a, law.controls)
+    succeeded, command_um = controller_output(law, a, coefficients, law.controls)
     good = good and succeeded
-    if count > 1:
-        return _command_together(law, first, count) and good
-    return _command(law, first, coefficients, state, command_um) and good
+    return _command(law, a, coefficients, state, command_um) and good
 
 
 @seldom
-def _tell_together(law, first, count):
-    """As `_tell`, for axes that share a controller: each rests at an error that depends on the commands of all."""
+def _evaluate_together(law, first, count, loop, references):
+    """The axes from `first` on, which share a controller."""
+    if loop.mode == CLOSED_LOOP and not _control_together(law, first, count):
+        _trip_by_law(loop)
+    for i in range(first, first + count):
+        _drive(law, i, loop, references[i])
+
+
+@jit
+def _control_together(law, first, count):
+    """Commands of axes that share a controller; False where it failed.
+
+    Each rests at an error that depends on the commands of all.
+    """
+    entering = False
     for i in range(first, first + count):
         coefficients, resting_um = coefficients_of(law, i), 0.0
         for j in range(count):
             resting_um += coefficients.resting_error[j] * state_of(law, first + j).applied_command_um
         _tell(law, i, coefficients, state_of(law, i), resting_um)
-
-
-@seldom
-def _command_together(law, first, count):
-    """As `_command`, for axes that share a controller."""
-    good = True
-    for i in range(first, first + count):
-        good = _command(law, i, coefficients_of(law, i), state_of(law, i), control_of(law, i).command_um) and good
+        entering = entering or state_of(law, i).entering != 0
+    _gather(law, first, count)
+    good = not entering or controller_enter(law, first, law.together)
+    succeeded, _ = controller_output(law, first, coefficients_of(law, first), law.together)
+    good = good and succeeded
+    commands_um = together_of(law, first, count)[COMMAND]
+    for i in range(count):
+        a = first + i
+        good = _command(law, a, coefficients_of(law, a), state_of(law, a), commands_um[i]) and good
     return good
+
+
+@jit
+def _gather(law, first, count):
+    """What the axes from `first` on are told, as the controller that they share finds it."""
+    together = together_of(law, first, count)
+    for i in range(count):
+        told = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
+        for field in range(CONTROL_FIELDS):
+            together[field, i] = told[field]
 
 
 @jit
@@ -222,12 +245,6 @@ def _drive(law, a, loop, reference):
     loop.tick_flags |= _driven(law, a, loop, coefficients, state, reference)
     if state.drive_v != coefficients.safe_v:
         loop.settled = 0
-
-
-@seldom
-def _drive_others(law, first, count, loop, references):
-    for i in range(first + 1, first + count):
-        _drive(law, i, loop, references[i])
 
 
 @jit
@@ -295,15 +312,20 @@ def update(record):
         if count != 0:
             _follow(law, a, loop, coefficients)
             if count > 1:
-                _follow_others(law, a, count, loop)
-            if loop.mode == CLOSED_LOOP and not controller_update(law, a, coefficients):
+                _update_together(law, a, count, loop)
+            elif loop.mode == CLOSED_LOOP and not controller_update(law, a, coefficients, law.controls):
                 loop.pending |= TRIP_LAW
 
 
 @seldom
-def _follow_others(law, first, count, loop):
+def _update_together(law, first, count, loop):
+    """The other axes that share the controller of axis `first`, and then that."""
     for i in range(first + 1, first + count):
         _follow(law, i, loop, coefficients_of(law, i))
+    if loop.mode == CLOSED_LOOP:
+        _gather(law, first, count)
+        if not controller_update(law, first, coefficients_of(law, first), law.together):
+            loop.pending |= TRIP_LAW
 
 
 @jit

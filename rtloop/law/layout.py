@@ -158,6 +158,15 @@ CONTROL = np.dtype(
     align=True,
 )
 """What a controller is told of an axis, see `rtloop.laws.contract`; written anew each tick, no part of the state."""
+
+
+def told_by(axes: int) -> np.dtype[Any]:
+    """What a controller of so many axes is told: of several, the same, each number an array with an entry an axis."""
+    if axes == 1:
+        return CONTROL
+    return np.dtype([(name, np.float64, (axes,)) for name in CONTROL.names or ()], align=True)
+
+
 FUNCTIONS = np.dtype(
     [
         *((name, np.int64) for name in ("output", "update", "enter")),
@@ -175,7 +184,7 @@ RULE = np.dtype(
 LAW = np.dtype(
     [
         *((name, np.int64) for name in ("coefficients", "coefficients_bytes", "axes", "axes_bytes", "loop")),
-        *((name, np.int64) for name in ("controls", "functions", "rules", "result", "raised")),
+        *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised")),
         *((name, np.int64) for name in ("controller_coefficients", "controller_state")),
         ("axis_count", np.uint32),
         ("law_count", np.uint32),

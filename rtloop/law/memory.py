@@ -211,6 +211,7 @@ class LawMemory:
             "axes": axes,
             "loop": state,
             "controls": records(CONTROL, axes.size),
+            "together": records(CONTROL, axes.size),
             "functions": self._functions,
             "rules": np.concatenate([np.zeros(0, RULE), *rules]),
             "result": np.zeros(1),

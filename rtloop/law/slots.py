@@ -48,10 +48,10 @@ def note_failure(state, failure, value):
 
 
 @jit
-def _controller_call(law, a, function):
+def _controller_call(law, a, function, told):
     coefficients = law.coefficients + a * law.coefficients_bytes + law.controller_coefficients
     state = law.axes + a * law.axes_bytes + law.controller_state
-    return call_law(function, law.result, law.raised, coefficients, state, law.controls + a * CONTROL_BYTES)
+    return call_law(function, law.result, law.raised, coefficients, state, told + a * CONTROL_BYTES)
 
 
 @jit
@@ -62,9 +62,12 @@ def _feedforward_call(law, a, function, result, value):
 
 
 @jit
-def controller_output(law, a, coefficients):
-    """Whether the controller whose first axis is `a` came to its end, and what it returned."""
-    status = _controller_call(law, a, functions_of(law, coefficients.controller_law).output)
+def controller_output(law, a, coefficients, told):
+    """Whether the controller whose first axis is `a` came to its end, and what it returned.
+
+    `told` is where what it is told begins, for all axes: `law.controls` or `law.together`.
+    """
+    status = _controller_call(law, a, functions_of(law, coefficients.controller_law).output, told)
     if status in (OK, NONE):
         return True, _result(law)
     note_failure(state_of(law, a), CONTROLLER_OUTPUT + RAISED, np.nan)
@@ -72,7 +75,7 @@ def controller_output(law, a, coefficients):
 
 
 @seldom
-def controller_enter(law, a):
+def controller_enter(law, a, told):
     """Have the controller whose first axis is `a`, its state at zero, go on from a command; False where it failed."""
     functions = functions_of(law, coefficients_of(law, a).controller_law)
     state = carray(
@@ -80,16 +83,16 @@ def controller_enter(law, a):
     )
     for i in range(functions.state_bytes):
         state[i] = 0
-    if functions.enter == 0 or _controller_call(law, a, functions.enter) in (OK, NONE):
+    if functions.enter == 0 or _controller_call(law, a, functions.enter, told) in (OK, NONE):
         return True
     note_failure(state_of(law, a), CONTROLLER_ENTER + RAISED, np.nan)
     return False
 
 
 @jit
-def controller_update(law, a, coefficients):
+def controller_update(law, a, coefficients, told):
     """Advance the controller whose first axis is `a`; False where it failed."""
-    if _controller_call(law, a, functions_of(law, coefficients.controller_law).update) in (OK, NONE):
+    if _controller_call(law, a, functions_of(law, coefficients.controller_law).update, told) in (OK, NONE):
         return True
     note_failure(state_of(law, a), CONTROLLER_UPDATE + RAISED, np.nan)
     return False

@@ -17,7 +17,7 @@ from numba.core.errors import NumbaError
 
 from rtloop.hil.native.compiled import UNCOMPILED, checked, native_address
 from rtloop.hil.native.pointers import carray
-from rtloop.law.layout import CONTROL, FUNCTIONS
+from rtloop.law.layout import FUNCTIONS, told_by
 from rtloop.law.memory import LawRecords
 from rtloop.laws.contract import Law
 from rtloop.laws.purity import foreign_calls
@@ -35,16 +35,20 @@ def functions_of(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
 def _bound(reference: LawReference) -> npt.NDArray[Any]:
     """One law, shape (1,): compiled and looked through once in a process, however often it is asked for."""
     law, found = law_class(reference), np.zeros(1, FUNCTIONS)
-    for name, signature in signatures_of(law).items():
-        found[name] = _address(law, name, signature)
+    keeps = law.records(reference.axes)
+    for name, signature in signatures_of(law, keeps).items():
+        found[name] = _address(law, keeps, name, signature)
     return found
 
 
-def signatures_of(law: type[Law]) -> dict[str, Any]:
+def signatures_of(law: type[Law], keeps: LawRecords) -> dict[str, Any]:
     """What each function that a law has takes and returns, for the compiler."""
-    keeps = law.records()
-    told = from_dtype(CONTROL) if law.axes else types.float64
-    returns = {"output": types.float64, "update": types.void if law.axes else types.float64, "enter": types.void}
+    told = from_dtype(told_by(keeps.axes)) if keeps.axes else types.float64
+    returns = {
+        "output": types.void if keeps.axes > 1 else types.float64,
+        "update": types.void if keeps.axes else types.float64,
+        "enter": types.void,
+    }
     return {
         name: result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
         for name, result in returns.items()
@@ -52,10 +56,10 @@ def signatures_of(law: type[Law]) -> dict[str, Any]:
     }
 
 
-def _address(law: type[Law], name: str, signature: Any) -> int:
+def _address(law: type[Law], keeps: LawRecords, name: str, signature: Any) -> int:
     function = getattr(law, name)
     if UNCOMPILED:
-        return native_address(_from_addresses(function, law.records(), law.axes), None)
+        return native_address(_from_addresses(function, keeps), None)
     kernel = function if law.shipped else _kernel(function)
     try:
         address = native_address(kernel, signature)
@@ -82,11 +86,11 @@ def _short(error: Exception) -> str:
     return " ".join(kept)[:MAX_CHARACTERS]
 
 
-def _from_addresses(function: Callable[..., Any], keeps: LawRecords, axes: int) -> Callable[..., Any]:
+def _from_addresses(function: Callable[..., Any], keeps: LawRecords) -> Callable[..., Any]:
     """An uncompiled function as the loop calls it."""
 
     def call(coefficients: int, state: int, told: Any) -> Any:
-        given = carray(told, 1, CONTROL)[0] if axes else told
+        given = carray(told, 1, told_by(keeps.axes))[0] if keeps.axes else told
         return function(carray(coefficients, 1, keeps.coefficients)[0], carray(state, 1, keeps.state)[0], given)
 
     return call

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from rtloop.hil.native.compiled import checked
-from rtloop.law.layout import CONTROL
+from rtloop.law.layout import told_by
 from rtloop.law.memory import records
 from rtloop.laws.binding import signatures_of
 from rtloop.laws.contract import Controller, Law, record_of
@@ -52,7 +52,7 @@ class LawConformance:
 
     def test_whole_numbers_are_bounded(self) -> None:
         """Whatever the functions use as an index has its range in `allowed_coefficients` and `allowed_state`."""
-        keeps = self.law.records()
+        keeps = self.law.records(self.law.count)
         for what, allowed in (("coefficients", keeps.allowed_coefficients), ("state", keeps.allowed_state)):
             table = getattr(keeps, what)
             whole = {
@@ -84,14 +84,14 @@ class LawConformance:
     def test_it_stays_finite(self, bench: Bench) -> None:
         """Bounded errors and commands that are applied give commands that are numbers, far from the end of numbers."""
         for number, (value, _) in enumerate(bench.run(20 * TICKS, wild=False)):
-            assert abs(value) < 1e9, f"tick {number}: {value}"
+            assert np.all(np.abs(value) < 1e9), f"tick {number}: {value}"
 
     def test_no_number_that_is_none_outlives_an_entry(self, bench: Bench) -> None:
         """After NaN and infinity, entered anew, it works."""
         bench.poison()
-        bench.enter(3.0, 1.0, 5.0)
+        bench.enter(*np.multiply.outer([3.0, 1.0, 5.0], np.ones(max(self.law.count, 1))))
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
-            assert np.isfinite(value), f"tick {number} after the entry: {value}"
+            assert np.all(np.isfinite(value)), f"tick {number} after the entry: {value}"
 
     def test_it_goes_on_where_it_is_told_to(self, bench: Bench) -> None:
         """Its `enter` leaves no more than BUMP; without one the loop's own offset does it."""
@@ -99,10 +99,10 @@ class LawConformance:
             pytest.skip("the law has no enter of its own")
         random = np.random.default_rng(SEED)
         for _ in range(50):
-            position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, 3)
+            position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, (3, self.law.count))
             found = bench.enter(position_um, error_um, command_um)
-            room = BUMP * (1 + abs(command_um) + abs(error_um))
-            assert abs(found - command_um) <= room, f"told to go on at {command_um}, it gave {found}"
+            room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
+            assert np.all(np.abs(found - command_um) <= room), f"told to go on at {command_um}, it gave {found}"
 
     def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:
         """No memory taken, nothing printed, no interpreter, no mathematics that differs between processors."""
@@ -128,13 +128,13 @@ class Bench:
     """A law's functions on records of its own, compiled as the loop has them or as they are written."""
 
     def __init__(self, law: Law, compiled: bool = True) -> None:
-        keeps, self._law = law.records(), law
+        keeps, self._law = law.records(law.count), law
         self.coefficients: Any = records(keeps.coefficients, 1)
         self.coefficients[:] = record_of(law)
         self.state: Any = records(keeps.state, 1)
-        self._told: Any = records(CONTROL, 1)
+        self._told: Any = records(told_by(law.count), 1) if law.count else None
         self._kernels: dict[str, Any] = {}
-        self._signatures = signatures_of(type(law))
+        self._signatures = signatures_of(type(law), keeps)
         for name, signature in self._signatures.items():
             plain = as_written(getattr(type(law), name))
             self._kernels[name] = _compiled(plain, signature) if compiled else plain
@@ -143,31 +143,37 @@ class Bench:
         with np.errstate(all="ignore"):
             return self._kernels[name](self.coefficients[0], self.state[0], told)
 
-    def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[float, bytes]]:
-        """What each tick gives, and the state after it."""
+    def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
+        """What each tick gives, a number or one for each axis, and the state after it."""
         random = np.random.default_rng(seed)
         for number in range(ticks):
-            if self._law.axes == 0:
+            if self._law.count == 0:
                 value = float(self._call("output", random.uniform(-REACH_UM, REACH_UM)))
                 followed = float(self._call("update", random.uniform(-10, 10)))
                 yield value + followed, self.state.tobytes()
                 continue
             told = self._told[0]
             reach = 1e6 if wild and number % 97 == 0 else REACH_UM
-            told.position_um = random.uniform(-reach, reach)
-            told.reference_um = random.uniform(-reach, reach)
+            axes = None if self._law.count == 1 else self._law.count
+            told.position_um = random.uniform(-reach, reach, axes)
+            told.reference_um = random.uniform(-reach, reach, axes)
             told.error_um = told.reference_um - told.position_um
-            told.command_um = told.applied_um = random.uniform(-REACH_UM, REACH_UM)
-            value = float(self._call("output", told))
-            told.command_um, told.applied_um = value, min(max(value, -REACH_UM), REACH_UM)
+            told.command_um = told.applied_um = random.uniform(-REACH_UM, REACH_UM, axes)
+            value = self._commands(told)
+            told.command_um, told.applied_um = value, np.clip(value, -REACH_UM, REACH_UM)
             self._call("update", told)
             yield value, self.state.tobytes()
+
+    def _commands(self, told: Any) -> Any:
+        """What the controller commands: a number, or a tuple with one for each of its axes."""
+        value = self._call("output", told)
+        return float(value) if self._law.count == 1 else tuple(told.command_um.tolist())
 
     def poison(self) -> None:
         """Ticks with what is no number; what it returns or raises then is its own affair."""
         for value in (np.nan, np.inf, -np.inf):
             try:
-                if self._law.axes == 0:
+                if self._law.count == 0:
                     self._call("output", value)
                     continue
                 for name in self._told.dtype.names:
@@ -177,17 +183,19 @@ class Bench:
             except (ArithmeticError, IndexError, ValueError):
                 continue
 
-    def enter(self, position_um: float, error_um: float, command_um: float) -> float:
-        """As the loop lets a controller in, from a state of zeros; the command of its first tick."""
-        if self._law.axes == 0:
+    def enter(self, position_um: Any, error_um: Any, command_um: Any) -> Any:
+        """As the loop lets a controller in, from a state of zeros; the commands of its first tick. All (axes,)."""
+        if self._law.count == 0:
             return 0.0
         self.state.view(np.uint8)[:] = 0
         told = self._told[0]
+        if self._law.count == 1:
+            position_um, error_um, command_um = float(position_um[0]), float(error_um[0]), float(command_um[0])
         told.position_um, told.error_um, told.reference_um = position_um, error_um, position_um + error_um
         told.command_um = told.applied_um = command_um
         if "enter" in self._kernels:
             self._call("enter", told)
-        return float(self._call("output", told))
+        return self._commands(told)
 
     def foreign(self) -> Iterator[tuple[str, dict[str, str]]]:
         """Of each function what it calls that a law may not."""

@@ -8,6 +8,9 @@ coefficients `c` and state `s` as records with attributes, and what else they ma
                   told.reference_um, position_um, error_um: as the controller meets them; in `update` also
                   command_um, what went out as its command, and applied_um, what of it was really applied
 
+    coupled       as a controller, but for several axes at once: what it is told are arrays with an entry an axis, and
+                  its output sets told.command_um[i] instead of returning a command
+
     feedforward   output(c, s, command_um) → drive in V
                   update(c, s, drive_v) → command in µm that this drive was, `drive_v` being what was really applied
 
@@ -28,6 +31,8 @@ from rtloop.law.layout import whole_lines
 from rtloop.law.memory import LawRecords, Rules
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOptions
 
+ANY_NUMBER = -1
+"""Of axes, for a coupled controller whose class does not say how many it is for."""
 Fields = Mapping[str, Any]
 """Name of each number of a record: `float` or `int`, or (type, length) for an array, (type, shape) for a matrix."""
 _TYPES = {float: np.float64, int: np.int64}
@@ -59,18 +64,24 @@ class Law(ABC):
             cls.kind = cls.__name__.lower()
 
     def __init__(self, options: Any, period_s: float, model: Any) -> None:
-        """`model` is the plant from command to position that the axis was given (`configuration`'s), or None."""
+        """`model` is the plant from command to position that the axis was given (`configuration`'s), or None; of a
+        coupled controller, a tuple with one for each of its axes."""
         self.options, self.period_s, self.model = options, period_s, model
 
     @abstractmethod
     def build(self) -> Mapping[str, Any]:
         """A value for each coefficient; arrays may be shorter than their fields. Raises ValueError."""
 
+    @property
+    def count(self) -> int:
+        """Of the axes that it has; 0 for a feedforward."""
+        return self.axes
+
     @classmethod
-    def records(cls) -> LawRecords:
-        """What it keeps, as types."""
+    def records(cls, axes: int = 0) -> LawRecords:
+        """What it keeps, as types; `axes` where its class does not say how many."""
         return LawRecords(
-            cls.kind, cls.axes, _record(cls.coefficients), _record(cls.state), cls.allowed_coefficients,
+            cls.kind, axes or cls.axes, _record(cls.coefficients), _record(cls.state), cls.allowed_coefficients,
             cls.allowed_state,
         )  # fmt: skip
 
@@ -97,6 +108,22 @@ class Controller(Law):
         None has it found by running the functions about rest (`rtloop.laws.linearise`).
         """
         return None
+
+
+class CoupledController(Controller):
+    """From what several axes do to the commands of their feedforwards."""
+
+    axes = ANY_NUMBER
+
+    @property
+    def count(self) -> int:
+        """Of its axes, here."""
+        return len(self.options.axes) if self.axes == ANY_NUMBER else self.axes
+
+    @staticmethod
+    @abstractmethod
+    def output(c: Any, s: Any, told: Any) -> None:  # type: ignore[override]
+        """Set the commands, told.command_um (axes,) in µm."""
 
 
 class Feedforward(Law):

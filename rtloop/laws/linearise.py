@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.law.layout import CONTROL
+from rtloop.law.layout import told_by
 from rtloop.law.memory import records
 from rtloop.laws.contract import Controller, record_of
 from rtloop.linear.realisation import System
 from rtloop.linear.sampled import Sampled
+from rtloop.linear.together import SampledTogether, SystemTogether
 
 STEP = 1e-4
 AGREEMENT = 1e-4
@@ -30,8 +31,10 @@ def linear_part(law: Controller) -> Any:
     return linearised(law) if known is None else known
 
 
-def linearised(law: Controller) -> Sampled:
-    """The law about its rest. Raises ValueError where it has too many states, is not smooth there, or fails there."""
+def linearised(law: Controller) -> Sampled | SampledTogether:
+    """The law about its rest; of several axes where it has several.
+
+    Raises ValueError where it has too many states, is not smooth there, or fails there."""
     tick = _Tick(law)
     if tick.size > MOST_STATES:
         raise ValueError(f"{tick.size} states; at most {MOST_STATES} are found out one by one")
@@ -44,14 +47,17 @@ def linearised(law: Controller) -> Sampled:
     if not np.all(np.abs(wide - narrow) <= AGREEMENT * scale):
         raise ValueError("it is not smooth at rest")
     n = tick.size
-    a, b, c, d = narrow[:n, :n], narrow[:n, n], narrow[n, :n], float(narrow[n, n])
-    kept = np.flatnonzero(_reached(a, b) & _reached(a.T, c))
-    return Sampled(System(a[np.ix_(kept, kept)], b[kept], c[kept], d), law.period_s)
+    a, b, c, d = narrow[:n, :n], narrow[:n, n:], narrow[n:, :n], narrow[n:, n:]
+    kept = np.flatnonzero(_reached(a, b) & _reached(a.T, c.T))
+    a, b, c = a[np.ix_(kept, kept)], b[kept], c[:, kept]
+    if law.count > 1:
+        return SampledTogether(SystemTogether(a, b, c, d), law.period_s)
+    return Sampled(System(a, b[:, 0], c[0], float(d[0, 0])), law.period_s)
 
 
 def _reached(a: Real, b: Real) -> npt.NDArray[np.bool_]:
-    """States that the input reaches at all, (n,); with Aᵀ and c those that the output sees. Counters are neither."""
-    reached = b != 0
+    """States that an input reaches at all, (n,); with Aᵀ and Cᵀ those that an output sees. Counters are neither."""
+    reached = np.any(b != 0, axis=1)
     while True:
         wider = reached | np.any((a != 0) & reached, axis=1)
         if np.array_equal(wider, reached):
@@ -60,42 +66,46 @@ def _reached(a: Real, b: Real) -> npt.NDArray[np.bool_]:
 
 
 def _derivatives(tick: _Tick, step: float) -> Real:
-    """Of the states after a tick and of the command (n + 1,), by the states before it and the error (n + 1)."""
-    size = tick.size
-    found = np.zeros((size + 1, size + 1))
-    for i in range(size + 1):
-        at = np.zeros(size + 1)
+    """Of the states after a tick and of the commands (n + m,), by the states before it and the errors (n + m)."""
+    size = tick.size + tick.axes
+    found = np.zeros((size, size))
+    for i in range(size):
+        at = np.zeros(size)
         at[i] = step
-        found[:, i] = (tick(at[:-1], at[-1]) - tick(-at[:-1], -at[-1])) / (2 * step)
+        found[:, i] = (tick(at[: tick.size], at[tick.size :]) - tick(-at[: tick.size], -at[tick.size :])) / (2 * step)
     return found
 
 
 class _Tick:
-    """One tick of the uncompiled functions: from floating-point states and error to states and command."""
+    """One tick of the uncompiled functions: from floating-point states and errors to states and commands."""
 
     def __init__(self, law: Controller) -> None:
-        keeps = law.records()
+        keeps = law.records(law.count)
         self._coefficients: Any = record_of(law).view(np.recarray)[0]
         self._state = records(keeps.state, 1)
         self._fields = [name for name in keeps.state.names or () if keeps.state[name].base == np.float64]
         self._fields = [name for name in self._fields if name not in ("reserved", "scratch")]
         self._output, self._update = as_written(type(law).output), as_written(type(law).update)
         self.size = sum(int(np.prod(keeps.state[name].shape)) for name in self._fields)
+        self.axes = law.count
+        self._told = told_by(law.count)
 
-    def __call__(self, states: Real, error_um: float) -> Real:
+    def __call__(self, states: Real, errors_um: Real) -> Real:
         self._state.view(np.uint8)[:] = 0
         at = 0
         for name in self._fields:
             target = self._state[name].reshape(-1)
             target[:] = states[at : at + target.size]
             at += target.size
-        told = records(CONTROL, 1)
-        told.position_um, told.error_um = -error_um, error_um
+        told = records(self._told, 1)
+        told.position_um, told.error_um = -errors_um, errors_um
         state = self._state[0]
-        command_um = float(self._output(self._coefficients, state, told[0]))
-        told.command_um = told.applied_um = command_um
+        returned = self._output(self._coefficients, state, told[0])
+        if self.axes == 1:
+            told.command_um = returned
+        told.applied_um = told.command_um
         self._update(self._coefficients, state, told[0])
-        return np.concatenate([*(self._state[name].reshape(-1) for name in self._fields), [command_um]])
+        return np.concatenate([*(self._state[name].reshape(-1) for name in self._fields), told.command_um.reshape(-1)])
 
 
 def as_written(function: Any) -> Callable[..., Any]:

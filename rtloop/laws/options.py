@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from rtloop.hil.options import Options
 from rtloop.laws.shipped.play_model import PlayModel
@@ -59,3 +59,5 @@ class ControllerOptions(LawOptions):
 
     allow_unstable: bool = False
     """Run although the loop is unstable on the axis's model."""
+    axes: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Axes that a coupled controller has, this one first and the others behind it; none is this one alone."""

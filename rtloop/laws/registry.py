@@ -23,6 +23,7 @@ from rtloop.laws.contract import Law
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
 BUILT_IN = {
+    "coupled": f"{SHIPPED}.coupled:Coupled",
     "integral_resonant": f"{SHIPPED}.integral_resonant:IntegralResonant",
     "pid": f"{SHIPPED}.pid:Pid",
     "positive_position": f"{SHIPPED}.positive_position:PositivePosition",
@@ -40,6 +41,8 @@ class LawReference:
     text: str = ""
     file: str = ""
     """Where the text stood, for messages."""
+    axes: int = 0
+    """Of a law for any number of axes, how many it has here."""
 
     @property
     def sha256(self) -> str | None:
@@ -94,7 +97,7 @@ def law_class(law: LawReference) -> type[Law]:
 
 def layout_of(laws: Sequence[LawReference]) -> Layout:
     """The records of a loop that knows these laws."""
-    return Layout(tuple(law_class(law).records() for law in laws))
+    return Layout(tuple(law_class(law).records(law.axes) for law in laws))
 
 
 @cache

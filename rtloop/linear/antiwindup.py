@@ -9,6 +9,8 @@ by a limit, the states obey x⁺ = A(I − m c)x + …, which must be stable.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
@@ -50,6 +52,40 @@ def antiwindup(system: System, form: Form) -> Real:
             f"controller: while its output is limited its states have spectral radius {radius:.9g}; below 1 is needed"
         )
     return correction
+
+
+def antiwindup_together(a: Real, b: Real, c: Real) -> Real:
+    """M (n, m) with C M = I for a controller with m outputs, so that A(I − M C) is stable.
+
+    For C M = I the outputs must differ: where they do not, what they have in common is shared out by least squares. The
+    states follow as an estimator's do that measures the outputs almost without noise: M = W Cᵀ(C W Cᵀ)⁻¹, W the error
+    covariance of a stationary Kalman filter. Raises ValueError where there is none.
+    """
+    if a.shape[0] == 0 or not np.any(c):
+        return np.zeros((a.shape[0], c.shape[0]))
+    noise = 1e-9 * max(float(np.trace(c @ c.T)), 1e-300) * np.eye(c.shape[0])
+    driving = b @ b.T + 1e-9 * np.trace(b @ b.T) * np.eye(a.shape[0])
+    try:
+        covariance = solve_discrete_are(a.T, c.T, driving, noise)
+    except (np.linalg.LinAlgError, ValueError):
+        raise ValueError("controller: no anti-windup exists for its unstable modes; a stable one is needed") from None
+    return covariance @ c.T @ np.linalg.pinv(c @ covariance @ c.T)
+
+
+def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float) -> float:
+    """Share of a shortfall that the states take up in a tick. Raises ValueError where that is not stable.
+
+    `m` (n,) and `c` (n,), or (n, outputs) and (outputs, n).
+    """
+    share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
+    outputs = c.size // max(a.shape[0], 1)
+    radius = _radius(a - share * a @ m.reshape(-1, outputs) @ c.reshape(outputs, -1)) if a.size else 0.0
+    if not radius < 1:
+        raise ValueError(
+            f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
+            f"(largest |pole| {radius:.6g}); a smaller one, or 0, is needed"
+        )
+    return share
 
 
 def steady_state_gain(system: System) -> Real:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
-from rtloop.configuration.file import Configuration, describe
+from rtloop.configuration.file import Configuration, describe, shared_faults
 from rtloop.configuration.laws import Library
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import TableOfSamples, extent, generator_values, volts
@@ -27,6 +27,7 @@ from rtloop.signals import MODE, Mode
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels")
 """Parts of a configuration that only a restart can change."""
+OTHER_AXES = "controller.axes: which axes share a controller changed, which needs a restart"
 SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
 """Of an axis, that may be tuned."""
 
@@ -61,6 +62,8 @@ class LiveLaw:
             options = self.prepared.configuration.axes[number]
             if section not in SECTIONS:
                 raise _unsuitable(f"section {section!r}: {', '.join(SECTIONS)} may change")
+            if section == "controller":
+                return self._swap_controller(number, changes, keep=True)
             merged = options.model_dump(exclude_unset=True)
             merged[section] = {**(merged.get(section) or {}), **changes}
             return self._swap(number, self._validated_axis(merged))
@@ -68,10 +71,15 @@ class LiveLaw:
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
         """Swap [axis.controller] as a whole; returns the tick. Raises ConfigError, Refused."""
         with self._building:
-            number = self.axis_number(axis)
-            merged = self.prepared.configuration.axes[number].model_dump(exclude_unset=True)
-            merged["controller"] = dict(controller)
-            return self._swap(number, self._validated_axis(merged))
+            return self._swap_controller(self.axis_number(axis), controller, keep=False)
+
+    def _swap_controller(self, number: int, controller: Mapping[str, Any], keep: bool) -> int:
+        """As `_swap`, of the axis that has the controller of axis `number`; `keep` what is not said."""
+        configuration = self.prepared.configuration
+        owner = configuration.owners[number]
+        merged = configuration.axes[owner].model_dump(exclude_unset=True)
+        merged["controller"] = {**((merged.get("controller") or {}) if keep else {}), **controller}
+        return self._swap(owner, self._validated_axis(merged))
 
     def set_reference(self, axis: str, reference: Mapping[str, Any]) -> int:
         """Change the generator of an axis; returns the tick. Raises ConfigError, Refused."""
@@ -116,6 +124,8 @@ class LiveLaw:
             fixed = [part for part in FIXED if getattr(old, part) != getattr(new, part)]
             if fixed or prepared.plan.axes != self.prepared.plan.axes:
                 raise Refused(f"{', '.join(fixed) or 'axes'}: changed, which needs a restart")
+            if old.owners != new.owners:
+                raise Refused(OTHER_AXES)
             pairs = list(enumerate(zip(old.axes, new.axes, strict=True)))
             for _, (before, after) in pairs:
                 if before.feedforward != after.feedforward:
@@ -142,9 +152,12 @@ class LiveLaw:
             return list(dict.fromkeys(changed))
 
     def _note(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
-        """The loop has taken an axis of `prepared`, and of what it does `axis` is true; the others are as they were."""
+        """The loop has taken an axis of `prepared`, with those that share its controller, and of what that axis does
+        `axis` is true; the others are as they were.
+        """
         coefficients = np.asarray(self.prepared.plan.coefficients).copy()
-        coefficients[number] = np.asarray(prepared.plan.coefficients)[number]
+        for i in prepared.configuration.together(number):
+            coefficients[i] = np.asarray(prepared.plan.coefficients)[i]
         configuration = _with_axis(self.prepared.configuration, number, axis)
         self.prepared = replace(
             self.prepared, configuration=configuration, plan=replace(self.prepared.plan, coefficients=coefficients)
@@ -164,21 +177,31 @@ class LiveLaw:
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
-        prepared = prepare_limited(_with_axis(configuration, number, axis))
+        changed = _with_axis(configuration, number, axis)
+        if faults := shared_faults(changed.axes):
+            raise ConfigError("change", faults)
+        if changed.owners != configuration.owners:
+            raise Refused(OTHER_AXES)
+        prepared = prepare_limited(changed)
         with self._lock:
             return self._stage(number, prepared, axis)
 
     def _stage(self, number: int, prepared: Prepared, axis: AxisOptions) -> int:
-        """Copy coefficients to where the loop takes them from, have it take them; note `axis`. Raises Taken, too."""
-        before, after = self.prepared.configuration.axes[number], prepared.configuration.axes[number]
-        coefficients = np.asarray(prepared.plan.coefficients)[number : number + 1].copy()
-        coefficients["offset_v"] = self.offsets_v.get(number, float(coefficients["offset_v"][0]))
-        size = coefficients.dtype.itemsize
+        """Copy coefficients to where the loop takes them from, have it take them; note `axis`. Raises Taken, too.
+
+        Axes that share a controller are taken together, by the number of the first.
+        """
+        first, *others = prepared.configuration.together(number)
+        before, after = self.prepared.configuration.axes[first], prepared.configuration.axes[first]
+        coefficients = np.asarray(prepared.plan.coefficients)[first : first + 1 + len(others)].copy()
+        for place, i in enumerate((first, *others)):
+            coefficients["offset_v"][place] = self.offsets_v.get(i, float(coefficients["offset_v"][place]))
+        begin = first * coefficients.dtype.itemsize
         self._require_settled()
-        self._block["staged"][number * size : (number + 1) * size] = np.frombuffer(coefficients.tobytes(), np.uint8)
+        self._block["staged"][begin : begin + coefficients.nbytes] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller
         try:
-            tick = self._settling(Kind.LOAD_LAW, number, [float(another)])
+            tick = self._settling(Kind.LOAD_LAW, first, [float(another)])
         except Taken:
             self._note(number, prepared, axis)
             raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from rtloop.hil.options import Numbers
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
 from rtloop.laws.shipped.play_model import PlayModel, play_model
-from rtloop.linear.options import TransferOptions
+from rtloop.linear.options import Matrix, TransferOptions
 
 
 class PrandtlIshlinskiiOptions(FeedforwardOptions):
@@ -57,12 +57,57 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         return (forward if self.dead_band == "exact" else behind), behind.inverse()
 
 
-class TransferControllerOptions(ControllerOptions, TransferOptions):
+class SampledTransferOptions(TransferOptions):
     """C(s) and how it becomes C(z)."""
 
-    kind: str = "transfer"
     method: Literal["matched", "tustin", "foh", "zoh"] = "matched"
     prewarp_hz: float | None = Field(default=None, gt=0)
+
+
+class TransferControllerOptions(ControllerOptions, SampledTransferOptions):
+    """C(s), C(z), and what becomes of the states while the command is limited."""
+
+    kind: str = "transfer"
     tracking_s: float = Field(default=0.0005, ge=0)
     """Anti-windup: time constant with which the states follow a command that was limited, short against the loop's
     response. 0 is at once, which lets even a single limited tick throw the slow states off."""
+
+
+class CoupledOptions(ControllerOptions):
+    """A controller of several axes: `loops`, a transfer function for each, or a state space in s, from errors to
+    commands; behind either stands `decoupling`.
+    """
+
+    kind: str = "coupled"
+    loops: Annotated[tuple[SampledTransferOptions, ...], Field(strict=False)] = ()
+    a: Matrix = ()
+    b: Matrix = ()
+    c: Matrix = ()
+    d: Matrix = ()
+    prewarp_hz: float | None = Field(default=None, gt=0)
+    """Of the state space: the frequency that keeps its place when it is discretised, by Tustin's rule."""
+    decoupling: Matrix = ()
+    """Commands per output of the loops, a row an axis: the inverse of the stage's coupling. None: each its own."""
+    tracking_s: float = Field(default=0.0005, ge=0)
+    """Anti-windup, as of `transfer`."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        count = len(self.axes)
+        if bool(self.loops) == bool(self.d):
+            raise ValueError("either loops, one for each axis, or a state space a, b, c, d, is needed")
+        if self.loops and len(self.loops) != count:
+            raise ValueError(f"{len(self.loops)} loops for {count} axes; one for each is needed")
+        if self.loops and (self.a or self.b or self.c or self.prewarp_hz is not None):
+            raise ValueError("a, b, c, prewarp_hz: of the state space; allowed without loops")
+        order = len(self.a)
+        shapes = {"a": (order, order), "b": (order, count), "c": (count, order), "d": (count, count)}
+        for name, shape in {**shapes, "decoupling": (count, count)}.items():
+            rows = getattr(self, name)
+            if rows and (len(rows) != shape[0] or any(len(row) != shape[1] for row in rows)):
+                raise ValueError(f"{name}: {shape[0]} rows of {shape[1]} numbers are needed")
+        if order and not (self.b and self.c):
+            raise ValueError("b, c: needed beside a")
+        if self.decoupling and np.linalg.matrix_rank(np.array(self.decoupling)) < count:
+            raise ValueError("decoupling: its rows depend on each other; an invertible matrix is needed")
+        return self

@@ -5,7 +5,6 @@ From C(s) by `rtloop.linear.discretise`, which is imported where a law is built 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
@@ -141,10 +140,14 @@ class TransferController(Controller):
 
     def build(self) -> Mapping[str, Any]:
         """States in the kernels' order. Raises ValueError for too high an order and an unstable anti-windup."""
+        from rtloop.linear.antiwindup import tracking_share
+
         controller = self.discrete
         order = controller.b.size
         if order > MAX_ORDER:
             raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
+        a, m, c = controller.a, controller.antiwindup, controller.c
+        share = tracking_share(a, m, c, self.options.tracking_s, self.period_s)
         places = _places(controller.a)
         a = np.zeros((MAX_ORDER, MAX_ORDER))
         a[np.ix_(places, places)] = controller.a
@@ -162,11 +165,11 @@ class TransferController(Controller):
             "row_start": bands[:, 0],
             "row_stop": bands[:, 1],
             "b": _placed(controller.b, places),
-            "c": _placed(controller.c, places),
+            "c": _placed(c, places),
             "d": controller.d,
-            "tracking": _placed(controller.antiwindup, places),
+            "tracking": _placed(m, places),
             "steady_state": _placed(controller.steady_state_gain, places),
-            "tracking_share": _tracking_share(controller, self.options.tracking_s, self.period_s),
+            "tracking_share": share,
         }
 
     def linear(self) -> DiscreteController:
@@ -194,16 +197,3 @@ def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
         for half, state in enumerate(pair):
             places[state] = number // LANES * BLOCK + number % LANES + half * LANES
     return places
-
-
-def _tracking_share(controller: DiscreteController, tracking_s: float, period_s: float) -> float:
-    """Share of a shortfall that the states take up in a tick. Raises ValueError where that is not stable."""
-    share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
-    a, m, c = controller.a, controller.antiwindup, controller.c
-    radius = np.abs(np.linalg.eigvals(a - share * np.outer(a @ m, c))).max(initial=0.0)
-    if not radius < 1:
-        raise ValueError(
-            f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
-            f"(largest |pole| {radius:.6g}); a smaller one, or 0, is needed"
-        )
-    return share

@@ -7,10 +7,12 @@ that the user names, if it is the recorded one to the letter; from the recording
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from rtloop.laws.registry import BUILT_IN, LawReference, kinds, layout_of, reference
+from rtloop.law.layout import MAX_COUPLED
+from rtloop.laws.contract import ANY_NUMBER
+from rtloop.laws.registry import BUILT_IN, LawReference, kinds, law_class, layout_of, reference
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 
@@ -43,6 +45,16 @@ def recorded_laws(recording: Recording, trust: Trust = NOTHING) -> tuple[LawRefe
 
 
 def _law(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:
+    """A law for any number of axes is taken for as many as it had."""
+    law, axes = _named(entry, recording, trust), entry.get("axes")
+    if law_class(law).axes != ANY_NUMBER:
+        return law
+    if not isinstance(axes, int) or not 2 <= axes <= MAX_COUPLED:
+        raise RecordingError(f"{recording.paths[0]}: law {law.kind!r}: {axes!r} axes; 2 to {MAX_COUPLED} are allowed")
+    return replace(law, axes=axes)
+
+
+def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
     where = f"{recording.paths[0]}: law {name!r}"
     if digest is None:

@@ -1,0 +1,164 @@
+"""Several axes closed by one controller, on a plant whose axes move each other, sample by sample.
+
+    r ──(+)── e ──► C(z) ──► v ──► K ──► (delay) ──► D_i ──┬──► x       L = G C,  G = diag(D_i) K
+          ▲ −                                              │            S = (I + L)⁻¹
+          └────────────────────────────────────────────────┘
+
+Margins of one axis are those of its loop broken alone, with all others closed. They say nothing of changes in several
+axes at once: the largest singular value of S and the disk margin do (Skogestad and Postlethwaite, Multivariable
+Feedback Control, 2005; Seiler, Packard and Gahinet, An Introduction to Disk Margins, 2020).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.analysis.closed_loop import Loop, sampled_plant
+from rtloop.analysis.margins import highest
+from rtloop.hil.modal import Complex, Real
+from rtloop.linear.realisation import System
+from rtloop.linear.together import BESIDE_ONE, SampledTogether, SystemTogether, beside_each_other
+from rtloop.linear.transfer import Transfer
+
+BALANCINGS = 30
+INTEGRATES = 1e6
+"""A loop whose gain beside z = 1 is above this is without limit there."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledPlant:
+    """D_i(s) and samples of delay of each axis, and K, (axes, axes)."""
+
+    dynamics: tuple[Transfer, ...]
+    delay_ticks: tuple[int, ...]
+    coupling: Real
+
+    def with_dynamics(self, number: int, changed: Transfer) -> CoupledPlant:
+        """Another D of one axis."""
+        return replace(self, dynamics=(*self.dynamics[:number], changed, *self.dynamics[number + 1 :]))
+
+    def sampled(self, period_s: float) -> SystemTogether:
+        """Behind a zero-order hold. Raises ValueError for an axis with direct feedthrough."""
+        for plant in self.dynamics:
+            if not plant.is_strictly_proper:
+                raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
+        pairs = zip(self.dynamics, self.delay_ticks, strict=True)
+        return beside_each_other([sampled_plant(plant, period_s, ticks) for plant, ticks in pairs]).mixed(self.coupling)
+
+
+def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
+    """K: 1 on the diagonal, and beside it what each axis takes of the others, 0 for those that are not named."""
+    pairs = zip(names, coupling, strict=True)
+    return np.array([[1.0 if a == b else taken.get(b, 0.0) for b in names] for a, taken in pairs])
+
+
+class TogetherMargins(NamedTuple):
+    """The largest singular value of S and of T, and the disk margins α of all sensors and of all commands at once.
+
+    Every axis's gain may change within a factor (1 − α/2)/(1 + α/2) … (1 + α/2)/(1 − α/2), and every one's phase by
+    2 atan(α/2), all at once and each its own way. NaN where the loop is unstable.
+    """
+
+    max_sensitivity: float
+    max_sensitivity_hz: float
+    max_tracking: float
+    disk_margin: float
+    disk_margin_hz: float
+    command_disk_margin: float
+    command_disk_margin_hz: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; null for NaN."""
+        return {name: None if np.isnan(value) else value for name, value in self._asdict().items()}
+
+
+class CoupledLoop:
+    """C(z) and G(z), joined."""
+
+    def __init__(self, controller: SampledTogether, plant: CoupledPlant) -> None:
+        self.period_s = controller.period_s
+        self._controller, self._plant = controller.system, plant.sampled(controller.period_s)
+        self.count = controller.count
+
+    def alone(self, number: int) -> Loop:
+        """The loop of one axis, broken at its sensor, the others closed; what it calls its command is its error."""
+        ac, bc, cc, dc = self._controller
+        ap, bp, cp, _ = self._plant
+        closed = np.eye(self.count)
+        closed[number, number] = 0.0
+        a = np.block([[ap - bp @ dc @ closed @ cp, bp @ cc], [-bc @ closed @ cp, ac]])
+        b = np.concatenate([bp @ dc[:, number], bc[:, number]])
+        c = np.concatenate([cp[number], np.zeros(ac.shape[0])])
+        own = System(a, b, c, 0.0)
+        poles = np.linalg.eigvals(a).astype(np.complex128)
+        rates = np.asarray(np.log(poles[np.abs(poles) > 1e-9]) / self.period_s, np.complex128)
+        at_rest = float(own.response(1.0 + BESIDE_ONE)[0].real)
+        nothing = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
+        static = at_rest if abs(at_rest) < INTEGRATES else np.copysign(np.inf, at_rest)
+        return Loop(nothing, own, float(static), rates, self.period_s)
+
+    @cached_property
+    def poles(self) -> Complex:
+        """Of the whole, closed."""
+        return self.alone(0).poles
+
+    @property
+    def is_stable(self) -> bool:
+        """Every pole inside the unit circle."""
+        return bool(np.all(np.abs(self.poles) < 1))
+
+    def sensitivity(self, hz: npt.ArrayLike) -> Complex:
+        """S = (I + G C)⁻¹ at frequencies (k,) in Hz, (k, axes, axes): from references to errors."""
+        return self._inverse(hz, self._plant, self._controller)
+
+    def command_sensitivity(self, hz: npt.ArrayLike) -> Complex:
+        """(I + C G)⁻¹, from what is added to the commands to what goes out, (k, axes, axes)."""
+        return self._inverse(hz, self._controller, self._plant)
+
+    def _inverse(self, hz: npt.ArrayLike, first: SystemTogether, second: SystemTogether) -> Complex:
+        points = np.exp(2 * np.pi * (1e-12 + 1j) * np.atleast_1d(np.asarray(hz, float)) * self.period_s)
+        opened = first.response(points) @ second.response(points)
+        return np.asarray(np.linalg.inv(np.eye(self.count) + opened), np.complex128)
+
+    @cached_property
+    def margins(self) -> TogetherMargins:
+        """What all axes together may bear."""
+        if not self.is_stable:
+            return TogetherMargins(*[np.nan] * len(TogetherMargins._fields))
+        hz = np.unique(np.concatenate([self.alone(i).frequencies for i in range(self.count)]))
+        one = np.eye(self.count)
+        peak, peak_hz = highest(lambda f: _largest(self.sensitivity(f)), hz)
+        tracking, _ = highest(lambda f: _largest(one - self.sensitivity(f)), hz)
+        disk, disk_hz = highest(lambda f: _structured(self.sensitivity(f) - one / 2), hz)
+        command, command_hz = highest(lambda f: _structured(self.command_sensitivity(f) - one / 2), hz)
+        return TogetherMargins(peak, peak_hz, tracking, 1 / disk, disk_hz, 1 / command, command_hz)
+
+
+def _largest(matrices: Complex) -> Real:
+    """Largest singular value of each of (k, m, m)."""
+    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, 0], np.float64)
+
+
+def _structured(matrices: Complex) -> Real:
+    """μ of each of (k, m, m) for a diagonal of complex changes, from above: σ̄ after scaling, which is exact for two.
+
+    The scaling makes the norms of each row and column beside the diagonal equal (Osborne, 1960): the Frobenius norm
+    is then least, and with it, for two axes, the largest singular value, as their product does not depend on it.
+    """
+    found = matrices.copy()
+    axes = np.arange(found.shape[1])
+    for _ in range(BALANCINGS if axes.size > 2 else 1):
+        for i in axes:
+            others = axes != i
+            row = np.linalg.norm(found[:, i, others], axis=1)
+            column = np.linalg.norm(found[:, others, i], axis=1)
+            scale = np.sqrt(np.where((row > 0) & (column > 0), column / np.where(row > 0, row, 1.0), 1.0))
+            found[:, i, :] *= scale[:, None]
+            found[:, :, i] /= scale[:, None]
+    return _largest(found)

@@ -1,0 +1,188 @@
+"""What is known of the axes before they run: their controllers as they will run, and their loops on their models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.comparison import Comparison, compare
+from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, TogetherMargins, coupling_matrix
+from rtloop.analysis.loop_analysis import LoopAnalysis, analyse, analyse_continuous, analyse_discrete
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.file import Configuration
+from rtloop.laws.contract import Controller, CoupledController
+from rtloop.laws.linearise import linear_part
+from rtloop.laws.options import ControllerOptions
+from rtloop.laws.shipped.transfer import TransferController
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.sampled import Sampled
+from rtloop.linear.together import SampledTogether
+from rtloop.linear.transfer import Transfer
+
+COMPARED_PART = 0.2
+"""C(z) is compared with C(s) up to this part of the rate; toward half of it every method must differ."""
+
+
+@dataclass
+class Findings:
+    """What is wrong with a configuration, and what should not be."""
+
+    faults: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def at(self, where: str) -> Iterator[None]:
+        """A ValueError raised within is a fault at `where`, and what follows goes on."""
+        try:
+            yield
+        except ValueError as error:
+            self.faults.append(f"{where}{error}")
+
+
+@dataclass(frozen=True)
+class Together:
+    """Of an axis whose controller has several: their names, its number among them, and their loop on their models."""
+
+    axes: tuple[str, ...]
+    place: int
+    law: CoupledController
+    linear: SampledTogether | None = None
+    plant: CoupledPlant | None = None
+    margins: TogetherMargins | None = None
+
+    def alone(self, dynamics: Transfer) -> Loop:
+        """The loop of this axis with other dynamics, broken alone."""
+        assert self.linear is not None
+        assert self.plant is not None
+        return CoupledLoop(self.linear, self.plant.with_dynamics(self.place, dynamics)).alone(self.place)
+
+
+@dataclass(frozen=True)
+class AxisCheck:
+    """What is known of an axis before it runs; None where there is no controller or no model.
+
+    Of an axis that shares its controller, `running` is its loop broken alone, and `together` knows the rest.
+    """
+
+    name: str
+    law: Controller | None = None
+    linear: DiscreteController | Sampled | None = None
+    controller: Transfer | None = None
+    discrete: DiscreteController | None = None
+    comparison: Comparison | None = None
+    plant: Transfer | None = None
+    continuous: LoopAnalysis | None = None
+    running: LoopAnalysis | None = None
+    together: Together | None = None
+
+
+def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
+    """Of every axis, in their order; what is wrong with one goes to `findings`."""
+    found, period_s = list[AxisCheck](), 1.0 / configuration.loop.rate_hz
+    for number, axis in enumerate(configuration.axes):
+        if len(configuration.together(number)) == 1:
+            found.append(_check(axis, period_s, findings))
+        elif number == configuration.owners[number]:
+            found += _check_together(configuration, number, period_s, findings)
+    return found
+
+
+def _check(axis: AxisOptions, period_s: float, findings: Findings) -> AxisCheck:
+    """The controller, C(z)'s agreement with C(s), and the loop on the axis's model as far as the law is linear."""
+    if axis.controller is None:
+        return AxisCheck(axis.name)
+    where, linear = f"axis.{axis.name}.controller", None
+    law = controller_of(axis, period_s)
+    check = AxisCheck(axis.name, law)
+    if isinstance(law, TransferController):
+        with findings.at(f"{where}: "):
+            linear, transfer = law.discrete, law.options.transfer()
+            comparison = compare(transfer, linear, up_to_hz=COMPARED_PART / period_s)
+            findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
+            check = replace(check, controller=transfer, discrete=linear, comparison=comparison)
+        if linear is None:
+            return replace(check, law=None)
+    elif law is not None:
+        try:
+            linear = linear_part(law)
+        except ValueError as error:
+            findings.warnings.append(f"{where}: stability and margins are not checked: {error}")
+            return check
+    if axis.model is None or linear is None:
+        findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
+        return replace(check, linear=linear)
+    plant, continuous, running = axis.model.transfer(), None, None
+    with findings.at(f"axis.{axis.name}.model: "):
+        continuous = None if check.controller is None else analyse_continuous(check.controller, plant)
+        running = analyse_discrete(linear, plant, axis.model.delay_ticks)
+    if running is not None:
+        _require_stable(running, axis.controller, where, f"axis.{axis.name}.model", findings)
+    return replace(check, linear=linear, plant=plant, continuous=continuous, running=running)
+
+
+def _require_stable(
+    running: LoopAnalysis, options: ControllerOptions, where: str, models: str, findings: Findings
+) -> None:
+    if running.stable or running.period_s is None:
+        return
+    message_ = (
+        f"{where}: the loop is unstable on {models} at {1 / running.period_s:g} Hz "
+        f"(largest |pole| {running.max_abs_pole:.6f}, must be below 1)"
+    )
+    if options.allow_unstable:
+        findings.warnings.append(message_)
+    else:
+        findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
+
+
+def _check_together(configuration: Configuration, number: int, period_s: float, findings: Findings) -> list[AxisCheck]:
+    """Of axes that share the controller of axis `number`: each one's loop broken alone, and all of them at once."""
+    axes = [configuration.axes[i] for i in configuration.together(number)]
+    names, options, where = tuple(axis.name for axis in axes), axes[0].controller, f"axis.{axes[0].name}.controller"
+    law = controller_of(axes[0], period_s, [axis.model for axis in axes])
+    assert isinstance(law, CoupledController)
+    assert options is not None
+    checks = [AxisCheck(name, law, together=Together(names, place, law)) for place, name in enumerate(names)]
+    linear, plant, loop = None, _coupled_plant(axes, findings), None
+    try:
+        linear = linear_part(law)
+    except ValueError as error:
+        if type(law).shipped:
+            findings.faults.append(f"{where}: {error}")
+            return [replace(check, law=None) for check in checks]
+        findings.warnings.append(f"{where}: stability and margins are not checked: {error}")
+    if linear is not None and plant is not None:
+        with findings.at(f"{where}: "):
+            loop = CoupledLoop(linear, plant)
+    if loop is None or linear is None or plant is None:
+        return checks
+    margins, found = loop.margins, []
+    for place, check in enumerate(checks):
+        running = replace(analyse(loop.alone(place), plant.delay_ticks[place]), peak_command=math.nan)
+        together = Together(names, place, law, linear, plant, margins)
+        found.append(replace(check, plant=plant.dynamics[place], running=running, together=together))
+    _require_stable(found[0].running, options, where, f"the models of {', '.join(names)}", findings)
+    return found
+
+
+def _coupled_plant(axes: Sequence[AxisOptions], findings: Findings) -> CoupledPlant | None:
+    """The plant of axes that have a model each, None where one has none."""
+    models = [axis.model for axis in axes if axis.model is not None]
+    names = [axis.name for axis in axes]
+    missing = [axis.name for axis in axes if axis.model is None]
+    findings.warnings += [f"axis.{name}.model: missing; stability and margins are not checked" for name in missing]
+    for axis, model in zip(axes, models, strict=False):
+        for other in model.coupling:
+            if other not in names or other == axis.name:
+                findings.faults.append(f"axis.{axis.name}.model.coupling.{other}: no other axis of its controller")
+    if missing:
+        return None
+    return CoupledPlant(
+        tuple(model.transfer() for model in models),
+        tuple(model.delay_ticks for model in models),
+        coupling_matrix(names, [model.coupling for model in models]),
+    )

@@ -1,0 +1,157 @@
+"""A controller of several axes, any linear one: x⁺ = A x + B e, v = W (C x + D e), e and v with an entry an axis.
+
+W is a decoupling matrix: where a stage's axes move each other by K, x = D K v, it is K⁻¹, and the loops do not meet.
+The states follow what was really applied in the observer form of anti-windup (Åström and Wittenmark,
+Computer-Controlled Systems, 1997), with a column for each command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rtloop.hil.native.compiled import jit
+from rtloop.law.layout import MAX_COUPLED, whole_lines
+from rtloop.law.validity import Allowed
+from rtloop.laws.contract import CoupledController
+from rtloop.laws.shipped.options import CoupledOptions
+from rtloop.linear.realisation import row_bands
+
+if TYPE_CHECKING:
+    from rtloop.linear.together import SampledTogether
+
+MAX_ORDER = 48
+COEFFICIENTS = whole_lines(
+    [
+        ("a", np.float64, (MAX_ORDER, MAX_ORDER)),
+        *((name, np.float64, (MAX_ORDER, MAX_COUPLED)) for name in ("b", "tracking", "steady_state")),
+        ("c", np.float64, (MAX_COUPLED, MAX_ORDER)),
+        ("d", np.float64, (MAX_COUPLED, MAX_COUPLED)),
+        ("row_start", np.uint8, (MAX_ORDER,)),
+        ("row_stop", np.uint8, (MAX_ORDER,)),
+        ("order", np.uint8),
+        ("count", np.uint8),
+        ("unused", np.uint8, (6,)),
+        ("share", np.float64),
+    ]
+)
+STATE = whole_lines([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float64, (MAX_ORDER,))])
+
+
+@jit
+def commands(c, s, told):
+    """v = C x + D e in µm, the decoupling in C and D."""
+    for i in range(c.count):
+        command_um = 0.0
+        for j in range(c.order):
+            command_um += c.c[i, j] * s.x[j]
+        for j in range(c.count):
+            command_um += c.d[i, j] * told.error_um[j]
+        told.command_um[i] = command_um
+
+
+@jit
+def advance(c, s, told):
+    """x⁺ = A (x + M (v_applied − v)) + B e."""
+    for j in range(c.order):
+        s.scratch[j] = s.x[j]
+        for i in range(c.count):
+            s.scratch[j] += c.share * c.tracking[j, i] * (told.applied_um[i] - told.command_um[i])
+    for j in range(c.order):
+        value = 0.0
+        for k in range(c.row_start[j], c.row_stop[j]):
+            value += c.a[j, k] * s.scratch[k]
+        for i in range(c.count):
+            value += c.b[j, i] * told.error_um[i]
+        s.x[j] = value
+
+
+@jit
+def go_on(c, s, told):
+    """State from which it continues at commands: its steady state for the errors, corrected along M."""
+    for j in range(c.order):
+        s.x[j] = 0.0
+        for i in range(c.count):
+            s.x[j] += c.steady_state[j, i] * told.error_um[i]
+    for i in range(c.count):
+        gap_um = told.command_um[i]
+        for j in range(c.order):
+            gap_um -= c.c[i, j] * s.x[j]
+        for j in range(c.count):
+            gap_um -= c.d[i, j] * told.error_um[j]
+        for j in range(c.order):
+            s.scratch[j] = (s.scratch[j] if i > 0 else 0.0) + c.tracking[j, i] * gap_um
+    for j in range(c.order):
+        s.x[j] += s.scratch[j]
+
+
+class Coupled(CoupledController):
+    """Transfer functions behind a decoupling matrix, or a state space, for 2 to 8 axes."""
+
+    kind = "coupled"
+    options_model = CoupledOptions
+    coefficients, state = COEFFICIENTS, STATE
+    allowed_coefficients = MappingProxyType(
+        {
+            "order": Allowed(0, MAX_ORDER),
+            "count": Allowed(0, MAX_COUPLED),
+            "row_start": Allowed(0, MAX_ORDER),
+            "row_stop": Allowed(0, MAX_ORDER),
+        }
+    )
+    shipped = True
+    output, update, enter = commands, advance, go_on
+
+    @cached_property
+    def _built(self) -> tuple[SampledTogether, Any]:
+        """The discrete controller, its decoupling included, and M. Raises ValueError."""
+        from rtloop.linear.antiwindup import antiwindup_together
+        from rtloop.linear.discretise import discretise
+        from rtloop.linear.together import SampledTogether, SystemTogether, beside_each_other, tustin
+
+        options: CoupledOptions = self.options
+        decoupling = np.array(options.decoupling) if options.decoupling else np.eye(self.count)
+        if options.loops:
+            loops = [discretise(one.transfer(), self.period_s, one.method, one.prewarp_hz) for one in options.loops]
+            system = beside_each_other([loop.system for loop in loops])
+            own = beside_each_other([loop.system._replace(b=loop.antiwindup) for loop in loops]).b
+            tracking = own @ np.linalg.inv(decoupling)
+        else:
+            order = len(options.a)
+            given = [np.array(getattr(options, name), float) for name in "abcd"]
+            shapes = ((order, order), (order, self.count), (self.count, order), (self.count, self.count))
+            matrices = [matrix.reshape(shape) for matrix, shape in zip(given, shapes, strict=True)]
+            system = tustin(SystemTogether(*matrices), self.period_s, options.prewarp_hz)
+            tracking = antiwindup_together(system.a, system.b, decoupling @ system.c)
+        return SampledTogether(system.mixed(after=decoupling), self.period_s), tracking
+
+    def build(self) -> Mapping[str, Any]:
+        """Matrices with room behind them. Raises ValueError for too high an order and an unstable anti-windup."""
+        from rtloop.linear.antiwindup import tracking_share
+
+        found, tracking = self._built
+        a, b, c, d = found.system
+        if found.order > MAX_ORDER:
+            raise ValueError(f"controller: order {found.order}; at most {MAX_ORDER} is allowed")
+        bands = row_bands(a)
+        return {
+            "order": found.order,
+            "count": self.count,
+            "a": a,
+            "b": b,
+            "c": c,
+            "d": d,
+            "row_start": bands[:, 0],
+            "row_stop": bands[:, 1],
+            "tracking": tracking,
+            "steady_state": np.linalg.pinv(np.eye(found.order) - a, rcond=1e-9) @ b,
+            "share": tracking_share(a, tracking, c, self.options.tracking_s, self.period_s),
+        }
+
+    def linear(self) -> SampledTogether:
+        """From errors to commands."""
+        return self._built[0]
