@@ -80,7 +80,7 @@ def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
     said = len(options.axes)
     if not issubclass(kind, CoupledController):
         if said > 1:
-            raise ValueError(f"axes: {said}; law {law.kind!r} is for one axis")
+            raise ValueError(f"axes: {said} are named; law {law.kind!r} is for one axis")
         return 0
     fewest, most = (2, MAX_COUPLED) if kind.axes == ANY_NUMBER else (kind.axes, kind.axes)
     if not fewest <= said <= most:

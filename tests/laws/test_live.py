@@ -26,6 +26,7 @@ CONTROLLERS = {
     **{
         path.stem: text[text.index("[axis.controller]") : text.index("[axis.model]")]
         for path in (DEPLOY / "laws").glob("*.toml")
+        if path.stem != "coupled"
         for text in [path.read_text()]
     },
     "mine": '[axis.controller]\nfile = "mine.py"\n',

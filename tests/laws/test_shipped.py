@@ -11,7 +11,8 @@ from rtloop.configuration.coefficients import controller_of
 from rtloop.configuration.file import load
 from rtloop.laws.conformance import LawConformance
 from rtloop.laws.registry import BUILT_IN
-from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+from rtloop.laws.shipped.coupled import Coupled
+from rtloop.laws.shipped.options import CoupledOptions, PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.prandtl_ishlinskii import PrandtlIshlinskii
 from tests.law.harness import EQ_4, EXACT, PERIOD_S
 
@@ -22,6 +23,16 @@ EXAMPLES = {path.stem.replace("-", "_"): path for path in sorted((DEPLOY / "laws
 def example(path: Path):
     """The controller of a configuration."""
     return controller_of(load(path).axes[0], PERIOD_S)
+
+
+def state_space() -> Coupled:
+    """A controller of three axes, from matrices."""
+    random = np.random.default_rng(4)
+    a = np.diag([0.0, -3.0, -40.0, -700.0, -5.0]) + np.triu(random.normal(size=(5, 5)), 1)
+    matrices = {"a": a, "b": 10 * random.normal(size=(5, 3)), "c": random.normal(size=(3, 5)), "d": np.eye(3) * 0.1}
+    decoupling = np.eye(3) + 0.1 * random.normal(size=(3, 3))
+    said = {name: matrix.tolist() for name, matrix in {**matrices, "decoupling": decoupling}.items()}
+    return Coupled(CoupledOptions.model_validate({"axes": ["x", "y", "z"], **said}), PERIOD_S, (None, None, None))
 
 
 def test_every_controller_that_is_shipped_has_an_example():
@@ -47,6 +58,16 @@ class TestPositivePosition(LawConformance):
 
 class TestRepetitive(LawConformance):
     law = example(EXAMPLES["repetitive"])
+
+
+class TestCoupled(LawConformance):
+    law = example(EXAMPLES["coupled"])
+
+
+class TestCoupledFromAStateSpace(LawConformance):
+    """Three axes, five states of which one integrates, a direct part, a decoupling."""
+
+    law = state_space()
 
 
 class TestPrandtlIshlinskii(LawConformance):

@@ -1,0 +1,254 @@
+"""Controllers of several axes: the shipped one against scipy and the rig, a laboratory's own, what is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from rtloop.analysis.coupled_loop import CoupledLoop
+from rtloop.configuration.file import load, parse
+from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.engine.loop import Outcome
+from rtloop.engine.messages import Kind
+from rtloop.errors import ConfigError
+from rtloop.laws.conformance import Bench
+from rtloop.laws.linearise import linearised
+from rtloop.recording.file.events import event_of
+from tests.engine.harness import LoopBench
+from tests.law.harness import PERIOD_S
+from tests.laws.test_shipped import EXAMPLES, example, state_space
+
+EXAMPLE = EXAMPLES["coupled"].read_text()
+CONTROLLER = EXAMPLE[EXAMPLE.index("[axis.controller]\n") : EXAMPLE.index("[axis.model]")]
+LOOP = CONTROLLER[CONTROLLER.index("[[axis.controller.loops]]\n") :].split("[[axis.controller.loops]]\n")[1]
+DECOUPLING = "decoupling = [[0.98232, -0.14735], [0.11788, 0.98232]]"
+PID = '[axis.controller]\nkind = "pid"\nki_per_s = 1.0\n'
+ALONE = "[axis.controller]\n" + LOOP
+THRESHOLDS, WEIGHTS = "thresholds_v = [0.0, 1.46, 4.01]", "weights_um_per_v = [3.0, 0.6, 0.9]"
+INVERTIBLE = f'[driver.plant.hysteresis]\ntruth = "custom"\n{THRESHOLDS}\n{WEIGHTS}\n[driver.coupling]'
+"""Hysteresis without a dead band, which the inverse undoes wholly: what is left is linear."""
+NOMINAL = '[driver.plant.hysteresis]\ntruth = "nominal"\n[driver.coupling]'
+
+
+def prepared(text: str, folder: Path = Path()) -> Prepared:
+    return prepare(parse(text, "test", folder, "test"), paced=False)
+
+
+def referenced(text: str, x: str, y: str) -> str:
+    """With other references of the two axes."""
+    head, first, second = text.split("[axis.reference]\n")
+    return f"{head}[axis.reference]\n{x}\n[[axis]]{first.split('[[axis]]')[1]}[axis.reference]\n{y}\n"
+
+
+def two_single_loops(text: str) -> str:
+    """The same loops, each axis by itself; their models know nothing of a coupling, as such controllers do not."""
+    alone = (
+        text.replace(CONTROLLER, ALONE)
+        .replace("coupling = { y = 0.15 }\n", "")
+        .replace("coupling = { x = -0.12 }\n", "")
+    )
+    head, second = alone.split('name = "y"\n')
+    return head + 'name = "y"\n' + second.replace("[axis.model]", ALONE + "[axis.model]")
+
+
+def invertible(text: str) -> str:
+    """The rig with that hysteresis, and the feedforward with the same."""
+    text = re.sub(r"thresholds_v = \[[^\]]*\]", THRESHOLDS, text)
+    text = re.sub(r"weights_um_per_v = \[[^\]]*\]", WEIGHTS, text)
+    return text.replace("[driver.coupling]", INVERTIBLE)
+
+
+def run(text: str, ticks: int, folder: Path = Path()) -> tuple[LoopBench, np.ndarray]:
+    bench = LoopBench(prepared(text, folder).plan)
+    rows = bench.run(ticks)
+    assert bench.outcome is Outcome.DONE
+    return bench, rows
+
+
+def test_it_computes_what_its_matrices_say():
+    """Against scipy's simulation of C(z), where all that is commanded is applied; and so does its linear part."""
+    for law in (example(EXAMPLES["coupled"]), state_space()):
+        bench, linear = Bench(law), law.linear()
+        random, axes = np.random.default_rng(1), law.count
+        errors_um = random.normal(size=(300, axes))
+        told, found = bench._told[0], []
+        for error_um in errors_um:
+            told.error_um = error_um
+            found.append(bench._commands(told))
+            told.applied_um = told.command_um
+            bench._call("update", told)
+        _, expected, _ = signal.dlsim((*linear.system, PERIOD_S), errors_um)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 50) * PERIOD_S)
+        np.testing.assert_allclose(linearised(law).system.response(z), linear.system.response(z), rtol=1e-5, atol=1e-9)
+
+
+def test_without_decoupling_it_is_its_loops_one_beside_the_other():
+    alone = prepared(two_single_loops(EXAMPLE)).checks[0].discrete
+    law = prepared(EXAMPLE.replace("decoupling =", "# decoupling =")).checks[0].law
+    z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 50) * PERIOD_S)
+    found = law.linear().system.response(z)
+    for i in range(2):
+        np.testing.assert_allclose(found[:, i, i], alone.system.response(z), rtol=1e-12)
+    assert np.all(found[:, 0, 1] == 0)
+    assert np.all(found[:, 1, 0] == 0)
+
+
+def test_a_limited_command_does_not_wind_it_up():
+    """With the states following at once they explain what was applied: C x + D e is that."""
+    for law in (example(EXAMPLES["coupled"]), state_space()):
+        bench, (a, b, c, d) = Bench(law), law.linear().system
+        bench.coefficients["share"] = 1.0
+        random, told, axes = np.random.default_rng(2), bench._told[0], law.count
+        for _ in range(50):
+            told.error_um = random.normal(size=axes)
+            bench._commands(told)
+            applied_um = random.normal(size=axes)
+            told.applied_um = applied_um
+            x = bench.state["x"][0, : a.shape[0]] + bench.coefficients["tracking"][0, : a.shape[0], :axes] @ (
+                applied_um - told.command_um
+            )
+            np.testing.assert_allclose(c @ x + d @ told.error_um, applied_um, atol=1e-7)
+            bench._call("update", told)
+            np.testing.assert_allclose(bench.state["x"][0, : a.shape[0]], a @ x + b @ told.error_um, atol=1e-9)
+
+
+def test_cross_talk_is_what_the_decoupling_takes_away():
+    """A step of 20 µm in x: what y moves, with the decoupling and with two single loops, on the plant of the model.
+
+    What is left is what the first threshold keeps of y's drive, 0.095 V · 2.55 µm/V, which no inverse undoes.
+    """
+    text = referenced(EXAMPLE.replace("[driver.coupling]", NOMINAL), 'kind = "hold"\nvalue = 20.0', 'kind = "hold"')
+    moved = {}
+    for name, one in (("decoupled", text), ("single", two_single_loops(text))):
+        bench, rows = run(one, 2000)
+        assert abs(bench.column(rows, "x_true_position_um")[-1] - 20.0) < 0.1
+        moved[name] = np.max(np.abs(bench.column(rows, "y_true_position_um"))) / 20.0
+    assert moved["decoupled"] < 1.1 * 0.095 * 2.55 / 20.0, moved
+    assert moved["single"] > 5 * moved["decoupled"], moved
+
+
+def test_the_loop_is_as_it_was_predicted(tmp_path):
+    """S measured on the rig by sines in one reference and then in the other, beside the one that `check` computes."""
+    found = prepared(EXAMPLE).checks[0].together
+    assert found is not None
+    predicted = found.margins
+    hz = np.array([20.0, 95.0, 200.0, 400.0, 560.0, 575.0, 580.0, 600.0, 1000.0])
+    times_s, rest = np.arange(8000) * PERIOD_S, 2000
+    sines = np.cos(2 * np.pi * np.outer(hz, times_s) + np.pi * np.arange(hz.size)[:, None] ** 2 / hz.size)
+    np.save(tmp_path / "sines.npy", 0.3 * sines.sum(axis=0))
+    asked, sensitivity = 'kind = "table"\nfile = "sines.npy"', np.zeros((hz.size, 2, 2), complex)
+    turns = np.exp(-2j * np.pi * np.outer(hz, times_s))[:, rest:]
+    for j, references in enumerate(((asked, 'kind = "hold"'), ('kind = "hold"', asked))):
+        bench, rows = run(referenced(invertible(EXAMPLE), *references), times_s.size, tmp_path)
+        wanted = turns @ bench.column(rows, f"{'xy'[j]}_reference_um")[rest:]
+        for i, axis in enumerate("xy"):
+            sensitivity[:, i, j] = turns @ bench.column(rows, f"{axis}_error_um")[rest:] / wanted
+    expected = CoupledLoop(found.linear, found.plant).sensitivity(hz)
+    np.testing.assert_allclose(sensitivity, expected, atol=0.01)
+    assert predicted.max_sensitivity == pytest.approx(np.linalg.norm(sensitivity, 2, axis=(1, 2)).max(), rel=0.01)
+    disk = 1 / np.linalg.norm(sensitivity - np.eye(2) / 2, 2, axis=(1, 2)).max()
+    assert predicted.disk_margin == pytest.approx(disk, rel=0.01)
+
+
+MINE = """
+from rtloop.laws import ControllerOptions, CoupledController
+
+class Options(ControllerOptions):
+    ki_per_s: float = 100.0
+    shared: float = 0.1
+
+class Mine(CoupledController):
+    axes = 2
+    options_model = Options
+    coefficients = {"ki": float, "shared": float}
+    state = {"integral_um": (float, 2)}
+
+    def build(self):
+        return {"ki": self.options.ki_per_s * self.period_s, "shared": self.options.shared}
+
+    def output(c, s, told):
+        for i in range(2):
+            told.command_um[i] = s.integral_um[i] - c.shared * s.integral_um[1 - i]
+
+    def update(c, s, told):
+        for i in range(2):
+            s.integral_um[i] += c.ki * told.error_um[i] + told.applied_um[i] - told.command_um[i]
+"""
+MY_TABLE = '[axis.controller]\nfile = "mine.py"\naxes = ["x", "y"]\n\n'
+
+
+def test_a_laboratory_writes_its_own(tmp_path):
+    """It is found to be linear, judged, run, and comes to its references."""
+    (tmp_path / "mine.py").write_text(MINE)
+    text = referenced(
+        EXAMPLE.replace(CONTROLLER, MY_TABLE), 'kind = "hold"\nvalue = 5.0', 'kind = "hold"\nvalue = -3.0'
+    )
+    ready = prepared(text, tmp_path)
+    assert ready.checks[1].running.stable
+    c = ready.checks[0].together.linear.system.response(np.exp(2j * np.pi * 10.0 * PERIOD_S))[0]
+    integral = 100.0 * PERIOD_S / (np.exp(2j * np.pi * 10.0 * PERIOD_S) - 1)
+    np.testing.assert_allclose(c, integral * np.array([[1.0, -0.1], [-0.1, 1.0]]), rtol=1e-9)
+    bench = LoopBench(ready.plan)
+    rows = bench.run(4000)
+    assert abs(bench.column(rows, "x_position_um")[-500:].mean() - 5.0) < 0.05
+    assert abs(bench.column(rows, "y_position_um")[-500:].mean() + 3.0) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("told.command_um[i] = told.error_um[5]", "raised in output of the controller"),
+        ("told.command_um[1 - i] = 1e300 * 1e300", "returned inf from output of the controller"),
+        ("told.command_um[i] = 1.0 / told.error_um[i] if False else 1.0 / 0.0", "raised in output"),
+    ],
+)
+def test_a_mistake_trips_both_axes(tmp_path, line, said):
+    (tmp_path / "mine.py").write_text(
+        MINE.replace("            told.command_um[i] = s.integral_um[i] - c.shared * s.integral_um[1 - i]\n",
+                     f"            {line}\n")
+    )  # fmt: skip
+    plan = prepared(EXAMPLE.replace(CONTROLLER, MY_TABLE + "allow_unstable = true\n"), tmp_path).plan
+    bench = LoopBench(plan)
+    rows = bench.run(300)
+    trips = [event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED]
+    assert len(trips) == 1
+    found = event_of(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
+    assert said in found["reason"]
+    assert "law 'mine'" in found["reason"]
+    for axis in plan.axes:
+        assert np.all(bench.column(rows, f"{axis}_drive_v") == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 are named; law 'coupled' is"),
+        ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; one for each is needed"),
+        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; this axis first"),
+        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; this axis first"),
+        (CONTROLLER, PID + 'axes = ["x", "y"]\n', "2 are named; law 'pid' is for one axis"),
+        ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "axis.x.model.coupling.z: no other axis"),
+        (DECOUPLING, "decoupling = [[1, 1], [1, 1]]", "depend on each"),
+        (DECOUPLING, "decoupling = [[1, 1]]", "2 rows of 2 numbers"),
+        (DECOUPLING, "decoupling = [[-1, 0], [0, -1]]", "unstable on the"),
+        ('rate_hz = 10000', 'rate_hz = 10000\nlaws = ["nothing"]', "'nothing' is not a known law"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(before, after, message):
+    with pytest.raises(ConfigError, match=message):
+        prepared(EXAMPLE.replace(before, after, 1))
+
+
+def test_an_axis_of_its_controller_has_none_of_its_own():
+    text = EXAMPLE.replace('name = "y"\n', 'name = "y"\n' + PID)
+    with pytest.raises(ConfigError, match="but y has a controller of its own"):
+        prepared(text)
+
+
+def test_the_example_loads_as_it_is():
+    assert load(EXAMPLES["coupled"]).owners == (0, 0)
