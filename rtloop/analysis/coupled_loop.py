@@ -26,6 +26,8 @@ from rtloop.linear.realisation import System
 from rtloop.linear.together import BESIDE_ONE, SampledTogether, SystemTogether, beside_each_other
 from rtloop.linear.transfer import Transfer
 
+NOTHING = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
+"""What leaves a signal as it is."""
 BALANCINGS = 30
 INTEGRATES = 1e6
 """A loop whose gain beside z = 1 is above this is without limit there."""
@@ -39,9 +41,13 @@ class CoupledPlant:
     delay_ticks: tuple[int, ...]
     coupling: Real
 
-    def with_dynamics(self, number: int, changed: Transfer) -> CoupledPlant:
-        """Another D of one axis."""
-        return replace(self, dynamics=(*self.dynamics[:number], changed, *self.dynamics[number + 1 :]))
+    def changed(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
+        """Another D and another delay of one axis."""
+        return replace(
+            self,
+            dynamics=(*self.dynamics[:number], dynamics, *self.dynamics[number + 1 :]),
+            delay_ticks=(*self.delay_ticks[:number], delay_ticks, *self.delay_ticks[number + 1 :]),
+        )
 
     def sampled(self, period_s: float) -> SystemTogether:
         """Behind a zero-order hold. Raises ValueError for an axis with direct feedthrough."""
@@ -56,6 +62,24 @@ def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]
     """K: 1 on the diagonal, and beside it what each axis takes of the others, 0 for those that are not named."""
     pairs = zip(names, coupling, strict=True)
     return np.array([[1.0 if a == b else taken.get(b, 0.0) for b in names] for a, taken in pairs])
+
+
+@dataclass(frozen=True, eq=False)
+class BrokenLoop(Loop):
+    """One axis's loop, the others closed: `plant` is from its error to its position, `command` to its command."""
+
+    command: System = NOTHING
+
+    def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
+        """From its reference to its command."""
+        return np.abs(self.command.response(self._points(hz))) * self.sensitivity(hz)
+
+    @cached_property
+    def matrices(self) -> tuple[Real, Real, Real, Real]:
+        """From its reference to its position and its command."""
+        a, b, c, _ = self.plant
+        own, direct = self.command.c, self.command.d
+        return a - np.outer(b, c), b, np.vstack([c, own - direct * c]), np.array([0.0, direct])
 
 
 class TogetherMargins(NamedTuple):
@@ -86,8 +110,8 @@ class CoupledLoop:
         self._controller, self._plant = controller.system, plant.sampled(controller.period_s)
         self.count = controller.count
 
-    def alone(self, number: int) -> Loop:
-        """The loop of one axis, broken at its sensor, the others closed; what it calls its command is its error."""
+    def alone(self, number: int) -> BrokenLoop:
+        """The loop of one axis, broken at its sensor, the others closed."""
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
         closed = np.eye(self.count)
@@ -96,12 +120,12 @@ class CoupledLoop:
         b = np.concatenate([bp @ dc[:, number], bc[:, number]])
         c = np.concatenate([cp[number], np.zeros(ac.shape[0])])
         own = System(a, b, c, 0.0)
+        command = System(a, b, np.concatenate([-dc[number] @ closed @ cp, cc[number]]), float(dc[number, number]))
         poles = np.linalg.eigvals(a).astype(np.complex128)
         rates = np.asarray(np.log(poles[np.abs(poles) > 1e-9]) / self.period_s, np.complex128)
         at_rest = float(own.response(1.0 + BESIDE_ONE)[0].real)
-        nothing = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
         static = at_rest if abs(at_rest) < INTEGRATES else np.copysign(np.inf, at_rest)
-        return Loop(nothing, own, float(static), rates, self.period_s)
+        return BrokenLoop(NOTHING, own, float(static), rates, self.period_s, command)
 
     @cached_property
     def poles(self) -> Complex:

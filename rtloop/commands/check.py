@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +11,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rtloop.analysis.coupled_loop import TogetherMargins
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
 from rtloop.commands.design import verified
-from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.checks import AxisCheck, Together
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import Prepared, prepare
-from rtloop.design.verification.text import answer, span
+from rtloop.design.verification.text import answer, span, together
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
-from rtloop.laws.shipped.options import TransferControllerOptions
 from rtloop.terminal.table import console as _console
 from rtloop.values import counted
 
@@ -49,7 +44,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     if strict and warnings:
         raise ConfigError(str(config), warnings)
     shifts = {check.name: _shifts(check) for check in prepared.checks}
-    judged = {axis.name: _judged(prepared, axis) for axis in prepared.configuration.axes}
+    judged = {check.name: _judged(prepared, check) for check in prepared.checks}
     if as_json:
         click.echo(json.dumps(_report(prepared, warnings, shifts, judged)))
         return 0
@@ -79,11 +74,12 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     return 0
 
 
-def _judged(prepared: Prepared, axis: AxisOptions) -> Verification | None:
-    """The axis against the specification that it names; None where there is nothing to judge."""
-    if axis.specification is None or not isinstance(axis.controller, TransferControllerOptions):
+def _judged(prepared: Prepared, check: AxisCheck) -> Verification | None:
+    """The axis against the specification that it names; None where there is nothing to judge, or to judge by."""
+    axis = prepared.configuration.axes[prepared.plan.axes.index(check.name)]
+    if axis.specification is None or not check.is_known:
         return None
-    return verified(prepared.configuration, axis, None)[0]
+    return verified(prepared.configuration, check, None)[0]
 
 
 def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) -> None:
@@ -109,13 +105,17 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) ->
         return
     heading = "on the model" if check.together is None else "on the models, broken alone"
     table = Table(heading, *found, box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    for label, show in ROWS if check.together is None else ROWS[:-1]:
+    for label, show in ROWS:
         table.add_row(label, *(show(one) for _, one in found.values() if one is not None))
     if shifts:
         table.add_row("resonance may move by", *(span(shifts[key]) for key, _ in found.values()))
     console.print(table)
     if check.together is not None and check.together.margins is not None and check.together.place == 0:
-        console.print(_table_together(check.together.axes, check.together.margins))
+        heading = f"{' and '.join(check.together.axes)} together"
+        table = Table(heading, "as they run", box=None, pad_edge=False, padding=(0, 3, 0, 0))
+        for label, value in together(check.together.margins):
+            table.add_row(label, value)
+        console.print(table)
 
 
 def _described_together(found: Together) -> str:
@@ -126,21 +126,6 @@ def _described_together(found: Together) -> str:
     return f"law {found.law.kind!r} of axes {', '.join(found.axes)}{order}"
 
 
-def _table_together(axes: Sequence[str], margins: TogetherMargins) -> Table:
-    """What all axes of a controller together bear."""
-    table = Table(f"{' and '.join(axes)} together", "as they run", box=None, pad_edge=False, padding=(0, 3, 0, 0))
-    table.add_row("largest σ(S)", f"{margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz")
-    table.add_row("largest σ(T)", f"{margins.max_tracking:.3f}")
-    for label, disk, hz in (
-        ("disk margin, sensors", margins.disk_margin, margins.disk_margin_hz),
-        ("disk margin, commands", margins.command_disk_margin, margins.command_disk_margin_hz),
-    ):
-        low, high = (1 - disk / 2) / (1 + disk / 2), (1 + disk / 2) / (1 - disk / 2) if disk < 2 else math.inf
-        phase_deg = math.degrees(2 * math.atan(disk / 2))
-        table.add_row(label, f"{disk:.3f} at {hz:.1f} Hz: gains × {low:.2f} … {high:.2f}, phases ± {phase_deg:.1f}°")
-    return table
-
-
 def _shifts(check: AxisCheck) -> dict[str, Range]:
     """Shift of the model's resonance that the loop survives."""
     if check.plant is None or check.running is None:
@@ -148,10 +133,8 @@ def _shifts(check: AxisCheck) -> dict[str, Range]:
     resonance = changes(check.plant).get("resonance")
     if resonance is None:
         return {}
-    if check.together is not None:
-        return {"running": until_unstable(check.together.alone, check.plant, resonance)}
-    assert check.linear is not None
-    running = {"running": until_unstable(maker(check.linear, check.running.delay_ticks), check.plant, resonance)}
+    runs = until_unstable(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
+    running = {"running": runs}
     if check.controller is None:
         return running
     return {"continuous": until_unstable(maker(check.controller), check.plant, resonance), **running}

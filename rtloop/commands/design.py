@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.hinf.assumptions import NoController
@@ -19,10 +19,8 @@ from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.verification.page import page
-from rtloop.design.verification.verify import Verification, as_dict, verify
+from rtloop.design.verification.verify import Subject, Verification, as_dict, verify
 from rtloop.errors import ConfigError, NoDesign, OutputError
-from rtloop.laws.shipped.options import TransferControllerOptions
-from rtloop.linear.discretise import discretise
 from rtloop.terminal.design import print_synthesis, print_verification
 
 
@@ -58,7 +56,11 @@ def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_chec
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
     """Judge every axis that has a controller; 1 where one misses its specification. Raises ConfigError, OutputError."""
     configuration = load(config)
-    judged = {axis.name: verified(configuration, axis, spec) for axis in configuration.axes if axis.controller}
+    findings = Findings()
+    checks = check_axes(configuration, findings)
+    if any(check.law is None and configuration.axes[i].controller for i, check in enumerate(checks)):
+        raise ConfigError(str(config), findings.faults)
+    judged = {check.name: verified(configuration, check, spec) for check in checks if check.law}
     if not judged:
         raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
     meets = all(found.meets for found, _ in judged.values())
@@ -104,21 +106,19 @@ def _as_dict(found: Synthesis, other: float | None, out: Path | None) -> dict[st
     }
 
 
-def verified(configuration: Configuration, axis: AxisOptions, spec: Path | None) -> tuple[Verification, DesignOptions]:
+def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) -> tuple[Verification, DesignOptions]:
     """An axis against the specification at `spec`, else against its own. Raises ConfigError."""
-    if not isinstance(axis.controller, TransferControllerOptions):
-        fault = f"axis.{axis.name}.controller: only a transfer function, the law 'transfer', can be verified"
-        raise ConfigError(configuration.source, [fault])
+    axis = next(one for one in configuration.axes if one.name == check.name)
     if spec is None and axis.specification is not None:
         spec = configuration.folder / axis.specification
     design = DesignOptions() if spec is None else load_specification(spec).design
-    model, options, where = axis.model or design.plant, axis.controller, f"axis.{axis.name}"
+    model, where = axis.model or design.plant, f"axis.{axis.name}"
     if model is None:
         raise ConfigError(configuration.source, [f"{where}.model: missing; there is no plant to verify against"])
+    margins = None if check.together is None else check.together.margins
     try:
-        controller = options.transfer()
-        discrete = discretise(controller, 1 / configuration.loop.rate_hz, options.method, options.prewarp_hz)
-        return verify(controller, discrete, model.transfer(), design, model.delay_ticks), design
+        subject = Subject(check.loop, check.controller, check.discrete)
+        return verify(subject, model.transfer(), design, model.delay_ticks, margins), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{where}: {error}"]) from None
 

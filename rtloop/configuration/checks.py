@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.closed_loop import Loop, discrete_loop
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, TogetherMargins, coupling_matrix
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse, analyse_continuous, analyse_discrete
@@ -54,11 +53,12 @@ class Together:
     plant: CoupledPlant | None = None
     margins: TogetherMargins | None = None
 
-    def alone(self, dynamics: Transfer) -> Loop:
-        """The loop of this axis with other dynamics, broken alone."""
-        assert self.linear is not None
-        assert self.plant is not None
-        return CoupledLoop(self.linear, self.plant.with_dynamics(self.place, dynamics)).alone(self.place)
+    def alone(self, dynamics: Transfer, delay_ticks: int) -> Loop:
+        """The loop of this axis with other dynamics, broken alone. Raises ValueError where a part is not known."""
+        if self.linear is None or self.plant is None:
+            raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
+        plant = self.plant.changed(self.place, dynamics, delay_ticks)
+        return CoupledLoop(self.linear, plant).alone(self.place)
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,25 @@ class AxisCheck:
     discrete: DiscreteController | None = None
     comparison: Comparison | None = None
     plant: Transfer | None = None
+    delay_ticks: int = 0
     continuous: LoopAnalysis | None = None
     running: LoopAnalysis | None = None
     together: Together | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether `loop` can say anything."""
+        if self.together is not None:
+            return self.together.linear is not None and self.together.plant is not None
+        return self.linear is not None
+
+    def loop(self, dynamics: Transfer, delay_ticks: int) -> Loop:
+        """The loop as it runs, on such dynamics. Raises ValueError where nothing linear is known of its law."""
+        if self.together is not None:
+            return self.together.alone(dynamics, delay_ticks)
+        if self.linear is None:
+            raise ValueError("controller: nothing linear is known of it")
+        return discrete_loop(self.linear, dynamics, delay_ticks)
 
 
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
@@ -121,7 +137,9 @@ def _check(axis: AxisOptions, period_s: float, findings: Findings) -> AxisCheck:
         running = analyse_discrete(linear, plant, axis.model.delay_ticks)
     if running is not None:
         _require_stable(running, axis.controller, where, f"axis.{axis.name}.model", findings)
-    return replace(check, linear=linear, plant=plant, continuous=continuous, running=running)
+    return replace(
+        check, linear=linear, plant=plant, delay_ticks=axis.model.delay_ticks, continuous=continuous, running=running
+    )
 
 
 def _require_stable(
@@ -162,9 +180,17 @@ def _check_together(configuration: Configuration, number: int, period_s: float, 
         return checks
     margins, found = loop.margins, []
     for place, check in enumerate(checks):
-        running = replace(analyse(loop.alone(place), plant.delay_ticks[place]), peak_command=math.nan)
+        running = analyse(loop.alone(place), plant.delay_ticks[place])
         together = Together(names, place, law, linear, plant, margins)
-        found.append(replace(check, plant=plant.dynamics[place], running=running, together=together))
+        found.append(
+            replace(
+                check,
+                plant=plant.dynamics[place],
+                delay_ticks=plant.delay_ticks[place],
+                running=running,
+                together=together,
+            )
+        )
     _require_stable(found[0].running, options, where, f"the models of {', '.join(names)}", findings)
     return found
 

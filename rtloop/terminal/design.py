@@ -8,7 +8,7 @@ import click
 from rich.table import Table
 
 from rtloop.design.synthesis.synthesise import Synthesis
-from rtloop.design.verification.text import HEADINGS, NOTE, ROBUSTNESS_HEADINGS, answer, robustness, shifts, table
+from rtloop.design.verification.text import NOTE, answer, robustness, shifts, table, together
 from rtloop.design.verification.verify import Verification
 from rtloop.terminal.table import console
 from rtloop.terminal.table import table as lines
@@ -33,12 +33,17 @@ def print_verification(name: str, found: Verification) -> None:
     """Every table of one axis, and the answer."""
     out = console()
     out.print(f"[bold]axis {name}[/]")
-    out.print(_table(HEADINGS, table(found)))
+    headings, *rows = table(found)
+    out.print(_table(headings, rows))
+    if found.together is not None:
+        out.print("\nAll axes of its controller together, as they run")
+        out.print(_table(("", ""), together(found.together)))
     if found.robustness.shifts:
         out.print("\nThe resonance may move by")
         out.print(_table(("", ""), shifts(found)))
     out.print()
-    out.print(_table(ROBUSTNESS_HEADINGS, robustness(found)))
+    headings, *rows = robustness(found)
+    out.print(_table(headings, rows))
     out.print(NOTE)
     out.print(f"\n[bold]{answer(found)}[/]")
     for warning in found.warnings:

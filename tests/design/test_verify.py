@@ -131,7 +131,7 @@ def test_faults_of_the_user(tmp_path, monkeypatch) -> None:
 def test_delay_margin_is_phase_margin_over_crossover() -> None:
     """75.54° at 94.53 Hz, eqs (5) and (20); as it runs, 21 samples and no more."""
     assert delay_margin_us(PAPER_LOOP) == pytest.approx(1e6 * 75.54 / 360 / 94.53, rel=1e-3)
-    ticks = delay_ticks_tolerated(RUNNING, PAPER_D)
+    ticks = delay_ticks_tolerated(lambda ticks: discrete_loop(RUNNING, PAPER_D, ticks))
     assert discrete_loop(RUNNING, PAPER_D, ticks).is_stable
     assert not discrete_loop(RUNNING, PAPER_D, ticks + 1).is_stable
     assert ticks == int(delay_margin_us(discrete_loop(RUNNING, PAPER_D)) / 100)

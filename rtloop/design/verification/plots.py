@@ -49,7 +49,8 @@ def pictures(found: Verification, asked: SpecificationOptions, title: str) -> di
 def _loops(found: Verification) -> list[tuple[str, Loop, str]]:
     rate = 1 / found.running.period_s if found.running.period_s else math.nan
     runs = f"as it runs: {rate:g} Hz, {found.delay_ticks} samples of delay"
-    return [("continuous", found.continuous, PAPER_TIME), (runs, found.running, RUN_TIME)]
+    on_paper = [] if found.continuous is None else [("continuous", found.continuous, PAPER_TIME)]
+    return [*on_paper, (runs, found.running, RUN_TIME)]
 
 
 def _frequencies(loop: Loop, found: Verification) -> Real:
@@ -78,7 +79,7 @@ def _sensitivity(panels: Any, found: Verification, _: SpecificationOptions) -> N
         panels[0].loglog(hz, loop.sensitivity(hz), color=color, label=f"|S| {label}")
         panels[1].loglog(hz, loop.command_sensitivity(hz), color=color, label=f"|CS| {label}")
     if found.weights is not None:
-        hz = _frequencies(found.continuous, found)
+        hz = _frequencies(found.continuous or found.running, found)
         _template(panels[0], hz, found.weights.tracking, "W1", found.gamma)
         _template(panels[1], hz, found.weights.command, "W2", found.gamma)
     panels[0].set_ylabel("|S|, error per reference")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from rtloop.analysis.closed_loop import Loop, discrete_loop
+from collections.abc import Callable
+
+from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import delay_tolerated
 from rtloop.analysis.perturbation import Change, Maker, Range, until_bad
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import Limit, specified
-from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 
 
@@ -29,9 +30,9 @@ def delay_margin_us(loop: Loop) -> float:
     return 1e6 * delay_tolerated(loop)[0] if loop.is_stable else 0.0
 
 
-def delay_ticks_tolerated(controller: DiscreteController, plant: Transfer, most: int = 64) -> int:
+def delay_ticks_tolerated(delayed: Callable[[int], Loop], most: int = 64) -> int:
     """The largest number of samples of delay with which, and with all fewer ones, the loop is stable; −1 if none."""
     for ticks in range(most + 1):
-        if not discrete_loop(controller, plant, ticks).is_stable:
+        if not delayed(ticks).is_stable:
             return ticks - 1
     return most

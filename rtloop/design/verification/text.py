@@ -3,31 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from itertools import chain
 
+from rtloop.analysis.coupled_loop import TogetherMargins
 from rtloop.analysis.perturbation import Range
 from rtloop.design.verification.judgement import Limit
 from rtloop.design.verification.verify import Row, Verification
 
-HEADINGS = ("", "required", "continuous C(s)", "", "as it runs C(z)", "", "its source says")
-ROBUSTNESS_HEADINGS = (
-    "may move by", "continuous, until unstable", "as it runs, until unstable", "until what is met is missed",
-)  # fmt: skip
+ON_PAPER, RUNS = "continuous C(s)", "as it runs C(z)"
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
 NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
 
 def table(found: Verification) -> list[tuple[str, ...]]:
-    """A row for each quantity: label, required, achieved and verdict twice, claim."""
-    stable = tuple("yes" if loop.is_stable else "NO" for loop in (found.continuous, found.running))
-    first = ("stable", "yes", stable[0], verdict(stable[0] == "yes"), stable[1], verdict(stable[1] == "yes"), "")
-    return [first, *(_cells(row) for row in found.rows)]
+    """Headings, then a row for each quantity: label, required, achieved and verdict (twice where it is on paper, too),
+    claim.
+    """
+    loops = [loop for loop in (found.continuous, found.running) if loop is not None]
+    columns = [ON_PAPER, RUNS][-len(loops) :]
+    stable = ["yes" if loop.is_stable else "NO" for loop in loops]
+    rows = [("", "required", *_twos((column, "") for column in columns), "its source says")]
+    rows.append(("stable", "yes", *_twos((one, verdict(one == "yes")) for one in stable), ""))
+    for row in found.rows:
+        values = [row.continuous, row.running][-len(loops) :]
+        cells = _twos((_with_unit(row, value), verdict(row.met(value))) for value in values)
+        rows.append((row.label, required(row), *cells, row.claim))
+    return rows
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    return (
-        row.label, required(row), _with_unit(row, row.continuous), verdict(row.met(row.continuous)),
-        _with_unit(row, row.running), verdict(row.met(row.running)), row.claim,
-    )  # fmt: skip
+def _twos(cells: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    return tuple(chain.from_iterable(cells))
 
 
 def required(row: Row) -> str:
@@ -60,13 +66,35 @@ def _with_unit(row: Row, value: float | None) -> str:
 
 
 def robustness(found: Verification) -> list[tuple[str, ...]]:
-    """A row for each thing that may move: until unstable twice, until missed."""
-    rows = [
-        (SHIFT_NAMES[name], *(span(ranges[which]) for which in ("continuous", "running", "running_missed")))
-        for name, ranges in found.robustness.ranges.items()
+    """Headings, then a row for each thing that may move: until unstable (twice where it is on paper), until missed."""
+    on_paper = found.continuous is not None
+    which = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
+    headings = ("continuous, until unstable", "as it runs, until unstable", "until what is met is missed")
+    rows = [("may move by", *headings[-len(which) :])]
+    rows += [
+        (SHIFT_NAMES[name], *(span(ranges[one]) for one in which)) for name, ranges in found.robustness.ranges.items()
     ]
-    delay = f"+{number(found.robustness.delay_us)} µs", f"+{found.robustness.delay_ticks} samples"
-    return [*rows, ("delay", *(delay if found.continuous.is_stable else ("–", "–")), "")]
+    judged = found.continuous or found.running
+    more = [f"+{number(found.robustness.delay_us)} µs", f"+{found.robustness.delay_ticks} samples"]
+    more = more if on_paper else [" or ".join(more)]
+    return [*rows, ("delay", *(more if judged.is_stable else ["–"] * len(more)), "")]
+
+
+def together(margins: TogetherMargins) -> list[tuple[str, str]]:
+    """What all axes of a controller bear at once."""
+    rows = [
+        ("largest σ(S)", f"{margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz"),
+        ("largest σ(T)", f"{margins.max_tracking:.3f}"),
+    ]
+    for label, disk, hz in (
+        ("disk margin, sensors", margins.disk_margin, margins.disk_margin_hz),
+        ("disk margin, commands", margins.command_disk_margin, margins.command_disk_margin_hz),
+    ):
+        low, high = (1 - disk / 2) / (1 + disk / 2), (1 + disk / 2) / (1 - disk / 2) if disk < 2 else math.inf
+        phase_deg = math.degrees(2 * math.atan(disk / 2))
+        gains = f"gains × {max(low, 0.0):.2f} … {high:.2f}, phases ± {phase_deg:.1f}°"
+        rows.append((label, f"{disk:.3f} at {hz:.1f} Hz: {gains}"))
+    return rows
 
 
 def shifts(found: Verification) -> list[tuple[str, str]]:

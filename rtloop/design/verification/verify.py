@@ -1,7 +1,7 @@
 """A controller judged: every specification with what is required, what is achieved and a verdict, and how robust it is.
 
-Twice: in continuous time, C(s)·D(s), as it is designed; and as it will run, C(z) behind the hold and the delay, seen
-through the sensor. A controller that meets its specification on paper only does not meet it.
+Twice: in continuous time, C(s)·D(s), as it is designed, where there is a C(s); and as it will run, C(z) behind the hold
+and the delay, seen through the sensor. A controller that meets its specification on paper only does not meet it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.closed_loop import Loop, continuous_loop
 from rtloop.analysis.comparison import compare
+from rtloop.analysis.coupled_loop import TogetherMargins
 from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
 from rtloop.design.synthesis.hinf.augment import augmented
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions, weights_of
@@ -52,6 +53,14 @@ class Row(NamedTuple):
         return None if self.limit is None or value is None else self.limit.met(value)
 
 
+class Subject(NamedTuple):
+    """What is judged: the loop as it runs, by dynamics and samples of delay, and C(s) where there is one, with C(z)."""
+
+    running: Callable[[Transfer, int], Loop]
+    controller: Transfer | None = None
+    discrete: DiscreteController | None = None
+
+
 class Robustness(NamedTuple):
     """Percent by which each of `ranges` may move until unstable, and, as it runs, until what is met now is missed.
 
@@ -71,11 +80,12 @@ class Verification:
     rows: tuple[Row, ...]
     examine: Callable[[], Robustness]
     warnings: tuple[str, ...]
-    continuous: Loop
+    continuous: Loop | None
     running: Loop
     delay_ticks: int
     weights: Weights | None
     gamma: float | None
+    together: TogetherMargins | None = None
 
     @cached_property
     def robustness(self) -> Robustness:
@@ -94,17 +104,27 @@ class Verification:
 
 
 def verify(
-    controller: Transfer, discrete: DiscreteController, plant: Transfer, design: DesignOptions, delay_ticks: int = 0
+    subject: Subject,
+    plant: Transfer,
+    design: DesignOptions,
+    delay_ticks: int = 0,
+    together: TogetherMargins | None = None,
 ) -> Verification:
-    """Judge C(s), and C(z) behind `delay_ticks` samples, on a plant.
+    """Judge a loop on a plant, behind `delay_ticks` samples; `together` is what its axis shares with others.
 
     Raises ValueError for a plant with direct feedthrough.
     """
-    asked, sensed = design.specification, design.sensor.seen_through(plant)
-    continuous, running = continuous_loop(controller, plant), discrete_loop(discrete, sensed, delay_ticks)
-    weights = _weights(design)
-    gamma = None if weights is None else weighted_norm(augmented(plant, weights), controller)
-    columns = [specified(loop, asked) | described(loop, design.sensor) for loop in (continuous, running)]
+    asked, sensed, controller = design.specification, design.sensor.seen_through(plant), subject.controller
+    continuous = None if controller is None else continuous_loop(controller, plant)
+    running = subject.running(sensed, delay_ticks)
+    weights = None if controller is None else _weights(design)
+    gamma = None
+    if weights is not None and controller is not None:
+        gamma = weighted_norm(augmented(plant, weights), controller)
+    columns = [
+        {} if loop is None else specified(loop, asked) | described(loop, design.sensor)
+        for loop in (continuous, running)
+    ]
     if gamma is not None:
         columns[0]["gamma"] = gamma
     required = limits(asked)
@@ -113,10 +133,12 @@ def verify(
         for name in QUANTITIES
         if any(name in column for column in columns)
     )
-    warnings = tuple(compare(controller, discrete, up_to_hz=0.2 / discrete.period_s).warnings)
+    warnings: tuple[str, ...] = ()
+    if controller is not None and subject.discrete is not None:
+        warnings = tuple(compare(controller, subject.discrete, up_to_hz=0.2 / subject.discrete.period_s).warnings)
     return Verification(
-        rows, lambda: _robustness(controller, discrete, plant, sensed, design, delay_ticks, rows), warnings,
-        continuous, running, delay_ticks, weights, gamma,
+        rows, lambda: _robustness(subject, plant, sensed, design, delay_ticks, rows), warnings,
+        continuous, running, delay_ticks, weights, gamma, together,
     )  # fmt: skip
 
 
@@ -128,30 +150,37 @@ def _weights(design: DesignOptions) -> Weights | None:
 
 
 def _robustness(
-    controller: Transfer,
-    discrete: DiscreteController,
+    subject: Subject,
     plant: Transfer,
     sensed: Transfer,
     design: DesignOptions,
     delay_ticks: int,
     rows: tuple[Row, ...],
 ) -> Robustness:
-    on_paper, runs = maker(controller), maker(discrete, delay_ticks)
+    on_paper = None if subject.controller is None else maker(subject.controller)
+
+    def runs(moved: Transfer) -> Loop:
+        return subject.running(moved, delay_ticks)
+
     met = {row.name: row.limit for row in rows if row.limit is not None and row.met(row.running)}
     ranges: dict[str, dict[str, Range | None]] = {}
     shifts: dict[str, Range] = {}
     for name, change in changes(plant).items():
-        modelled = until_unstable(on_paper, plant, change)
+        modelled = {} if on_paper is None else {"continuous": until_unstable(on_paper, plant, change)}
         ranges[name] = {
-            "continuous": modelled,
+            **modelled,
             "running": until_unstable(runs, sensed, change),
             "running_missed": until_missed(runs, sensed, change, design.specification, met) if met else None,
         }
         if name == "resonance":
-            delayed = {str(ticks): until_unstable(maker(discrete, ticks), sensed, change) for ticks in DELAYS}
-            shifts = {"continuous": modelled, **delayed}
-    more = delay_ticks_tolerated(discrete, sensed) - delay_ticks
-    return Robustness(ranges, shifts, delay_margin_us(on_paper(plant)), more)
+            delayed = {
+                str(ticks): until_unstable(lambda moved, ticks=ticks: subject.running(moved, ticks), sensed, change)
+                for ticks in DELAYS
+            }
+            shifts = {**modelled, **delayed}
+    more = delay_ticks_tolerated(lambda ticks: subject.running(sensed, ticks)) - delay_ticks
+    judged = runs(sensed) if on_paper is None else on_paper(plant)
+    return Robustness(ranges, shifts, delay_margin_us(judged), more)
 
 
 def as_dict(found: Verification) -> dict[str, Any]:
@@ -159,7 +188,10 @@ def as_dict(found: Verification) -> dict[str, Any]:
     robust = found.robustness
     return {
         "meets": found.meets,
-        "stable": {"continuous": found.continuous.is_stable, "running": found.running.is_stable},
+        "stable": {
+            "continuous": None if found.continuous is None else found.continuous.is_stable,
+            "running": found.running.is_stable,
+        },
         "delay_ticks": found.delay_ticks,
         "rate_hz": 1 / found.running.period_s if found.running.period_s else None,
         "rows": [_row(row) for row in found.rows],
@@ -170,6 +202,7 @@ def as_dict(found: Verification) -> dict[str, Any]:
         },
         "delay_margin_us": _number(robust.delay_us),
         "more_delay_ticks": robust.delay_ticks,
+        "together": None if found.together is None else found.together.as_dict(),
         "warnings": list(found.warnings),
     }
 
