@@ -156,9 +156,12 @@ class LiveLaw:
         `axis` is true; the others are as they were.
         """
         coefficients = np.asarray(self.prepared.plan.coefficients).copy()
+        configuration = self.prepared.configuration
         for i in prepared.configuration.together(number):
             coefficients[i] = np.asarray(prepared.plan.coefficients)[i]
-        configuration = _with_axis(self.prepared.configuration, number, axis)
+            beside = {"reference": configuration.axes[i].reference}
+            options = axis if i == number else prepared.configuration.axes[i].model_copy(update=beside)
+            configuration = _with_axis(configuration, i, options)
         self.prepared = replace(
             self.prepared, configuration=configuration, plan=replace(self.prepared.plan, coefficients=coefficients)
         )
@@ -189,11 +192,14 @@ class LiveLaw:
     def _stage(self, number: int, prepared: Prepared, axis: AxisOptions) -> int:
         """Copy coefficients to where the loop takes them from, have it take them; note `axis`. Raises Taken, too.
 
-        Axes that share a controller are taken together, by the number of the first.
+        Axes that share a controller are taken together, by the number of the first, where that one changes.
         """
+        whole, now = np.asarray(prepared.plan.coefficients), np.asarray(self.prepared.plan.coefficients)
         first, *others = prepared.configuration.together(number)
         before, after = self.prepared.configuration.axes[first], prepared.configuration.axes[first]
-        coefficients = np.asarray(prepared.plan.coefficients)[first : first + 1 + len(others)].copy()
+        if number != first and whole[first].tobytes() == now[first].tobytes():
+            first, others = number, []
+        coefficients = whole[first : first + 1 + len(others)].copy()
         for place, i in enumerate((first, *others)):
             coefficients["offset_v"][place] = self.offsets_v.get(i, float(coefficients["offset_v"][place]))
         begin = first * coefficients.dtype.itemsize

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import signal
 
+import rtloop
 from rtloop.analysis.coupled_loop import CoupledLoop
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.engine.commands import send
 from rtloop.engine.loop import Outcome
-from rtloop.engine.messages import Kind
+from rtloop.engine.messages import Kind, message
 from rtloop.errors import ConfigError
 from rtloop.laws.conformance import Bench
 from rtloop.laws.linearise import linearised
+from rtloop.recording.capture.session import Session
 from rtloop.recording.file.events import event_of
+from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.replay import replay
+from rtloop.service import live
 from tests.engine.harness import LoopBench
 from tests.law.harness import PERIOD_S
 from tests.laws.test_shipped import EXAMPLES, example, state_space
+from tests.recording.real_loop import Options, RealLoop
 
 EXAMPLE = EXAMPLES["coupled"].read_text()
 CONTROLLER = EXAMPLE[EXAMPLE.index("[axis.controller]\n") : EXAMPLE.index("[axis.model]")]
@@ -197,6 +205,64 @@ def test_a_laboratory_writes_its_own(tmp_path):
     rows = bench.run(4000)
     assert abs(bench.column(rows, "x_position_um")[-500:].mean() - 5.0) < 0.05
     assert abs(bench.column(rows, "y_position_um")[-500:].mean() + 3.0) < 0.05
+
+
+class RunningDesk:
+    """Has the loop take what is submitted."""
+
+    def __init__(self, loop: RealLoop, session: Session) -> None:
+        self.loop, self.session = loop, session
+
+    def submit(self, kind: Kind, *, axis: int = -1, values: Sequence[float] = ()) -> int:
+        send(self.loop.block, message(kind, axis=axis, values=values))
+        tick = self.loop.tick
+        self.run(500)
+        return tick
+
+    def run(self, ticks: int) -> None:
+        self.loop.run(ticks)
+        self.session.drain()
+        self.session.write_due()
+
+
+def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
+    """By the name of any of its axes; without a jump; and a replay comes to the same."""
+    monkeypatch.setattr(live, "prepare_limited", lambda configuration: prepare(configuration, paced=False))
+    (tmp_path / "mine.py").write_text(MINE)
+    text = EXAMPLE.replace("rate_hz = 10000", 'rate_hz = 10000\nlaws = ["mine.py"]')
+    loop = RealLoop(referenced(text, 'kind = "hold"\nvalue = 8.0', 'kind = "hold"\nvalue = -6.0'), tmp_path)
+    session = Session(loop.block, tmp_path / "live.mcap", loop.header, Options(min_free_bytes=0))
+    desk = RunningDesk(loop, session)
+    desk.run(3000)
+    law = live.LiveLaw(loop.prepared, loop.block, desk, {1: 0.001})  # type: ignore[arg-type]
+    law.tune("y", "controller", {"tracking_s": 0.002})
+    law.tune("y", "limits", {"command_um": 40.0})
+    law.tune("x", "limits", {"command_um": 39.0})
+    coupled = law.prepared.configuration.axes[0].controller.model_dump(exclude_unset=True)
+    law.load_controller("y", {**coupled, "decoupling": [[1.0, 0.0], [0.0, 1.0]]})
+    law.load_controller("x", {"file": "mine.py", "axes": ["x", "y"], "shared": 0.05})
+    law.tune("y", "controller", {"ki_per_s": 120.0})
+    law.load_controller("x", coupled)
+    for controller, said in (
+        ({"form": "zpk", "gain": 0.1, "poles": [[-1.0, 0.0]]}, "which axes share"),
+        (coupled | {"axes": ["x", "z"]}, "x, z"),
+    ):
+        with pytest.raises((live.Refused, ConfigError), match=said):
+            law.load_controller("x", controller)
+    assert [axis.limits.command_um for axis in law.prepared.configuration.axes] == [39.0, 40.0]
+    assert law.prepared.configuration.axes[1].controller is None
+    loop.end()
+    session.drain()
+    session.finish("finished")
+    recording = rtloop.load(tmp_path / "live.mcap")
+    assert [event["axis"] for event in recording.events if event["kind"] == "load_law"] == ["x", "y", *["x"] * 5]
+    assert not [event for event in recording.events if event["kind"] in ("tripped", "refused")]
+    for axis, aimed_um in (("x", 8.0), ("y", -6.0)):
+        assert np.max(np.abs(np.diff(recording[f"{axis}_drive_v"][2000:]))) < 0.05
+        assert abs(recording[f"{axis}_position_um"][-400:].mean() - aimed_um) < 0.1
+    report = replay(recording, trust=Trust(recorded=True))
+    assert report.identical
+    assert report.ticks == 3000 + 7 * 500
 
 
 @pytest.mark.parametrize(
