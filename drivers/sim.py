@@ -15,21 +15,27 @@ from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import ConverterOptions, RigOptions
 from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
-CONTEXT = np.dtype([("count", np.uint32), ("coefficients", np.int64), ("state", np.int64)], align=True)
+CONTEXT = np.dtype(
+    [("count", np.uint32), ("looped", np.uint32), *((name, np.int64) for name in ("coefficients", "state", "looped_v"))],
+    align=True,
+)
 OBSERVED_PER_AXIS = 2
 
 
 @cfunc(SIGNATURE)
 def sim_read(context, values):
-    """Volts, age 0, then true position and hysteresis of each plant."""
+    """Volts of each plant, those that are looped back, age 0, then true position and hysteresis of each plant."""
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
-    out = carray(values, rig.count * (1 + OBSERVED_PER_AXIS) + 1)
-    out[rig.count] = 0.0
+    out = carray(values, rig.count * (1 + OBSERVED_PER_AXIS) + rig.looped + 1)
+    looped_v = carray(address_pointer(rig.looped_v), rig.looped, np.float64)
+    for i in range(rig.looped):
+        out[rig.count + i] = looped_v[i]
+    out[rig.count + rig.looped] = 0.0
     for i in range(rig.count):
         out[i] = sample(coefficients[i], state[i])
-        observed = rig.count + 1 + i * OBSERVED_PER_AXIS
+        observed = rig.count + rig.looped + 1 + i * OBSERVED_PER_AXIS
         out[observed] = state[i].true_position_um
         out[observed + 1] = state[i].hysteresis_um
     return 0
@@ -41,7 +47,11 @@ def sim_write(context, values):
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
-    advance(coefficients, state, carray(values, rig.count))
+    out = carray(values, rig.count + rig.looped)
+    looped_v = carray(address_pointer(rig.looped_v), rig.looped, np.float64)
+    for i in range(rig.looped):
+        looped_v[i] = out[rig.count + i]
+    advance(coefficients, state, out[: rig.count])
     return 0
 
 
@@ -56,6 +66,7 @@ class SimDriver(Driver):
         self._rig_options = options
         self._rig = build_rig(options, self._axes_by_plant(), 1.0 / rate_hz)
         self._context = np.zeros(1, CONTEXT)
+        self._looped_v = np.zeros(options.loopback)
 
     def _axes_by_plant(self) -> list[str]:
         """Axis at each plant. Raises ValueError for a wiring that leaves the rig."""
@@ -78,16 +89,21 @@ class SimDriver(Driver):
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
         return Facts(
-            inputs=tuple(_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)),
-            outputs=tuple(_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)),
+            inputs=(*(_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)), *self._looped("adc")),
+            outputs=(*(_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)), *self._looped("dac")),
             observed=tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um")),
             exclusive=False,
             real=False,
         )
 
+    def _looped(self, kind: str) -> list[Channel]:
+        """The channels behind those of the plants."""
+        return [Channel(f"{kind}{len(self.wiring) + i}") for i in range(self._looped_v.size)]
+
     def open(self) -> Pointers:
         """Pointers to the compiled rig."""
         coefficients, state = self._rig
+        self._context["looped"], self._context["looped_v"] = self._looped_v.size, self._looped_v.ctypes.data
         self._context["count"] = coefficients.size
         self._context["coefficients"], self._context["state"] = coefficients.ctypes.data, state.ctypes.data
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
@@ -99,11 +115,12 @@ class SimDriver(Driver):
     @property
     def dac_v(self) -> list[float]:
         """What each DAC was given last, as it renders it."""
-        return self._rig[1]["dac_v"].tolist()
+        return [*self._rig[1]["dac_v"].tolist(), *self._looped_v.tolist()]
 
     def close(self) -> None:
         """Outputs at 0 V; no time passes, for the rig exists only while it is called."""
         self._rig[1]["dac_v"] = 0.0
+        self._looped_v[:] = 0.0
 
 
 def _channel(name: str, converter: ConverterOptions) -> Channel:

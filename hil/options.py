@@ -184,6 +184,8 @@ class RigOptions(Options):
     coupling: dict[str, dict[str, float]] = {}
     """Of an axis, and of another one that moves it: µm of its own displacement per µm of the other's, before the
     dynamics. None: each axis moves alone."""
+    loopback: int = Field(default=0, ge=0, le=16)
+    """Further pairs of channels behind those of the axes: what output dac<n> was last written, input adc<n> reads."""
     latency_ticks: int = Field(default=0, ge=0, le=MAX_LATENCY)
     """Periods more than the one that a held output always takes: 0 is written in tick k, seen from k + 1."""
 

@@ -1,7 +1,7 @@
 """The record of a tick: the one definition that ring, recording, replay and export share.
 
-A record is a row of float64. Its columns are the common signals, then the signals of each axis, then what the driver
-declares as observed (a rig's truth; recorded, never passed to the law).
+A record is a row of float64. Its columns are the common signals, then the signals of each axis, then extra inputs and
+outputs in volts, then what the driver declares as observed (a rig's truth; recorded, never passed to the law).
 """
 
 from __future__ import annotations
@@ -111,11 +111,12 @@ RAISED = 1
 TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 
-def columns(axes: Sequence[str], observed: Sequence[str]) -> tuple[str, ...]:
-    """Names of a record's columns, in order: `tick`, …, `x_adc_v`, …, then the observed ones as given."""
+def columns(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
+    """Names of a record's columns, in order: `tick`, …, `x_adc_v`, …, then extras and the observed ones as given."""
     return (
         *(signal.name for signal in COMMON),
         *(f"{axis}_{signal.name}" for axis in axes for signal in PER_AXIS),
+        *extras,
         *observed,
     )
 

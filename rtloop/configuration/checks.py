@@ -12,6 +12,7 @@ from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, TogetherMarg
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse, analyse_continuous, analyse_discrete
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import controller_of
+from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
 from rtloop.laws.contract import Controller, CoupledController
 from rtloop.laws.linearise import linear_part
@@ -104,6 +105,11 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
             found.append(_check(axis, period_s, findings))
         elif number == configuration.owners[number]:
             found += _check_together(configuration, number, period_s, findings)
+        law = found[-1].law
+        if law is not None and number == configuration.owners[number]:
+            owned = [configuration.axes[i].name for i in configuration.together(number)]
+            with findings.at(f"axis.{axis.name}.controller: "):
+                connect(law, owned, list(configuration.inputs), configuration.outputs)
     return found
 
 

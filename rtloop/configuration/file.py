@@ -1,12 +1,12 @@
 """The configuration file: TOML, checked as a whole, every fault reported at once with its key and what is allowed.
 
-[loop]  [driver]  [driver.channels.AXIS]  [[axis]]  [[schedule]]  [recording]
+[loop]  [driver]  [driver.channels.AXIS]  [inputs]  [outputs]  [[axis]]  [[schedule]]  [recording]  [service]
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
+from rtloop.configuration.extras import NAME, ExtraInputOptions, ExtraOutputOptions, extra_faults
 from rtloop.configuration.laws import DEFAULT_LAWS, Library
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import parse_toml, read_text
@@ -48,6 +49,9 @@ class LoopOptions(Options):
     """Input channel of an enable or emergency-stop switch; its threshold is [axis.interlocks] enable_min_v."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """The loop parks by itself when its supervisor was silent for so long."""
+    hold_input: str | None = None
+    """One of [inputs]: while it is at `hold_min_v` or above, references stand still."""
+    hold_min_v: float = 2.5
     laws: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Further laws that the loop loads, kinds or files, so that they may be swapped in while it runs."""
 
@@ -100,6 +104,8 @@ class RecordingOptions(Options):
 class _Sections(Options):
     loop: LoopOptions
     axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
+    inputs: dict[Annotated[str, Field(pattern=NAME)], ExtraInputOptions] = {}  # noqa: RUF012
+    outputs: dict[Annotated[str, Field(pattern=NAME)], ExtraOutputOptions] = {}  # noqa: RUF012
     schedule: Annotated[tuple[ScheduleOptions, ...], Field(strict=False)] = ()
     recording: RecordingOptions = RecordingOptions()
     service: ServiceOptions = ServiceOptions()
@@ -122,6 +128,8 @@ class Configuration:
     driver_kind: str
     driver_options: Options
     channels: Mapping[str, ChannelOptions]
+    inputs: Mapping[str, ExtraInputOptions] = field(default_factory=dict)
+    outputs: Mapping[str, ExtraOutputOptions] = field(default_factory=dict)
     laws: tuple[LawReference, ...] = DEFAULT_LAWS
     """All that the loop is to know, in an order that does not depend on where they are used."""
 
@@ -183,6 +191,8 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
         driver_kind=kind,
         driver_options=options,
         channels=channels,
+        inputs=sections.inputs,
+        outputs=sections.outputs,
         laws=laws,
     )
 
@@ -325,6 +335,7 @@ def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -
     ]
     faults += [f"driver.channels.{name}: there is no axis of this name" for name in channels if name not in names]
     faults += shared_faults(sections.axis)
+    faults += extra_faults(sections.inputs, sections.outputs, sections.loop.hold_input, sections.axis)
     for entry in sections.schedule:
         if entry.axis is not None and entry.axis not in names:
             faults.append(f"schedule.axis: {entry.axis!r} is not an axis; there are {', '.join(names)}")

@@ -10,6 +10,7 @@ import numpy as np
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.coefficients import axis_coefficients, joined
+from rtloop.configuration.extras import extras_of
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.drivers.base import Channel, Driver, Facts, index_of
@@ -18,6 +19,7 @@ from rtloop.drivers.registry import driver_class
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.plan import Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
+from rtloop.law.extras import Extras
 from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
 from rtloop.laws.binding import functions_of
@@ -56,6 +58,10 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         coefficients.append(_coefficients(configuration, axis, checks[owner].law, facts, findings, number - owner))
         if configuration.axes[owner].controller is None and _uses_closed_loop(configuration):
             findings.faults.append(f"axis.{axis.name}.controller: missing; mode closed_loop needs it")
+    extras = Extras()
+    with findings.at(""):
+        names = [axis.name for axis in configuration.axes]
+        extras = extras_of(configuration.inputs, configuration.outputs, names, facts, configuration.wiring)
     table = TableOfSamples()
     generators = _generators(configuration, facts, table, findings)
     schedule = _schedule(configuration, facts, table, findings)
@@ -77,6 +83,11 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         table=table.samples,
         schedule=schedule,
         observed=facts.observed,
+        extras=extras,
+        extra_channels={name: one.channel for name, one in {**configuration.inputs, **configuration.outputs}.items()},
+        hold=None
+        if configuration.loop.hold_input is None
+        else (configuration.loop.hold_input, configuration.loop.hold_min_v),
         enable_input=configuration.loop.enable_input,
     )
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))

@@ -29,7 +29,7 @@ UNLIMITED = np.iinfo(np.int64).max
 
 def law_at_rest(plan: Plan) -> LawMemory:
     """The plan's law before its first tick."""
-    memory = LawMemory.at_rest(plan.layout, functions_of(plan.laws), plan.coefficients)
+    memory = LawMemory.at_rest(plan.layout, functions_of(plan.laws), plan.coefficients, plan.extras)
     set_mode(memory.law, int(plan.mode), True)
     return memory
 
@@ -84,6 +84,14 @@ class Assembly:
         self._point("timing", np.zeros(4))
         self._point("conditions", np.zeros(1, CONDITIONS))
         loop.enable_index = -1 if plan.enable_input is None else index_of(facts.inputs, plan.enable_input)
+        names = plan.extras.inputs
+        loop.hold_index, loop.hold_min_v = -1 if plan.hold is None else names.index(plan.hold[0]), np.inf
+        if plan.hold is not None:
+            loop.hold_min_v = plan.hold[1]
+        read = [index_of(facts.inputs, plan.extra_channels[name]) for name in names]
+        written = [index_of(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs]
+        self._point("extra_input_index", np.array(read, np.int64))
+        self._point("extra_output_index", np.array(written, np.int64))
         self._point("adc_v", np.zeros(len(axes)))
         self._point("references", np.zeros(len(axes)))
         inputs = [index_of(facts.inputs, plan.wiring[axis].input) for axis in axes]

@@ -23,7 +23,7 @@ _ADDRESSES = (
     *("inputs", "outputs", "timing"),
     # law
     *("law", "generators", "table", "adc_v", "references", "input_index", "output_index"),
-    "conditions",
+    *("conditions", "extra_input_index", "extra_output_index"),
     # shared block
     *("words", "last_drive_v", "commands", "commands_marks", "schedule", "staged"),
     *(f"{ring}_{part}" for ring in ("ticks", "events", "snapshots") for part in ("head", "marks", "slots")),
@@ -35,6 +35,8 @@ _COUNTS = (
 )
 _SETTINGS = (
     ("enable_index", np.int64),
+    ("hold_index", np.int64),
+    ("hold_min_v", np.float64),
     ("period_s", np.float64),
     ("period_us", np.float64),
     ("heartbeat_timeout_ns", np.float64),

@@ -32,9 +32,10 @@ from rtloop.hil.native.atomics import load_acquire
 from rtloop.hil.native.compiled import jit, seldom
 from rtloop.hil.native.pointers import call
 from rtloop.law.access import loop_of, state_of
+from rtloop.law.extras import inputs_of, outputs_of
 from rtloop.law.law import all_fit, evaluate, set_mode, update
 from rtloop.law.layout import LOOP_STATE
-from rtloop.law.reference import reference_sample
+from rtloop.law.reference import FOR_EVER, reference_sample
 from rtloop.signals import (
     ADC,
     COMMAND,
@@ -225,6 +226,9 @@ def _evaluate(loop, status, now_ns, lateness_us):
     )
     generators, table = generators_of(loop), floats(loop.table, loop.table_count)
     law = law_of(loop)
+    extras = law.extra_input_count + law.extra_output_count
+    if extras != 0:
+        _read_extras(loop, inputs)
     for a in range(loop.axis_count):
         adc_v[a] = inputs[input_index[a]]
         references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
@@ -238,11 +242,48 @@ def _evaluate(loop, status, now_ns, lateness_us):
     evaluate(law, adc_v, references, conditions)
     for a in range(loop.axis_count):
         outputs[output_index[a]] = state_of(law, a).drive_v
+    if extras != 0:
+        _set_extras(loop, outputs)
+
+
+@seldom
+def _read_extras(loop, inputs):
+    """Inputs beside the sensors, for the law; references stand still while the input that holds them is high."""
+    law, read = law_of(loop), inputs_of(law_of(loop))
+    index = integers(loop.extra_input_index, law.extra_input_count)
+    for k in range(law.extra_input_count):
+        read[k] = inputs[index[k]]
+    if loop.hold_index >= 0 and read[loop.hold_index] >= loop.hold_min_v:
+        generators = generators_of(loop)
+        for a in range(loop.axis_count):
+            generators[a].start_tick += 1
+            if generators[a].held_until < FOR_EVER:
+                generators[a].held_until += 1
+
+
+@seldom
+def _set_extras(loop, outputs):
+    """Outputs beside the drives."""
+    law, extras = law_of(loop), outputs_of(law_of(loop))
+    index = integers(loop.extra_output_index, law.extra_output_count)
+    for k in range(law.extra_output_count):
+        outputs[index[k]] = extras[k].value_v
+
+
+@seldom
+def _fill_extras(loop, row, column):
+    """Inputs and outputs beside sensors and drives."""
+    law = law_of(loop)
+    read, extras = inputs_of(law), outputs_of(law)
+    for k in range(law.extra_input_count):
+        row[column + k] = read[k]
+    for k in range(law.extra_output_count):
+        row[column + law.extra_input_count + k] = extras[k].value_v
 
 
 @jit
 def _fill_signals(loop, row):
-    """Sample age, the signals of each axis, the observed signals."""
+    """Sample age, the signals of each axis, extra inputs and outputs, the observed signals."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
     law = law_of(loop)
@@ -258,6 +299,10 @@ def _fill_signals(loop, row):
         row[column + DEMAND] = state.demand_v
         row[column + DRIVE] = state.drive_v
     column = COMMON_COUNT + loop.axis_count * PER_AXIS_COUNT
+    extras = law.extra_input_count + law.extra_output_count
+    if extras != 0:
+        _fill_extras(loop, row, column)
+    column += extras
     for i in range(loop.observed_count):
         row[column + i] = inputs[loop.input_count + 1 + i]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,8 @@ import numpy.typing as npt
 from rtloop.drivers.base import Driver, Facts, Wiring
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.memory import Sizes
-from rtloop.law.memory import Layout
+from rtloop.law.extras import Extras
+from rtloop.law.memory import NO_EXTRAS, Layout
 from rtloop.laws.registry import LawReference, layout_of
 from rtloop.signals import Mode, columns
 
@@ -50,6 +51,11 @@ class Plan:
     schedule: npt.NDArray[Any]
     observed: tuple[str, ...]
     enable_input: str | None = None
+    extras: Extras = NO_EXTRAS
+    extra_channels: Mapping[str, str] = field(default_factory=dict)
+    """Channel of each extra input and output."""
+    hold: tuple[str, float] | None = None
+    """Extra input at or above whose volts the references stand still."""
     spare_samples: int = 0
     """Room behind `table` for waveforms that come while the loop runs."""
 
@@ -61,7 +67,7 @@ class Plan:
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a record."""
-        return columns(self.axes, self.observed)
+        return columns(self.axes, self.observed, self.extras.columns)
 
     @property
     def sizes(self) -> Sizes:

@@ -8,11 +8,11 @@ import numpy as np
 
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LOOP_STATE, STATE
+from rtloop.law.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LOOP_STATE, STATE, TOLD
 
 FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
 CONTROL_BYTES, FUNCTIONS_BYTES = CONTROL.itemsize, FUNCTIONS.itemsize
-CONTROL_FIELDS = len(CONTROL.names or ())
+CONTROL_FIELDS = len(TOLD)
 
 
 class Law(NamedTuple):
@@ -31,6 +31,10 @@ class Law(NamedTuple):
     controller_coefficients: int
     controller_state: int
     axis_count: int
+    extra_inputs: int
+    extra_outputs: int
+    extra_input_count: int
+    extra_output_count: int
 
 
 @jit
@@ -39,6 +43,7 @@ def opened(law):
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
         law.functions, law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
+        law.extra_inputs, law.extra_outputs, int(law.extra_input_count), int(law.extra_output_count),
     )  # fmt: skip
 
 

@@ -20,6 +20,8 @@ MAX_TAPS = 128
 MAX_SECTIONS = 12
 MAX_COUPLED = 8
 """Axes that one controller may have."""
+MAX_EXTRAS = 8
+"""Inputs, and outputs, beside the sensors and the drives."""
 MAX_LAWS = 32
 """Kinds of laws that one loop may know."""
 ANEW = -1
@@ -153,10 +155,9 @@ CONDITIONS = np.dtype(
     align=True,
 )
 """What a tick is judged by beside its inputs; all of it is recorded."""
-CONTROL = np.dtype(
-    [(name, np.float64) for name in ("reference_um", "position_um", "error_um", "command_um", "applied_um")],
-    align=True,
-)
+TOLD = ("reference_um", "position_um", "error_um", "command_um", "applied_um")
+_EXTRAS = [("inputs", np.float64, (MAX_EXTRAS,)), ("outputs", np.float64, (MAX_EXTRAS,))]
+CONTROL = np.dtype([*((name, np.float64) for name in TOLD), *_EXTRAS], align=True)
 """What a controller is told of an axis, see `rtloop.laws.contract`; written anew each tick, no part of the state."""
 
 
@@ -164,9 +165,13 @@ def told_by(axes: int) -> np.dtype[Any]:
     """What a controller of so many axes is told: of several, the same, each number an array with an entry an axis."""
     if axes == 1:
         return CONTROL
-    return np.dtype([(name, np.float64, (axes,)) for name in CONTROL.names or ()], align=True)
+    return np.dtype([*((name, np.float64, (axes,)) for name in TOLD), *_EXTRAS], align=True)
 
 
+EXTRA_OUTPUT = np.dtype(
+    [*((name, np.float64) for name in ("value_v", "lowest_v", "highest_v", "safe_v")), ("axis", np.int64)], align=True
+)
+"""An output beside the drives: what it is now, where it may be, and which axis's controller sets it."""
 FUNCTIONS = np.dtype(
     [
         *((name, np.int64) for name in ("output", "update", "enter")),
@@ -186,8 +191,8 @@ LAW = np.dtype(
         *((name, np.int64) for name in ("coefficients", "coefficients_bytes", "axes", "axes_bytes", "loop")),
         *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised")),
         *((name, np.int64) for name in ("controller_coefficients", "controller_state")),
-        ("axis_count", np.uint32),
-        ("law_count", np.uint32),
+        *((name, np.int64) for name in ("extra_inputs", "extra_outputs")),
+        *((name, np.uint32) for name in ("axis_count", "law_count", "extra_input_count", "extra_output_count")),
     ],
     align=True,
 )

@@ -15,15 +15,18 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from rtloop.law.extras import Extras
 from rtloop.law.layout import (
     ALLOWED_COEFFICIENTS,
     ALLOWED_LOOP_STATE,
     ALLOWED_STATE,
     COEFFICIENTS,
     CONTROL,
+    EXTRA_OUTPUT,
     LAW,
     LINE_BYTES,
     LOOP_STATE,
+    MAX_EXTRAS,
     REVISION,
     RULE,
     STATE,
@@ -31,6 +34,7 @@ from rtloop.law.layout import (
 )
 from rtloop.law.validity import Allowed, Bits, require_allowed
 
+NO_EXTRAS = Extras()
 Slot = Literal["feedforward", "controller"]
 Which = Literal["coefficients", "state"]
 Rules = Mapping[str, Allowed | Bits]
@@ -197,7 +201,13 @@ class LawMemory:
     """
 
     def __init__(
-        self, layout: Layout, functions: npt.NDArray[Any], coefficients: Records, axes: Records, state: Records
+        self,
+        layout: Layout,
+        functions: npt.NDArray[Any],
+        coefficients: Records,
+        axes: Records,
+        state: Records,
+        extras: Extras = NO_EXTRAS,
     ) -> None:
         self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
         rules = layout.rules()
@@ -216,24 +226,36 @@ class LawMemory:
             "rules": np.concatenate([np.zeros(0, RULE), *rules]),
             "result": np.zeros(1),
             "raised": np.zeros(1, np.int64),
+            "extra_inputs": np.zeros(MAX_EXTRAS),
+            "extra_outputs": records(EXTRA_OUTPUT, MAX_EXTRAS),
         }
+        for one, output in zip(self._kept["extra_outputs"], extras.outputs, strict=False):
+            one["value_v"] = one["safe_v"] = output.safe_v
+            one["lowest_v"], one["highest_v"], one["axis"] = output.lowest_v, output.highest_v, output.axis
         self.records: Any = records(LAW, 1)
         for name, array in self._kept.items():
             self.records[name] = array.ctypes.data
         self.law = self.records[0]
         self.law.coefficients_bytes, self.law.axes_bytes = coefficients.itemsize, axes.itemsize
         self.law.axis_count, self.law.law_count = axes.size, len(layout.laws)
+        self.law.extra_input_count, self.law.extra_output_count = len(extras.inputs), len(extras.outputs)
         own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.room("feedforward")
         self.law.controller_coefficients = own[0] + feedforward[0]
         self.law.controller_state = own[1] + feedforward[1]
 
     @classmethod
-    def at_rest(cls, layout: Layout, functions: npt.NDArray[Any], coefficients: npt.NDArray[Any]) -> LawMemory:
+    def at_rest(
+        cls,
+        layout: Layout,
+        functions: npt.NDArray[Any],
+        coefficients: npt.NDArray[Any],
+        extras: Extras = NO_EXTRAS,
+    ) -> LawMemory:
         """Outputs at their safe values, an unloaded actuator that never moved."""
         own = copied(coefficients)
         axes = records(layout.state, own.size)
         axes["drive_v"] = own["safe_v"]
-        return cls(layout, functions, own, axes, records(LOOP_STATE, 1))
+        return cls(layout, functions, own, axes, records(LOOP_STATE, 1), extras)
 
     def of_law(self, axis: int, slot: Slot, what: Which) -> Any:
         """A plug-in's record of axis number `axis`, by attributes; None for a controller that another axis owns."""

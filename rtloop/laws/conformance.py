@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from rtloop.hil.native.compiled import checked
-from rtloop.law.layout import told_by
+from rtloop.law.layout import MAX_EXTRAS, told_by
 from rtloop.law.memory import records
 from rtloop.laws.binding import signatures_of
 from rtloop.laws.contract import Controller, Law, record_of
@@ -144,7 +144,7 @@ class Bench:
             return self._kernels[name](self.coefficients[0], self.state[0], told)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
-        """What each tick gives, a number or one for each axis, and the state after it."""
+        """What each tick gives, a number or one for each axis, and the state and the outputs after it."""
         random = np.random.default_rng(seed)
         for number in range(ticks):
             if self._law.count == 0:
@@ -159,10 +159,11 @@ class Bench:
             told.reference_um = random.uniform(-reach, reach, axes)
             told.error_um = told.reference_um - told.position_um
             told.command_um = told.applied_um = random.uniform(-REACH_UM, REACH_UM, axes)
+            told.inputs, told.outputs = random.uniform(-10, 10, MAX_EXTRAS), np.zeros(MAX_EXTRAS)
             value = self._commands(told)
             told.command_um, told.applied_um = value, np.clip(value, -REACH_UM, REACH_UM)
             self._call("update", told)
-            yield value, self.state.tobytes()
+            yield value, self.state.tobytes() + told.outputs.tobytes()
 
     def _commands(self, told: Any) -> Any:
         """What the controller commands: a number, or a tuple with one for each of its axes."""

@@ -7,6 +7,8 @@ coefficients `c` and state `s` as records with attributes, and what else they ma
                   update(c, s, told)
                   told.reference_um, position_um, error_um: as the controller meets them; in `update` also
                   command_um, what went out as its command, and applied_um, what of it was really applied
+                  told.inputs, told.outputs: in V, by the places that `self.channels` says; an output that is not set
+                  in a tick is at its safe value
 
     coupled       as a controller, but for several axes at once: what it is told are arrays with an entry an axis, and
                   its output sets told.command_um[i] instead of returning a command
@@ -52,6 +54,10 @@ class Law(ABC):
     allowed_state: ClassVar[Rules] = MappingProxyType({})
     shipped: ClassVar[bool] = False
     """True where the functions are compiled kernels already, whose indices are checked where data enters."""
+    inputs: ClassVar[tuple[str, ...]] = ()
+    outputs: ClassVar[tuple[str, ...]] = ()
+    """Of a controller, the names of channels beside sensor and drive that it reads in told.inputs, and sets in
+    told.outputs, both in V; `self.channels` has their places there."""
     libm: ClassVar[bool] = False
     """True where sin, exp and the like are wanted, although a replay on another processor may then differ."""
     enter: Any = None
@@ -67,6 +73,7 @@ class Law(ABC):
         """`model` is the plant from command to position that the axis was given (`configuration`'s), or None; of a
         coupled controller, a tuple with one for each of its axes."""
         self.options, self.period_s, self.model = options, period_s, model
+        self.channels = {name: place for names in (self.inputs, self.outputs) for place, name in enumerate(names)}
 
     @abstractmethod
     def build(self) -> Mapping[str, Any]:

@@ -25,7 +25,7 @@ from rtloop.service.building import prepare_limited
 from rtloop.service.desk import Desk, Refused, Taken
 from rtloop.signals import MODE, Mode
 
-FIXED = ("loop", "driver_kind", "driver_options", "channels")
+FIXED = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs")
 """Parts of a configuration that only a restart can change."""
 OTHER_AXES = "controller.axes: which axes share a controller changed, which needs a restart"
 SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")

@@ -35,6 +35,12 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "configuration": configuration.text,
         "configuration_sha256": hashlib.sha256(configuration.text.encode()).hexdigest(),
         "law": _laws(plan),
+        "extras": {
+            "inputs": [{"name": name, "channel": plan.extra_channels[name]} for name in plan.extras.inputs],
+            "outputs": [
+                {**output._asdict(), "channel": plan.extra_channels[output.name]} for output in plan.extras.outputs
+            ],
+        },
         "driver": {
             "kind": plan.driver_kind,
             "inputs": [channel.name for channel in prepared.facts.inputs],

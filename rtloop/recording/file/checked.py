@@ -7,7 +7,7 @@ make of it: a mode, the number of an axis, the kind of a generator and its place
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import pydantic_core
@@ -15,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
+from rtloop.law.extras import ExtraOutput, Extras
+from rtloop.law.layout import MAX_EXTRAS
 from rtloop.law.reference import Generator
 from rtloop.recording.file.events import FINAL, GAP, RECORDER, RECORDING_FAILED, RECORDING_RESUMED, Event, known
 from rtloop.recording.file.format import FORMAT
@@ -63,6 +65,23 @@ class _Versions(_Checked):
     rtloop: Text | None = None
 
 
+class _Input(_Checked):
+    name: Name
+    channel: Text
+
+
+class _Output(_Input):
+    axis: Annotated[int, Field(ge=0, lt=64)]
+    lowest_v: float
+    highest_v: float
+    safe_v: float
+
+
+class _Extras(_Checked):
+    inputs: Annotated[list[_Input], Field(max_length=MAX_EXTRAS)] = []
+    outputs: Annotated[list[_Output], Field(max_length=MAX_EXTRAS)] = []
+
+
 class _Header(_Checked):
     format: Annotated[int, Field(ge=1)]
     name: Text
@@ -78,6 +97,7 @@ class _Header(_Checked):
     realtime: _Realtime
     versions: _Versions
     host: _Host
+    extras: _Extras = _Extras()
     sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
     first_tick: Tick = 0
 
@@ -143,10 +163,25 @@ def header_from(payload: bytes) -> dict[str, Any]:
 
 
 def require_columns(header: dict[str, Any]) -> None:
-    """Raise Malformed where the columns are not those of the axes and the observed signals."""
-    expected = list(signals.columns(header["axes"], header["observed"]))
+    """Raise Malformed where the columns are not those of the axes, the extras and the observed signals."""
+    expected = list(signals.columns(header["axes"], header["observed"], extras_of(header).columns))
     if header["columns"] != expected:
         raise Malformed(f"columns: {_shown(header['columns'])}; axes and observed make {_shown(expected)}")
+
+
+def extras_of(header: Mapping[str, Any]) -> Extras:
+    """Inputs and outputs beside sensors and drives, as the loop had them."""
+    found = header.get("extras", {})
+    outputs = [[output[field] for field in ExtraOutput._fields] for output in found.get("outputs", ())]
+    return Extras(
+        tuple(entry["name"] for entry in found.get("inputs", ())), tuple(ExtraOutput(*output) for output in outputs)
+    )
+
+
+def extra_channels_of(header: Mapping[str, Any]) -> dict[str, str]:
+    """The channel of each of them."""
+    found = header.get("extras", {})
+    return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in found.get(kind, ())}
 
 
 def event_from(payload: bytes, axes: Sequence[str]) -> Event:

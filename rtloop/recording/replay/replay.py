@@ -19,6 +19,7 @@ from rtloop.law.memory import LawMemory
 from rtloop.laws.binding import functions_of
 from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.checked import extras_of
 from rtloop.recording.file.events import GAP, RECOVERED, Event, json_value, message_of
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.load import Recording
@@ -47,7 +48,8 @@ def law_of(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference
     layout = layout_of(laws)
     try:
         _, *law = layout.split(snapshot.data, len(recording.header["axes"]))
-        return LawMemory(layout, functions_of(laws), *law)
+        coefficients, axes, state = law
+        return LawMemory(layout, functions_of(laws), coefficients, axes, state, extras_of(recording.header))
     except ValueError as error:
         raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
 

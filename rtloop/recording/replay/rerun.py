@@ -17,6 +17,7 @@ from rtloop.engine.plan import Pacing, Plan
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
+from rtloop.recording.file.checked import extra_channels_of, extras_of
 from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048
@@ -32,6 +33,7 @@ class Source(Protocol):
 
     facts: Facts
     wiring: dict[str, Wiring]
+    extra_channels: dict[str, str]
     enable_input: str | None
 
     def pointers(self) -> Pointers:
@@ -51,10 +53,15 @@ class Tape:
     def __init__(self, header: Mapping[str, Any]) -> None:
         axes, observed = header["axes"], tuple(header["observed"])
         channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
-        self.facts = Facts((*channels[0], Channel("enable")), channels[1], observed, real=False)
+        self._extras = extras_of(header)
+        self.extra_channels = {name: f"extra {name}" for name in extra_channels_of(header)}
+        read = tuple(Channel(self.extra_channels[name]) for name in self._extras.inputs)
+        written = tuple(Channel(self.extra_channels[output.name]) for output in self._extras.outputs)
+        inputs = (*channels[0], Channel("enable"), *read)
+        self.facts = Facts(inputs, (*channels[1], *written), observed, real=False)
         self.wiring = {axis: Wiring(f"{axis} in", f"{axis} out") for axis in axes}
         self._columns, self._axes, self._observed = len(header["columns"]), len(axes), len(observed)
-        self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + self._axes + 1 + 1 + self._observed), np.nan)
+        self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + len(inputs) + 1 + self._observed), np.nan)
         self._playback = Playback()
 
     def pointers(self) -> Pointers:
@@ -75,9 +82,13 @@ class Tape:
         for axis in range(self._axes):
             tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
         tape[:, first + self._axes] = rows[:, signals.ENABLE]
-        tape[:, first + self._axes + 1] = rows[:, signals.SAMPLE_AGE]
+        read = len(self._extras.inputs)
+        if read:
+            begin = signals.axis_column(self._axes, 0)
+            tape[:, first + self._axes + 1 : first + self._axes + 1 + read] = rows[:, begin : begin + read]
+        tape[:, first + self._axes + 1 + read] = rows[:, signals.SAMPLE_AGE]
         if self._observed:
-            tape[:, first + self._axes + 2 :] = rows[:, self._columns - self._observed :]
+            tape[:, first + self._axes + read + 2 :] = rows[:, self._columns - self._observed :]
         self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
 
 
@@ -166,5 +177,7 @@ def _plan(
         table=np.zeros(SLICE_TICKS * len(axes)),
         schedule=commands,
         observed=source.facts.observed,
+        extras=extras_of(header),
+        extra_channels=source.extra_channels,
         enable_input=source.enable_input,
     )

@@ -19,6 +19,7 @@ from rtloop.law.memory import LawMemory
 from rtloop.laws.binding import functions_of
 from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.checked import extra_channels_of, extras_of
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.outcome import Differences, Performance
@@ -41,7 +42,8 @@ class Rig:
 
     enable_input: str | None = None
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
+        self.extra_channels = extra_channels
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
     def pointers(self) -> Pointers:
@@ -86,7 +88,7 @@ def resimulate(recording: Recording, law: Law, driver: Driver, progress: Progres
     before, after = (Performance(axes, rate_hz) for _ in range(2))
     ticks = 0
     try:
-        with closing(_pairs(recording, law, Rig(driver))) as pairs:
+        with closing(_pairs(recording, law, Rig(driver, extra_channels_of(recording.header)))) as pairs:
             for recorded, replayed in pairs:
                 before.add(recorded)
                 after.add(replayed)
@@ -111,7 +113,7 @@ def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Ro
             while len(rows):
                 tick = int(rows[0, signals.TICK])
                 if rerun is None:
-                    memory = _at_rest(law, Mode(int(rows[0, signals.MODE])))
+                    memory = _at_rest(recording, law, Mode(int(rows[0, signals.MODE])))
                     rerun = Rerun(recording.header, source, law.laws, memory, commands[commands["tick"] >= tick], tick)
                 count = min(len(rows), rerun.room(tick))
                 replayed = rerun.execute(rows[:count])
@@ -123,8 +125,9 @@ def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Ro
         raise RecordingError(f"{recording.paths[0]}: holds no tick")
 
 
-def _at_rest(law: Law, mode: Mode) -> LawMemory:
-    memory = LawMemory.at_rest(layout_of(law.laws), functions_of(law.laws), law.coefficients)
+def _at_rest(recording: Recording, law: Law, mode: Mode) -> LawMemory:
+    extras = extras_of(recording.header)
+    memory = LawMemory.at_rest(layout_of(law.laws), functions_of(law.laws), law.coefficients, extras)
     set_mode(memory.law, int(mode), True)
     return memory
 

@@ -1,0 +1,106 @@
+"""[inputs] and [outputs]: channels beside the sensors and the drives, which controllers read and set by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rtloop.configuration.axis import AxisOptions
+from rtloop.drivers.base import Facts, Wiring, index_of
+from rtloop.hil.options import Options
+from rtloop.law.extras import ExtraOutput, Extras
+from rtloop.law.layout import MAX_EXTRAS
+from rtloop.laws.contract import Law
+
+NAME = r"^[a-z][a-z0-9_]{0,31}$"
+
+
+class ExtraInputOptions(Options):
+    """A channel that is read each tick."""
+
+    channel: str
+
+
+class ExtraOutputOptions(Options):
+    """A channel that the controller of an axis sets; at `safe_v` wherever it does not."""
+
+    channel: str
+    axis: str
+    min_v: float | None = None
+    max_v: float | None = None
+    """Where it may be; the channel's range by default."""
+    safe_v: float | None = None
+    """The channel's own by default."""
+
+
+def extra_faults(
+    inputs: Mapping[str, ExtraInputOptions],
+    outputs: Mapping[str, ExtraOutputOptions],
+    hold_input: str | None,
+    axes: Sequence[AxisOptions],
+) -> list[str]:
+    """What concerns names."""
+    faults: list[str] = []
+    for section, named in (("inputs", inputs), ("outputs", outputs)):
+        if len(named) > MAX_EXTRAS:
+            faults.append(f"{section}: {len(named)} channels; at most {MAX_EXTRAS} are allowed")
+    faults += [f"outputs.{name}: an input has this name" for name in outputs if name in inputs]
+    names = [axis.name for axis in axes]
+    for name, output in outputs.items():
+        if output.axis not in names:
+            faults.append(f"outputs.{name}.axis: {output.axis!r} is not an axis; there are {', '.join(names)}")
+    if hold_input is not None and hold_input not in inputs:
+        there = f"there are {', '.join(inputs)}" if inputs else "there is none"
+        faults.append(f"loop.hold_input: {hold_input!r} is not among [inputs]; {there}")
+    return faults
+
+
+def extras_of(
+    inputs: Mapping[str, ExtraInputOptions],
+    outputs: Mapping[str, ExtraOutputOptions],
+    axes: Sequence[str],
+    facts: Facts,
+    wiring: Mapping[str, Wiring],
+) -> Extras:
+    """With the driver's channels. Raises ValueError for one that is not there, is taken, or cannot go so far."""
+    for name, read in inputs.items():
+        _at(f"inputs.{name}.channel", facts.inputs, read.channel)
+    taken = {one.output: f"the drive of axis {axis}" for axis, one in wiring.items()}
+    found = []
+    for name, options in outputs.items():
+        channel = facts.outputs[_at(f"outputs.{name}.channel", facts.outputs, options.channel)]
+        if channel.name in taken:
+            raise ValueError(f"outputs.{name}.channel: {channel.name!r} is taken by {taken[channel.name]}")
+        taken[channel.name] = f"output {name}"
+        lowest_v = channel.minimum_v if options.min_v is None else options.min_v
+        highest_v = channel.maximum_v if options.max_v is None else options.max_v
+        safe_v = channel.safe_v if options.safe_v is None else options.safe_v
+        if not channel.minimum_v <= lowest_v <= safe_v <= highest_v <= channel.maximum_v:
+            raise ValueError(
+                f"outputs.{name}: from {lowest_v:g} to {highest_v:g} V, safe at {safe_v:g}; the channel has "
+                f"{channel.minimum_v:g} … {channel.maximum_v:g} V, and what is safe must lie between the ends"
+            )
+        found.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
+    return Extras(tuple(inputs), tuple(found))
+
+
+def _at(where: str, channels: Any, name: str) -> int:
+    try:
+        return index_of(channels, name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapping[str, ExtraOutputOptions]) -> None:
+    """Tell a law the numbers of its inputs and outputs; `owned` are its axes. Raises ValueError for one that is not
+    there.
+    """
+    numbers = {name: number for number, name in enumerate(inputs)}
+    numbers |= {name: number for number, name in enumerate(outputs)}
+    own = [name for name, output in outputs.items() if output.axis in owned]
+    for kind, wanted, there in (("input", law.inputs, list(inputs)), ("output", law.outputs, own)):
+        for name in wanted:
+            if name not in there:
+                has = f"there are {', '.join(there)}" if there else "there is none"
+                raise ValueError(f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; {has} for it")
+    law.channels = {name: numbers[name] for name in (*law.inputs, *law.outputs)}
