@@ -6,6 +6,8 @@ When the loop has ended it reports how many bytes of the canaries are no longer 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -38,10 +40,20 @@ def broken() -> int:
     return sum(int(np.count_nonzero(np.delete(room, np.s_[begin:end]) != CANARY)) for room, begin, end in _guarded)
 
 
+@contextmanager
+def guarding() -> Iterator[None]:
+    """Records that are made meanwhile have canaries, and are kept for ever."""
+    memory.records, usual = guarded_records, memory.records
+    try:
+        yield
+    finally:
+        memory.records = usual
+
+
 def main() -> int:
     """The loop's process, and then the canaries."""
-    memory.records = guarded_records
-    code = process.main()
+    with guarding():
+        code = process.main()
     process.report("canaries", records=guarded(), broken=broken())
     return code
 

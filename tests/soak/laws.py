@@ -14,12 +14,11 @@ from pathlib import Path
 from random import Random
 
 import rtloop
-from rtloop.law import memory
 from rtloop.recording.capture.session import Options
 from rtloop.recording.file.recover import recover
 from rtloop.recording.replay.replay import replay
 from tests.laws.changing import AT_CHANGE_V, CONTROLLERS, MORE, LawChanges, Steps, change_at_random, steps_of
-from tests.soak.guarded_process import broken, guarded, guarded_records
+from tests.soak.guarded_process import broken, guarded, guarding
 
 CHANGES, ROTATE_S = 1000, 5.0
 
@@ -28,7 +27,8 @@ def changed(folder: Path, sections: dict[str, str], seed: int) -> tuple[LawChang
     """The changes of one run, its recording in one file, and in several."""
     whole, parts = folder / "whole.mcap", folder / "parts.mcap"
     files = {whole: Options(min_free_bytes=0), parts: Options(min_free_bytes=0, rotate_s=ROTATE_S)}
-    changes = change_at_random(folder, sections, files, seed=seed, count=CHANGES, model=True)
+    with guarding():
+        changes = change_at_random(folder, sections, files, seed=seed, count=CHANGES, model=True)
     return changes, whole, sorted(folder.glob("parts-*.mcap"))
 
 
@@ -86,7 +86,6 @@ def main() -> None:
     parser.add_argument("seeds", nargs="*", type=int, default=[14])
     parser.add_argument("--laws", nargs="*", choices=CONTROLLERS, default=list(CONTROLLERS))
     given = parser.parse_args()
-    memory.records = guarded_records
     for seed in given.seeds:
         alone = steps_alone(seed)
         print(f"C(z) alone, seed {seed}: {alone.at_change_v:.1e} V at a change, {alone.largest_v:.4f} V in any tick")
