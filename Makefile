@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -28,6 +28,10 @@ faults-pairs: $(READY)
 # A law changed at random for 10^8 ticks, with canaries around its records: about ten minutes, 1 GB in the temporary folder.
 soak-live-changes: $(READY)
 	$(BIN)/python -m tests.soak.live_changes
+
+# A thousand live changes of every shipped controller, for each of SEEDS (such as "1 2 3"): a quarter of an hour each.
+soak-laws: $(READY)
+	$(BIN)/python -m tests.soak.laws $(SEEDS)
 
 # The control API under eight clients beside a paced run; swaps through it; the daemon on a board for an hour.
 soak-flood: $(READY)

@@ -63,6 +63,13 @@ class Word(IntEnum):
     """Ticks before FLUSHED_TICKS that are in no file."""
     RECORDER_FAILURE = 16
     """Why ticks from FLUSHED_TICKS on are not recorded: `OutputError.number`; 0 while they are."""
+    ANNOUNCED_TICKS = 17
+    """As FLUSHED_TICKS and the others will be behind a write; see `rtloop.recording.capture.progress`."""
+    ANNOUNCED_EVENTS = 18
+    ANNOUNCED_SNAPSHOTS = 19
+    ANNOUNCED_LOST = 20
+    ANNOUNCED_BYTE = 21
+    """Where in its file that write begins."""
 
 
 class ProcessState(IntEnum):

@@ -106,9 +106,12 @@ class Recording:
 
     def snapshots(self) -> Generator[Snapshot]:
         """The recorded states of the law, in order."""
+        before = -1
         with self._reading() as readers:
             for reader in readers:
-                yield from reader.snapshots()
+                for snapshot in reader.snapshots(before):
+                    before = snapshot.tick
+                    yield snapshot
 
     @contextmanager
     def _reading(self) -> Iterator[list[Reader]]:

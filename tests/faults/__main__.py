@@ -8,12 +8,12 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-from tests.faults import clock, hardware, outputs, processes, requests, storage
+from tests.faults import clock, hardware, laws, outputs, processes, requests, storage
 from tests.faults.fault import Row, measure
 
 FAULTS = (
     *(*processes.FAULTS, *hardware.FAULTS, *storage.FAULTS),
-    *(*requests.FAULTS, *clock.FAULTS, *outputs.FAULTS),
+    *(*requests.FAULTS, *clock.FAULTS, *outputs.FAULTS, *laws.FAULTS),
 )
 COLUMNS = ("fault", "what must happen", "safe after", "lost / executed", "largest |drive|, step (allowed)", "verdict")
 

@@ -8,6 +8,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAPER = (ROOT / "deploy" / "paper.toml").read_text(encoding="utf-8")
 LAW = PAPER[PAPER.index("[axis.feedforward]") : PAPER.index("# [axis.prefilter]")]
 """Feed-forward, controller and model."""
+CONTROLLER = LAW[LAW.index("[axis.controller]") : LAW.index("# Eq (5)")]
 BOARD_RATE_HZ, CARD_RATE_HZ = 4000.0, 2000.0
 SLEW_V_PER_S, TRIP_SLEW_V_PER_S = 1000.0, 500.0
 

@@ -31,6 +31,10 @@ def text(output: str = "", update: str = "") -> str:
     return HEAD + "".join(part.format(body) for part, body in zip((OUTPUT, UPDATE), bodies, strict=True))
 
 
+ENDLESS_UM = 30.0
+FOR_EVER = "        if told.reference_um > {}:\n            while True:\n                s.seen += 1.0\n"
+ENDLESS = HEAD + OUTPUT.format(FOR_EVER.format(ENDLESS_UM)) + UPDATE.format("")
+"""Its output never comes to an end once a reference lies above ENDLESS_UM."""
 FAILING = {
     "divides by zero": (text("return 1.0 / (s.seen - 200.0)"), 200, "raised in output of the controller"),
     "divides a whole number by zero": (text("return 1.0 * (7 // (int(s.seen) - 200))"), 200, "raised in output"),

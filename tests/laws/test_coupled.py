@@ -27,6 +27,7 @@ from rtloop.recording.replay.replay import replay
 from rtloop.service import live
 from tests.engine.harness import LoopBench
 from tests.law.harness import PERIOD_S
+from tests.laws.changing import PAIR
 from tests.laws.test_shipped import EXAMPLES, example, state_space
 from tests.recording.real_loop import Options, RealLoop
 
@@ -163,30 +164,7 @@ def test_the_loop_is_as_it_was_predicted(tmp_path):
     assert predicted.disk_margin == pytest.approx(disk, rel=0.01)
 
 
-MINE = """
-from rtloop.laws import ControllerOptions, CoupledController
-
-class Options(ControllerOptions):
-    ki_per_s: float = 100.0
-    shared: float = 0.1
-
-class Mine(CoupledController):
-    axes = 2
-    options_model = Options
-    coefficients = {"ki": float, "shared": float}
-    state = {"integral_um": (float, 2)}
-
-    def build(self):
-        return {"ki": self.options.ki_per_s * self.period_s, "shared": self.options.shared}
-
-    def output(c, s, told):
-        for i in range(2):
-            told.command_um[i] = s.integral_um[i] - c.shared * s.integral_um[1 - i]
-
-    def update(c, s, told):
-        for i in range(2):
-            s.integral_um[i] += c.ki * told.error_um[i] + told.applied_um[i] - told.command_um[i]
-"""
+MINE = PAIR.replace("class Pair", "class Mine")
 MY_TABLE = '[axis.controller]\nfile = "mine.py"\naxes = ["x", "y"]\n\n'
 
 

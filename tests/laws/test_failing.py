@@ -7,16 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rtloop
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.recording.file.events import event_of
+from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
 from tests.engine.harness import AXIS, LoopBench, text
-from tests.laws.failing import FAILING, REFUSED
+from tests.laws.changing import HOLD as HOLD_5_UM
+from tests.laws.changing import configuration
+from tests.laws.failing import ENDLESS, ENDLESS_UM, FAILING, REFUSED
 from tests.laws.failing import text as law_text
+from tests.service.test_run import run
 
 HOLD = '[axis.controller]\nfile = "mine.py"\n[axis.reference]\nkind = "hold"\nvalue = 5.0\n'
 CANARY = 0xA5
@@ -82,6 +88,22 @@ def test_it_is_refused_before_anything_runs(name, tmp_path):
     law, said = REFUSED[name]
     with pytest.raises(ConfigError, match=said):
         plan_of(tmp_path, law)
+
+
+def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
+    """In a run of its own; what was recorded before is whole. On a board that outlives it: `make faults`."""
+    (tmp_path / "mine.py").write_text(ENDLESS)
+    steps = f'[axis.reference]\nkind = "steps"\nlevels = [5.0, {ENDLESS_UM + 5.0}]\ndwell_s = 0.2\n'
+    config, law = tmp_path / "lab.toml", '[axis.controller]\nfile = "mine.py"\n'
+    whatever_the_host_does = ("late_ticks = 10", "late_ticks = 0")
+    text = configuration(law, [], model=False).replace(*whatever_the_host_does)
+    config.write_text(text.replace(HOLD_5_UM, steps))
+    code, summary, said = run(config, "--duration", "3", "--out", tmp_path)
+    assert code == 1
+    assert "stood still and was killed; its outputs were parked" in said
+    assert (summary["ticks_logged"], summary["ticks_lost"]) == (2000, 0)
+    report = replay(rtloop.load(summary["recording"]), trust=Trust(recorded=True))
+    assert (report.ticks, report.first_difference) == (2000, None)
 
 
 def test_a_law_without_enter_is_entered_without_a_bump(tmp_path):

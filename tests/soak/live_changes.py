@@ -8,10 +8,9 @@ the recording must replay identical.
 from __future__ import annotations
 
 import argparse
-import re
 import tempfile
 import threading
-from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -24,20 +23,19 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
-from rtloop.errors import RtloopError
 from rtloop.recording.replay.replay import replay
 from rtloop.service.desk import Desk
 from rtloop.service.live import LiveLaw
 from rtloop.signals import Mode
 from rtloop.supervision.child import Child
 from rtloop.supervision.supervisor import Processes, Supervisor
+from tests.laws.changing import MODEL, Changes
 from tests.recording.real_loop import ROOT
 
 DRIVE_V, SLEW_V_PER_S, TRIP_SLEW_V_PER_S, RATE_HZ = 9.0, 3000.0, 700.0, 10_000.0
 ROTATE_MIB, BLOCK_TICKS, SPARE_SAMPLES = 256.0, 1_000_000, 1 << 14
 TEXT = (ROOT / "deploy" / "two-axis.toml").read_text(encoding="utf-8")
 LIMITS = ("drive_v = 10.0\n", f"drive_v = {DRIVE_V}\nslew_v_per_s = {SLEW_V_PER_S}\n")
-MODEL = re.compile(r"\[axis\.model\].*?(?=\n\[)", re.DOTALL)
 TRIP = ("trip_slew_v_per_s = 1000.0", f"trip_slew_v_per_s = {TRIP_SLEW_V_PER_S}")
 
 
@@ -50,23 +48,13 @@ class GuardedProcesses(Processes):
         self.recorder = Child("rtloop.recording.capture.recorder", self.fd)
 
 
-class Changes:
-    """Random changes to a running law; `done` counts them by kind, `refused` those that were not taken."""
+class EveryChange(Changes):
+    """Of everything that may change under way, on either axis."""
 
-    def __init__(self, live: LiveLaw, desk: Desk, chance: Random) -> None:
-        self._live, self._desk, self._chance = live, desk, chance
-        self.done: Counter[str] = Counter()
-        self.refused = 0
-
-    def one(self) -> None:
-        """The next one."""
+    def kinds(self) -> Sequence[Callable[[], object]]:
+        """All of them."""
         kinds = self._prefilter, self._controller, self._limits, self._interlocks, self._mode, self._reference
-        kind = self._chance.choice((*kinds, self._waveform, self._tare, self._reset))
-        try:
-            kind()
-            self.done[kind.__name__.strip("_")] += 1
-        except RtloopError:
-            self.refused += 1
+        return (*kinds, self._waveform, self._tare, self._reset)
 
     @property
     def _axis(self) -> str:
@@ -134,7 +122,7 @@ class Changes:
         self._desk.submit(Kind.SET_MODE, values=[float(Mode.CLOSED_LOOP)])
 
 
-def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], Changes, dict[str, Any]]:
+def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], EveryChange, dict[str, Any]]:
     """Run so many ticks under changes; the recording's files, the changes, what the canaries say."""
     text = TEXT.replace(*LIMITS).replace(*TRIP)
     text = MODEL.sub("", text[: text.index("[recording]")])  # without margins to find, a change takes milliseconds
@@ -144,7 +132,7 @@ def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], Changes, di
         prepared = replace(prepared, plan=replace(prepared.plan, spare_samples=SPARE_SAMPLES))
         supervisor = Supervisor(processes, prepared, folder / "changes.mcap")
         desk = Desk(supervisor.block)
-        changes = Changes(LiveLaw(prepared, supervisor.block, desk, {}), desk, Random(seed))
+        changes = EveryChange(LiveLaw(prepared, supervisor.block, desk, {}), desk, Random(seed))
         ended = threading.Event()
 
         def change() -> None:
@@ -193,6 +181,7 @@ def main() -> None:
             f"{SLEW_V_PER_S / RATE_HZ} V; replay {'identical' if verdict.identical else verdict.first_difference}",
             flush=True,
         )
+        assert canaries["records"]
         assert canaries["broken"] == 0
         assert found["drive_v"] <= DRIVE_V
         assert found["step_v"] <= SLEW_V_PER_S / RATE_HZ * (1 + 1e-9)

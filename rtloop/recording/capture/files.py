@@ -25,6 +25,18 @@ class Options(NamedTuple):
     """Number of the first file: above 1 where another recorder of the same run died."""
 
 
+def numbered(path: Path, sequence: int) -> Path:
+    """The name of one of several files of a run."""
+    return path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
+
+
+def left_by_another(path: Path, sequence: int) -> Path | None:
+    """The unfinished file of the recorder that died before file number `sequence` was begun."""
+    names = [numbered(path, sequence - 1), *([path] if sequence == 2 else [])]
+    parts = [name.with_name(f"{name.name}.part") for name in names]
+    return next((part for part in parts if part.exists()), None)
+
+
 class Files:
     """`begin` is where the first file begins, `logged` the ticks that earlier recorders left in files.
 
@@ -61,7 +73,7 @@ class Files:
         path, header, options = self._path, self._header, self._options
         sequence = len(self._opened) + options.sequence
         if options.rotate_bytes or options.rotate_s or sequence > 1:
-            path = path.with_name(f"{path.stem}-{sequence:04d}{path.suffix}")
+            path = numbered(path, sequence)
             header = {**header, "sequence": sequence, "first_tick": self.next.tick}
         index, least = options.message_index, options.min_free_bytes
         room_bytes += self.writer.end_bytes if room_bytes and self.writer else 0

@@ -32,6 +32,11 @@ class Pending:
         self._entries: list[Entry] = []
         self.dropped = 0
 
+    @property
+    def waiting_events(self) -> int:
+        """Events of the loop that wait."""
+        return sum(entry.of_loop for entry in self._entries)
+
     def add_event(self, event: Event) -> None:
         """An event behind all others."""
         message = Message(format.EVENTS, self._start_unix_ns() + event["time_ns"], json.dumps(event).encode())

@@ -16,8 +16,9 @@ from typing import Any
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import TickBuffer
-from rtloop.recording.capture.files import Files, Options
+from rtloop.recording.capture.files import Files, Options, left_by_another
 from rtloop.recording.capture.pending import Entry, Pending, tick_of
+from rtloop.recording.capture.progress import Position, Progress
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import (
@@ -32,7 +33,6 @@ from rtloop.recording.file.events import (
 from rtloop.signals import TICK
 
 FLUSH_S = 0.5
-FLUSHED = {"ticks": Word.FLUSHED_TICKS, "snapshots": Word.FLUSHED_SNAPSHOTS, "events": Word.FLUSHED_EVENTS}
 ROOM_BYTES = 1 << 20
 """Must be free, and a quarter more than is to stay free, before a file is begun after a failure: it is to last."""
 
@@ -49,16 +49,18 @@ class Session:
         self._laws = [law["name"] for law in header.get("law", {}).get("laws", ())]
         self._buffer = TickBuffer(header["columns"], header["rate_hz"])
         self._written_s = time.monotonic()
-        self._ticks, self._snapshots, self._events = (
-            RingReader(block, name, block.load(word)) for name, word in FLUSHED.items()
-        )
+        self._progress = Progress(block)
+        begin = self._progress.found(left_by_another(path, options.sequence))
+        self._progress.note(begin)
+        self._ticks = RingReader(block, "ticks", begin.ticks)
+        self._snapshots = RingReader(block, "snapshots", begin.snapshots)
+        self._events = RingReader(block, "events", begin.events)
         self._ahead: deque[bytes] = deque()
         self._pending = Pending(self._buffer, self._start_unix_ns)
         self.error: str | None = None
         self.failure: OutputError | None = None
         self._cut_tick = self.cursor
-        logged = self.cursor - block.load(Word.LOST_TICKS)
-        self._files = Files(path, header, options, self._buffer.place(self.cursor), logged)
+        self._files = Files(path, header, options, self._buffer.place(self.cursor), begin.ticks - begin.lost)
         try:
             self._files.begin(self._files.opened(header["created_unix_ns"] if header["paced"] else 0))
         except OutputError as error:
@@ -191,10 +193,6 @@ class Session:
 
     def _write_all(self) -> None:
         self._write(len(self._buffer), self._pending.take())
-        if self.failure is None:  # else a recorder that comes after this one may still find it in the rings
-            self._account(self._files.next.tick)
-            self._block.store(Word.FLUSHED_SNAPSHOTS, self._snapshots.position - len(self._ahead))
-            self._block.store(Word.FLUSHED_EVENTS, self._events.position)
 
     def _write(self, count: int, entries: list[Entry]) -> None:
         """Entries, then the first `count` rows. Where nothing can be written, rows are lost and events are kept."""
@@ -217,12 +215,19 @@ class Session:
             messages.sort(key=lambda message: message.log_time)
         if count:
             end = self._buffer.place(int(rows[-1, TICK]) + 1)
-        self._files.write(messages, rows, self._start_unix_ns(), end)
+        reached = Position(
+            end.tick,
+            self._snapshots.position - len(self._ahead),
+            self._events.position - self._pending.waiting_events,
+            end.tick - self._files.logged - count,
+        )
+        with self._progress.writing(self._files.size_bytes, reached):
+            self._files.write(messages, rows, self._start_unix_ns(), end)
 
     def _account(self, tick: int) -> None:
-        """Ticks before `tick` are in a file, or lost."""
-        self._block.store(Word.FLUSHED_TICKS, tick)
-        self._block.store(Word.LOST_TICKS, tick - self._files.logged)
+        """Ticks before `tick` are in a file, or lost; snapshots and events may still be found in the rings."""
+        lost = tick - self._files.logged
+        self._progress.note(self._progress.written._replace(ticks=tick, lost=lost))
 
     def _start_unix_ns(self) -> int:
         """Virtual time starts at 0, so that two unpaced runs are logged alike."""

@@ -96,11 +96,10 @@ def _require_seamless(source: Source, indexes: list[ChunkIndex], end: int) -> No
         raise DamagedChunk("its chunk index does not go with its chunks")
 
 
-def scanned_chunks(source: Source) -> tuple[list[Entry], list[str]]:
-    """The chunks found by going through the file, and what is wrong with it."""
+def scanned_chunks(source: Source, position: int = len(MAGIC)) -> tuple[list[Entry], list[str]]:
+    """The chunks found by going through the file from a record at `position` on, and what is wrong with it."""
     entries: list[Entry] = []
     problems: list[str] = []
-    position = len(MAGIC)
     while position < source.size:
         entry, length = _record_at(source, position)
         if entry:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
 from rtloop.recording.file import format
-from rtloop.recording.file.chunks import Entry, Source
-from rtloop.recording.file.container import MESSAGE_HEAD, PREFIX, DamagedChunk, parse_chunk_head, split_records
+from rtloop.recording.file.chunks import Entry, Source, scanned_chunks
+from rtloop.recording.file.container import (
+    MESSAGE_HEAD,
+    PREFIX,
+    DamagedChunk,
+    parse_chunk_head,
+    split_records,
+    unpack_chunk,
+)
 
 
 class Message(NamedTuple):
@@ -48,6 +58,14 @@ def read_chunk(source: Source, entry: Entry) -> bytes:
         if (head.start, head.end, head.uncompressed) != said:
             raise DamagedChunk("it contradicts the index")
     return record
+
+
+def contents_behind(path: Path, position: int) -> Iterator[bytes]:
+    """What the whole chunks hold from a record at `position` of a file on. Raises RecordingError."""
+    with closing(Source(path)) as source:
+        for entry in scanned_chunks(source, position)[0]:
+            with suppress(DamagedChunk):
+                yield unpack_chunk(read_chunk(source, entry))
 
 
 def is_ticks(content: bytes) -> bool:

@@ -136,9 +136,8 @@ class Reader:
         if entries is None:
             self._close(account)
 
-    def snapshots(self) -> Iterator[Snapshot]:
-        """The snapshots of the law, in order, each verified by its digest."""
-        before = -1
+    def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
+        """The snapshots of the law behind tick `before`, in order, each verified by its digest."""
         for message in self._messages(format.LAW):
             tick, data = _tick_of(message), message.payload[DIGEST_BYTES:]
             if tick > before:
