@@ -81,7 +81,7 @@ def configuration(controller: str, standby: Sequence[str], *, model: bool) -> st
 
     Without its `model` there are no margins to find, and a change takes milliseconds.
     """
-    if "axes =" in controller:
+    if "\naxes =" in controller:
         text = TWO_AXES.replace(TOGETHER["coupled"], controller)
         for section in re.findall(r"\[axis\.reference\]\n.*?\n\n", text, re.DOTALL):
             text = text.replace(section, HOLD + "\n", 1)
@@ -96,7 +96,8 @@ def configuration(controller: str, standby: Sequence[str], *, model: bool) -> st
 
 
 def _standing_by(standby: Sequence[str]) -> str:
-    return f"laws = [{', '.join(f'"{name}"' for name in standby)}]\n"
+    names = ", ".join(f'"{name}"' for name in standby)
+    return f"laws = [{names}]\n"
 
 
 class Changes:
