@@ -13,8 +13,6 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from llvmlite import ir
-from numba import types
 from pydantic import Field, model_validator
 
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
@@ -70,11 +68,12 @@ class ComediOptions(Options):
 
 
 @intrinsic
-def _call(typingctx: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
+def _call(compiler: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
     """`int function(comedi_t *, subdevice, channel, range, aref, last)`, addresses as integers.
 
     `last` is a code, or the address where one goes.
     """
+    types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if last == types.uint32 else ir.IntType(64)
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

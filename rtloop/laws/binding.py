@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import from_dtype, types
-from numba.core.errors import NumbaError
 
 from rtloop.hil.native.compiled import UNCOMPILED, checked, native_address
 from rtloop.hil.native.pointers import carray
@@ -42,6 +40,8 @@ def _bound(reference: LawReference) -> npt.NDArray[Any]:
 
 def signatures_of(law: type[Law]) -> dict[str, Any]:
     """What each function that a law has takes and returns, for the compiler."""
+    from numba import from_dtype, types
+
     keeps = law.records()
     told = from_dtype(CONTROL) if law.axes else types.float64
     returns = {"output": types.float64, "update": types.void if law.axes else types.float64, "enter": types.void}
@@ -75,6 +75,8 @@ def _kernel(function: Callable[..., Any]) -> Any:
 
 def _short(error: Exception) -> str:
     """What the compiler says, without its advice: the lines that say what is wrong, and where."""
+    from numba.core.errors import NumbaError
+
     if not isinstance(error, NumbaError):
         return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]
