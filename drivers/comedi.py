@@ -229,7 +229,7 @@ class ComediDriver(Driver):
 
     def _park(self) -> None:
         safe = np.full(len(self._outputs), self._options.safe_v)
-        if comedi_write.ctypes(self._context.ctypes.data, safe.ctypes.data_as(_DOUBLES)) < 0:
+        if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
 
     def _release(self) -> None:

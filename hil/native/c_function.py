@@ -1,46 +1,48 @@
-"""C functions made of kernels: compiled once, and from then on loaded without the compiler.
+"""Compiled kernels that are reached from outside of other kernels: by their address, or by a call from Python.
 
-Their machine code lies in the cache beside what numba keeps there. To load it takes a millisecond and LLVM's linker; to
-have numba load its own takes a second, most of which numba needs to know all that it could compile.
+They are compiled once, and from then on loaded without the compiler. One that cannot do without numba's own help would
+be compiled in each process; there is none here, and a test sees to that.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
-import hashlib
-import os
+import pickle
 import re
-import tempfile
 from collections.abc import Callable
-from functools import cache, cached_property
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
-import llvmlite.binding as llvm
+from rtloop.hil.native import machine_code
 
-OURS = "rtloop."
-"""Modules whose sources name the cache; what others compile is compiled in each process that uses it."""
-C_TYPES = {
-    "int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_uint64, "intp": ctypes.c_ssize_t
-}  # fmt: skip
-_DIGEST_BYTES = hashlib.sha256().digest_size
+C_TYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_uint64, "intp": ctypes.c_ssize_t}
+C_TYPES |= {"voidptr": ctypes.c_ssize_t, "CPointer(float64)": ctypes.c_ssize_t}
+ENTRY = {"error_model": "numpy"}
 
 
-class CFunction:
-    """A kernel with the shape of a C function, such as "int64(intp, uint64)": to be called by its address, or here."""
+class Outward:
+    """A kernel and its signature, such as "int64(intp, uint64)"; addresses are integers to Python."""
 
     def __init__(self, function: Callable[..., Any], signature: str) -> None:
         self.__name__, self._function, self._signature = function.__name__, function, signature
         self._name = f"{function.__module__}.{function.__qualname__}"
-        if not function.__module__.startswith(OURS):
-            assert self.address  # a mistake in it is said where it stands
 
     @cached_property
     def address(self) -> int:
         """Where its machine code is."""
-        ours = self._function.__module__.startswith(OURS)
-        return (_loaded(self._name) if ours else None) or self._compiled(ours)
+        return machine_code.loaded(self._name) or self._compiled()
+
+    def _compiled(self) -> int:
+        raise NotImplementedError
+
+    @property
+    def _types(self) -> list[Any]:
+        """Of its result, and of what it is given."""
+        return [C_TYPES[one] for one in re.findall(r"\w+\(float64\)|\w+", self._signature)]
+
+
+class CFunction(Outward):
+    """A kernel as a C function. It raises nothing, or numba's own C function says so where nobody can catch it."""
 
     def __call__(self, *arguments: int) -> Any:
         """Run it."""
@@ -48,58 +50,74 @@ class CFunction:
 
     @cached_property
     def _callable(self) -> Any:
-        """By the interpreter, which waits for it as it does for any kernel: whoever needs memory in order gets it."""
-        result, *given = re.findall(r"\w+", self._signature)
-        return ctypes.PYFUNCTYPE(C_TYPES[result], *(C_TYPES[one] for one in given))(self.address)
+        """With the interpreter waiting, as for every kernel."""
+        result, *given = self._types
+        return ctypes.PYFUNCTYPE(result, *given)(self.address)
 
-    def _compiled(self, kept: bool) -> int:
+    def _compiled(self) -> int:
         from rtloop.hil.native.compiler import numba
-        from rtloop.hil.native.standalone import standalone
+        from rtloop.hil.native.standalone import c_function
 
-        made = numba.cfunc(self._signature, error_model="numpy")(self._function)
-        self._made = made  # its machine code lives as long
-        if kept and (machine_code := standalone(made, self._name)):
-            _keep(self._name, machine_code)
-        address: Any = made.address
+        self._made = numba.cfunc(self._signature, error_model="numpy")(self._function)
+        if found := c_function(self._made, self._name):
+            machine_code.keep(self._name, found)
+        address: Any = self._made.address
         return address
 
 
-def _path(name: str) -> Path:
-    from rtloop.hil.native.cache import CACHE_FOLDER
+class Entry(Outward):
+    """A kernel that Python calls. What is raised within it is raised."""
 
-    return CACHE_FOLDER / f"{name}.o"
+    def __call__(self, *arguments: int) -> Any:
+        """Run it."""
+        result, raised = self._types[0](), ctypes.c_void_p()
+        status = self._callable(ctypes.byref(result), ctypes.byref(raised), *arguments)
+        if status:
+            raise _what_was(raised.value or 0)
+        return result.value
 
+    @cached_property
+    def _callable(self) -> Any:
+        """As compiled functions call each other: places for result and exception, and a status."""
+        _, *given = self._types
+        return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *given)(self.address)
 
-def _keep(name: str, machine_code: bytes) -> None:
-    path = _path(name)
-    with contextlib.suppress(OSError):  # it is compiled again
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(machine_code).digest() + machine_code)
-        os.replace(file.name, path)
+    def _compiled(self) -> int:
+        from rtloop.hil.native.compiler import signature_of
 
-
-def _loaded(name: str) -> int | None:
-    """Address of what was kept; None where nothing was, or not the whole of it."""
-    try:
-        data = _path(name).read_bytes()
-    except OSError:
-        return None
-    machine_code = data[_DIGEST_BYTES:]
-    if hashlib.sha256(machine_code).digest() != data[:_DIGEST_BYTES]:
-        return None
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(machine_code))
-    engine.finalize_object()
-    _engines.append(engine)
-    return engine.get_function_address(name)
+        return kernel_address(self._function, signature_of(self._signature), self._name, ENTRY, raises=True)
 
 
-_engines: list[Any] = []
-"""They own the machine code, one each: several may hold copies of one kernel."""
+def kernel_address(
+    function: Callable[..., Any], signature: Any, name: str, options: dict[str, Any], raises: bool = False
+) -> int:
+    """Compile a kernel, and keep it under `name` for `machine_code` to load.
+
+    Whoever calls one that `raises` looks at its status.
+    """
+    from rtloop.hil.native.compiler import numba
+    from rtloop.hil.native.standalone import kernel
+
+    made: Any = numba.njit(**options)(function)
+    made.compile(signature)
+    found = made.overloads[signature.args]
+    if code := kernel(found.library, found.fndesc.llvm_func_name, name, raises):
+        machine_code.keep(name, code)
+    _made.append(made)
+    return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
 
 
-@cache
-def _machine() -> Any:
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple().create_target_machine(jit=True)
+_made: list[Any] = []
+"""Compiled code lives as long as its dispatcher."""
+
+
+class _Raised(ctypes.Structure):
+    """The begin of numba's description of an exception."""
+
+    _fields_ = (("pickled", ctypes.c_void_p), ("size", ctypes.c_int32))
+
+
+def _what_was(raised: int) -> Exception:
+    found = _Raised.from_address(raised)
+    kind, arguments, *_ = pickle.loads(ctypes.string_at(found.pickled, found.size))
+    return kind(*(arguments or ()))

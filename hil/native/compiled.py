@@ -12,9 +12,12 @@ from functools import cached_property, update_wrapper, wraps
 from types import SimpleNamespace
 from typing import Any
 
-from rtloop.hil.native.c_function import CFunction
+from rtloop.hil.native import machine_code
+from rtloop.hil.native.c_function import CFunction, Entry, kernel_address
 from rtloop.hil.native.uncompiled import address_of
 
+OURS = "rtloop."
+"""Modules whose sources name the cache; what stands in others is numba's to cache."""
 UNCOMPILED = bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
 """Whether kernels are to run as they are written, which NUMBA_DISABLE_JIT=1 asks for."""
 
@@ -24,13 +27,15 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         update_wrapper(self, function)
-        self.py_func, self._options = function, options
+        self.py_func = function
+        self.options = {name: value for name, value in options.items() if name != "cache"}
+        self._cached = options.get("cache", False)
 
     @cached_property
     def _dispatcher(self) -> Any:
         from rtloop.hil.native.compiler import numba
 
-        return numba.njit(**self._options)(self.py_func)
+        return numba.njit(cache=self._cached, **self.options)(self.py_func)
 
     def __call__(self, *arguments: Any) -> Any:
         """Run it."""
@@ -117,10 +122,23 @@ def external(name: str, signature: str) -> Any:
 
 
 def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a kernel to a C function whose `.address` other compiled code may call; so can Python call it."""
-    if UNCOMPILED:
-        return lambda function: SimpleNamespace(address=address_of(function))
-    return lambda function: CFunction(function, signature)
+    """Compile a kernel to a C function whose `.address` other compiled code may call."""
+
+    def made(function: Callable[..., Any]) -> Any:
+        if UNCOMPILED:
+            return SimpleNamespace(address=address_of(function))
+        if function.__module__.startswith(OURS):
+            return CFunction(function, signature)
+        from rtloop.hil.native.compiler import numba
+
+        return numba.cfunc(signature, cache=True, error_model="numpy")(function)
+
+    return made
+
+
+def entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
+    """Compile a kernel that Python calls with numbers and addresses."""
+    return lambda function: Entry(function, signature)
 
 
 def native_address(kernel: Any, signature: Any) -> int:
@@ -133,3 +151,8 @@ def native_address(kernel: Any, signature: Any) -> int:
     kernel.compile(signature)
     found = kernel.overloads[signature.args]
     return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
+
+
+def kept_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
+    """As `native_address`, for a kernel that the cache keeps as machine code under a name of its own."""
+    return machine_code.loaded(name) or kernel_address(kernel.py_func, signature(), name, kernel.options)

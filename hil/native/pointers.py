@@ -9,12 +9,15 @@ from __future__ import annotations
 from typing import Any
 
 from rtloop.hil.native import uncompiled
-from rtloop.hil.native.compiled import UNCOMPILED, borrowed, intrinsic
+from rtloop.hil.native.compiled import UNCOMPILED, borrowed, external, intrinsic
 
 carray: Any = uncompiled.carray if UNCOMPILED else borrowed("carray")
 """numba's array view of a pointer."""
 SIGNATURE = "int32(voidptr, CPointer(float64))"
 """numba's signature of `int32 function(void *context, double *values)`."""
+
+copy: Any = external("memcpy", "intp(intp, intp, intp)")
+"""`memcpy`: to, from, bytes."""
 
 
 @intrinsic

@@ -14,7 +14,6 @@ from rtloop.engine.context import (
     generators_of,
     law_of,
     messages,
-    octets,
     unsigned,
     words_of,
 )
@@ -23,7 +22,7 @@ from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
 from rtloop.hil.native.atomics import exchanged, load_acquire, store_release
 from rtloop.hil.native.compiled import guarded, jit, seldom, seldom_guarded
-from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.hil.native.pointers import address_pointer, carray, copy
 from rtloop.hil.native.words import exchanged as exchanged_word
 from rtloop.hil.native.words import store_release as store_word
 from rtloop.law.access import coefficients_of, loop_of, state_of
@@ -210,7 +209,7 @@ def _take_axis(law, a, staged):
             for j in range(after.sections.shape[1]):
                 refilled = refilled or before.sections[i, j] != after.sections[i, j]
     size = law.coefficients_bytes
-    octets(law.coefficients + a * size, size)[:] = octets(staged, size)
+    copy(law.coefficients + a * size, staged, size)
     if refilled:
         fill_prefilter_anew(state_of(law, a))
 

@@ -13,12 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
-from rtloop.hil.native.compiled import cfunc, external, jit
-from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.hil.native.compiled import entry, jit
+from rtloop.hil.native.pointers import address_pointer, carray, copy
 
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 ONE = np.uint64(1)
-_memcpy = external("memcpy", "intp(intp, intp, intp)")
 
 
 class Ring(NamedTuple):
@@ -74,7 +73,7 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
     return copied, int(first[0]), int(first[0]) - int(cursor)
 
 
-@cfunc("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
+@entry("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
 def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, first_address):
     """Slots copied; `first`, the position to begin with, becomes that of the first of them."""
     head_word = carray(address_pointer(head_address), 1, np.uint64)
@@ -90,7 +89,7 @@ def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, fir
         slot = _slot(count, position)
         intact = load_acquire(marks, slot) == position + ONE
         if intact:
-            _memcpy(out + copied * slot_bytes, slots + slot * slot_bytes, slot_bytes)
+            copy(out + copied * slot_bytes, slots + slot * slot_bytes, slot_bytes)
             fence_acquire()
             intact = load_acquire(marks, slot) == position + ONE
         if intact:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.native.compiled import UNCOMPILED, checked, native_address
+from rtloop.hil.native.compiled import UNCOMPILED, checked, kept_address, native_address
 from rtloop.hil.native.pointers import carray
 from rtloop.law.layout import CONTROL, FUNCTIONS
 from rtloop.law.memory import LawRecords
@@ -33,8 +33,8 @@ def functions_of(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
 def _bound(reference: LawReference) -> npt.NDArray[Any]:
     """One law, shape (1,): compiled and looked through once in a process, however often it is asked for."""
     law, found = law_class(reference), np.zeros(1, FUNCTIONS)
-    for name, signature in signatures_of(law).items():
-        found[name] = _address(law, name, signature)
+    for name in functions_in(law):
+        found[name] = _address(law, name)
     return found
 
 
@@ -48,22 +48,29 @@ def signatures_of(law: type[Law]) -> dict[str, Any]:
     return {
         name: result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
         for name, result in returns.items()
-        if getattr(law, name) is not None
+        if name in functions_in(law)
     }
 
 
-def _address(law: type[Law], name: str, signature: Any) -> int:
+def functions_in(law: type[Law]) -> list[str]:
+    """Names of the functions that a law has."""
+    return [name for name in ("output", "update", "enter") if getattr(law, name) is not None]
+
+
+def _address(law: type[Law], name: str) -> int:
     function = getattr(law, name)
     if UNCOMPILED:
         return native_address(_from_addresses(function, law.records(), law.axes), None)
-    kernel = function if law.shipped else _kernel(function)
+    if law.shipped:
+        place = f"{law.__module__}.{law.__qualname__}.{name}"
+        return kept_address(function, place, lambda: signatures_of(law)[name])
+    kernel, signature = _kernel(function), signatures_of(law)[name]
     try:
         address = native_address(kernel, signature)
     except Exception as error:  # whatever the compiler comes upon
         raise ValueError(f"law {law.kind!r}: {name} cannot be compiled: {_short(error)}") from error
-    if not law.shipped:
-        for called, reason in foreign_calls(kernel, signature, law.libm).items():
-            raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
+    for called, reason in foreign_calls(kernel, signature, law.libm).items():
+        raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
     return address
 
 
