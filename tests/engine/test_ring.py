@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 
 import numba
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from rtloop.engine.ring import ONE, Ring, claim, drain, publish
+from rtloop.engine.ring import ONE, Ring, _drain, claim, drain, publish
 from rtloop.hil.native.atomics import load_acquire
 
 COLUMNS = 40
@@ -88,16 +88,33 @@ def hammer(ring, stop):
         position += ONE
 
 
-def watch(ring: Ring, out: npt.NDArray[np.float64], wanted: int) -> tuple[int, int, int]:
-    """Drain until `wanted` slots were read: values torn or out of place, slots lost, laps."""
-    cursor, read_, wrong, lost, laps = 0, 0, 0, 0, 0
+_POINTERS, _NUMBER = [ctypes.c_ssize_t] * 3, ctypes.c_int64
+DRAIN = ctypes.CFUNCTYPE(
+    ctypes.c_int32, *_POINTERS[:2], *_POINTERS, _NUMBER, _NUMBER, ctypes.c_ssize_t, _NUMBER, ctypes.c_ssize_t
+)(_drain.address)
+"""The reader's machine code, as `drain` calls it: compiled code calls it often enough to meet the writer."""
+
+
+@numba.njit(nogil=True)
+def watch(ring, out, wanted):
+    """Drain until `wanted` slots were read: slots torn or out of place, lost, laps."""
+    cursor, read_, wrong, lost, laps = np.uint64(0), 0, 0, 0, 0
+    first, copied, raised = np.zeros(1, np.uint64), np.zeros(1, np.int64), np.zeros(1, np.int64)
     while read_ < wanted:
-        copied, first, missed = drain(ring, cursor, out)
-        lost += missed
-        laps += missed > 0
-        wrong += np.count_nonzero(out[:copied] != np.arange(first, first + copied)[:, np.newaxis])
-        cursor = first + copied
-        read_ += copied
+        first[0] = cursor
+        DRAIN(
+            copied.ctypes.data, raised.ctypes.data, ring.head.ctypes.data, ring.marks.ctypes.data,
+            ring.slots.ctypes.data, ring.marks.size, ring.slots.strides[0],
+            out.ctypes.data, out.shape[0], first.ctypes.data,
+        )  # fmt: skip
+        lost += np.int64(first[0] - cursor)
+        laps += 1 if first[0] > cursor else 0
+        for i in range(copied[0]):
+            for j in range(out.shape[1]):
+                if out[i, j] != float(first[0] + np.uint64(i)):
+                    wrong += 1
+        cursor = first[0] + np.uint64(copied[0])
+        read_ += copied[0]
     return wrong, lost, laps
 
 
@@ -106,6 +123,8 @@ def test_no_torn_read_under_a_writer_that_never_waits(slots):
     ring, stop, out = new_ring(slots), np.zeros(1, np.uint64), np.empty((64, COLUMNS))
     warm = np.ones(1, np.uint64)
     hammer(ring, warm)  # compiles
+    write(ring, 0, 1)
+    watch(ring, out, 1)
     ring = new_ring(slots)
     writer = threading.Thread(target=hammer, args=(ring, stop))
     writer.start()
