@@ -13,8 +13,6 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from llvmlite import ir
-from numba import types
 from pydantic import Field, model_validator
 
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
@@ -70,11 +68,12 @@ class ComediOptions(Options):
 
 
 @intrinsic
-def _call(typingctx: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
+def _call(compiler: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
     """`int function(comedi_t *, subdevice, channel, range, aref, last)`, addresses as integers.
 
     `last` is a code, or the address where one goes.
     """
+    types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if last == types.uint32 else ir.IntType(64)
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -230,7 +229,7 @@ class ComediDriver(Driver):
 
     def _park(self) -> None:
         safe = np.full(len(self._outputs), self._options.safe_v)
-        if comedi_write.ctypes(self._context.ctypes.data, safe.ctypes.data_as(_DOUBLES)) < 0:
+        if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
 
     def _release(self) -> None:

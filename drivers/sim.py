@@ -15,10 +15,8 @@ from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import ConverterOptions, RigOptions
 from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
-CONTEXT = np.dtype(
-    [("count", np.uint32), ("looped", np.uint32), *((name, np.int64) for name in ("coefficients", "state", "looped_v"))],
-    align=True,
-)
+_COUNTS, _ADDRESSES = ("count", "looped"), ("coefficients", "state", "looped_v")
+CONTEXT = np.dtype([*((name, np.uint32) for name in _COUNTS), *((name, np.int64) for name in _ADDRESSES)], align=True)
 OBSERVED_PER_AXIS = 2
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import rtloop
-from rtloop.hil.native import compiled
-from rtloop.hil.native.compiled import KERNELS, OPTIONS, source_digest
+from rtloop.hil.native import cache
+from rtloop.hil.native.cache import KERNELS, OPTIONS, source_digest
 
 PACKAGE = Path(rtloop.__file__).parent
 COMPILERS = {"jit", "cfunc", "inlined", "seldom", "intrinsic", "guarded", "seldom_guarded"}
@@ -80,7 +80,7 @@ def test_what_an_edit_makes_anew(name, recompiles, tmp_path, monkeypatch) -> Non
         copied = shutil.copytree if (PACKAGE / place).is_dir() else shutil.copy
         (tmp_path / place).parent.mkdir(exist_ok=True)
         copied(PACKAGE / place, tmp_path / place)
-    monkeypatch.setattr(compiled, "PACKAGE", tmp_path)
+    monkeypatch.setattr(cache, "PACKAGE", tmp_path)
     before = source_digest()
     (tmp_path / name).write_text((tmp_path / name).read_text() + '"""An edited text."""\n')
     assert (source_digest() != before) == recompiles

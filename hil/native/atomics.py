@@ -8,84 +8,83 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import types
-from numba.core import cgutils
-
 from rtloop.hil.native.compiled import intrinsic
 
-WORD = types.uint64
 ALIGNMENT = 8
 
 
-def _element_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+def _element_pointer(compiler: Any, context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
     fields = context.make_array(array_type)(context, builder, array)
-    return cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
+    return compiler.cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
 
 
-def _is_words(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.dtype == WORD and array.ndim == 1
+def _is_words(types: Any, array: Any) -> bool:
+    return isinstance(array, types.Array) and array.dtype == types.uint64 and array.ndim == 1
 
 
 @intrinsic
-def load_acquire(typingctx: Any, array: Any, index: Any) -> Any:
+def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
     """Word `index` of a uint64 array, ordered before every later load and store."""
-    if not _is_words(array):
+    types = compiler.types
+    if not _is_words(types, array):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
+        pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         return builder.load_atomic(pointer, "acquire", ALIGNMENT)
 
-    return WORD(array, types.intp), codegen
+    return types.uint64(array, types.intp), codegen
 
 
 @intrinsic
-def store_release(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
     """Set word `index` of a uint64 array, ordered after every earlier load and store."""
-    if not _is_words(array):
+    types = compiler.types
+    if not _is_words(types, array):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
+        pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         builder.store_atomic(arguments[2], pointer, "release", ALIGNMENT)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, WORD), codegen
+    return types.void(array, types.intp, types.uint64), codegen
 
 
 @intrinsic
-def exchanged(typingctx: Any, array: Any, index: Any, expected: Any, wanted: Any) -> Any:
+def exchanged(compiler: Any, array: Any, index: Any, expected: Any, wanted: Any) -> Any:
     """Set word `index` of a uint64 array to `wanted` if it is `expected`, at once; whether it was.
 
     Of several that try, in whatever processes, exactly one gets True.
     """
-    if not _is_words(array):
+    types = compiler.types
+    if not _is_words(types, array):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
+        pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         return builder.extract_value(builder.cmpxchg(pointer, arguments[2], arguments[3], "seq_cst"), 1)
 
-    return types.boolean(array, types.intp, WORD, WORD), codegen
+    return types.boolean(array, types.intp, types.uint64, types.uint64), codegen
 
 
 @intrinsic
-def fence_acquire(typingctx: Any) -> Any:
+def fence_acquire(compiler: Any) -> Any:
     """No later load or store moves before an earlier load."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.fence("acquire")
         return context.get_dummy_value()
 
-    return types.void(), codegen
+    return compiler.types.void(), codegen
 
 
 @intrinsic
-def fence_release(typingctx: Any) -> Any:
+def fence_release(compiler: Any) -> Any:
     """No earlier load or store moves after a later store."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.fence("release")
         return context.get_dummy_value()
 
-    return types.void(), codegen
+    return compiler.types.void(), codegen

@@ -7,19 +7,16 @@ address of two int64 as their scratch `timespec`, so that they allocate nothing.
 from __future__ import annotations
 
 import numpy as np
-from numba import types
 
-from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.compiled import external, jit
 from rtloop.hil.native.pointers import address_pointer, carray
 
 CLOCK_MONOTONIC = 1
 TIMER_ABSTIME = 1
 SECOND_NS = 1_000_000_000
 
-_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
-_clock_nanosleep = types.ExternalFunction(
-    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
-)
+_clock_gettime = external("clock_gettime", "int32(int32, intp)")
+_clock_nanosleep = external("clock_nanosleep", "int32(int32, int32, intp, intp)")
 
 
 @jit

@@ -8,22 +8,23 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
-from numba import carray as _carray  # pyright: ignore[reportPrivateImportUsage]
-from numba import types
-
 from rtloop.hil.native import uncompiled
-from rtloop.hil.native.compiled import UNCOMPILED, intrinsic
+from rtloop.hil.native.compiled import UNCOMPILED, borrowed, external, intrinsic
 
-carray: Any = uncompiled.carray if UNCOMPILED else _carray
+carray: Any = uncompiled.carray if UNCOMPILED else borrowed("carray")
 """numba's array view of a pointer."""
-SIGNATURE = types.int32(types.voidptr, types.CPointer(types.float64))
+SIGNATURE = "int32(voidptr, CPointer(float64))"
 """numba's signature of `int32 function(void *context, double *values)`."""
+
+copy: Any = external("memcpy", "intp(intp, intp, intp)")
+"""`memcpy`: to, from, bytes."""
 
 
 @intrinsic
-def call(typingctx: Any, function: Any, context: Any, values: Any) -> Any:
+def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
     """Call `int32 function(void *context, double *values)`, all three given as integers."""
+
+    types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         void_pointer, double_pointer = ir.IntType(8).as_pointer(), ir.DoubleType().as_pointer()
@@ -38,12 +39,14 @@ def call(typingctx: Any, function: Any, context: Any, values: Any) -> Any:
 
 
 @intrinsic
-def call_law(typingctx: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, told: Any) -> Any:
+def call_law(compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, told: Any) -> Any:
     """Call a compiled function of two records and a third or a number; its status, 0 where it came to its end.
 
     Function and records are given as integers, as are the places where it may write what it returns and what it
     raised. This is how compiled functions call each other: an exception is a status, and nothing is unwound.
     """
+
+    types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = ir.IntType(8).as_pointer()
@@ -57,8 +60,9 @@ def call_law(typingctx: Any, function: Any, result: Any, raised: Any, coefficien
 
 
 @intrinsic
-def address_pointer(typingctx: Any, address: Any) -> Any:
+def address_pointer(compiler: Any, address: Any) -> Any:
     """An integer address as `void *`, for numba.carray."""
+    types = compiler.types
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))

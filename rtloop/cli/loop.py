@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds, fails_clearly
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds, fails_clearly, require_text
 
 
 class Positive(click.FloatRange):
@@ -38,6 +38,7 @@ def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None,
     """
     from rtloop.supervision.interruption import Interruption
 
+    require_text(config)
     with Interruption() as interruption:
         from rtloop.commands.run import run_configuration
 
@@ -54,6 +55,7 @@ def check(config: Path, strict: bool, as_json: bool) -> int:
 
     Limits, C(z) against C(s), margins on the model, and what the axis's specification says of it.
     """
+    require_text(config)
     from rtloop.commands.check import check_configuration
 
     return check_configuration(config, strict, as_json)

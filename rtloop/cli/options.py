@@ -39,6 +39,13 @@ def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
     return wrapped
 
 
+def require_text(file: Path) -> None:
+    """Say at once that a file cannot be read, before a second goes into imports. Raises InputFileError."""
+    from rtloop.configuration.text_files import read_text
+
+    read_text(file)
+
+
 def _with_lines(error: Any) -> str:
     """The faults of a configuration with the lines of its file."""
     from rtloop.configuration.toml_lines import numbered

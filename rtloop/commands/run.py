@@ -13,7 +13,7 @@ from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
-from rtloop.hil.native.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.recording.file.recover import leftovers, recover
 from rtloop.recording.views.summary import summarise
 from rtloop.supervision.interruption import Interruption

@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from rtloop.hil.native.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
 KEPT_CACHES = 8
 
@@ -42,7 +42,7 @@ def _rehearse_others() -> None:
 
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)
-    drain(block.ring("events"), np.uint64(0), np.zeros(1, MESSAGE))
+    drain(block.ring("events"), 0, np.zeros(1, MESSAGE))
     withdraw(block, send(block, message(Kind.STOP)))
     with tempfile.TemporaryDirectory() as folder:
         serve(Path(folder) / "board", ShmOptions(), ["x"], 1000.0, lambda: True)

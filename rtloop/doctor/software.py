@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
 from rtloop.engine.plan import Pacing
-from rtloop.hil.native.compiled import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
 LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 

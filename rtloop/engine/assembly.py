@@ -13,8 +13,10 @@ from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
+from rtloop.hil.native.compiled import entry
+from rtloop.hil.native.pointers import address_pointer, carray
 from rtloop.law.law import set_mode
-from rtloop.law.layout import CONDITIONS
+from rtloop.law.layout import CONDITIONS, LAW
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR
 from rtloop.laws.binding import functions_of
@@ -30,8 +32,15 @@ UNLIMITED = np.iinfo(np.int64).max
 def law_at_rest(plan: Plan) -> LawMemory:
     """The plan's law before its first tick."""
     memory = LawMemory.at_rest(plan.layout, functions_of(plan.laws), plan.coefficients, plan.extras)
-    set_mode(memory.law, int(plan.mode), True)
+    _begin(memory.records.ctypes.data, int(plan.mode))
     return memory
+
+
+@entry("int64(intp, int64)")
+def _begin(law_address, mode):
+    """The law at an address, at rest, in a mode."""
+    set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
+    return 0
 
 
 class Assembly:
@@ -68,7 +77,7 @@ class Assembly:
 
     def run(self, until_tick: int) -> Outcome:
         """Run the compiled loop."""
-        return Outcome(run_ticks(self.loop, until_tick))
+        return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
     def _point(self, name: str, array: np.ndarray[Any, Any]) -> None:
         self._arrays[name] = array

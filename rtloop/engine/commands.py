@@ -14,7 +14,6 @@ from rtloop.engine.context import (
     generators_of,
     law_of,
     messages,
-    octets,
     unsigned,
     words_of,
 )
@@ -23,7 +22,9 @@ from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
 from rtloop.hil.native.atomics import exchanged, load_acquire, store_release
 from rtloop.hil.native.compiled import guarded, jit, seldom, seldom_guarded
-from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.hil.native.pointers import address_pointer, carray, copy
+from rtloop.hil.native.words import exchanged as exchanged_word
+from rtloop.hil.native.words import store_release as store_word
 from rtloop.law.access import coefficients_of, loop_of, state_of
 from rtloop.law.law import fits, reset_trip, set_controller, set_mode
 from rtloop.law.layout import COEFFICIENTS
@@ -53,19 +54,20 @@ def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
     if head - tail >= (slots.size if urgent else COMMAND_SLOTS):
         raise QueueFull(f"{head - tail} commands are waiting for the loop")
     slots[head % slots.size] = command[0]
-    _offer(block["words"], block["commands_marks"], head)
+    store_word(_mark(block, head), head + 1)
+    block.store(Word.COMMANDS_HEAD, head + 1)
     return head
 
 
 def withdraw(block: SharedBlock, position: int) -> bool:
     """Take the command at `position` back; False where the loop has taken it already."""
-    return bool(_exchange(block["commands_marks"], position))
+    return bool(exchanged_word(_mark(block, position), position + 1, int(GONE)))
 
 
-@guarded
-def _offer(words, marks, position):
-    store_release(marks, position % marks.size, np.uint64(position + 1))
-    store_release(words, HEAD, np.uint64(position + 1))
+def _mark(block: SharedBlock, position: int) -> int:
+    """Address of the mark of a command's slot."""
+    marks = block["commands_marks"]
+    return marks.ctypes.data + position % marks.size * marks.itemsize
 
 
 @guarded
@@ -207,7 +209,7 @@ def _take_axis(law, a, staged):
             for j in range(after.sections.shape[1]):
                 refilled = refilled or before.sections[i, j] != after.sections[i, j]
     size = law.coefficients_bytes
-    octets(law.coefficients + a * size, size)[:] = octets(staged, size)
+    copy(law.coefficients + a * size, staged, size)
     if refilled:
         fill_prefilter_anew(state_of(law, a))
 

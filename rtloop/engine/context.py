@@ -84,6 +84,12 @@ def conditions_of(loop):
 
 
 @jit
+def loop_at(address):
+    """A loop's record at an address."""
+    return carray(address_pointer(address), 1, LOOP)[0]
+
+
+@jit
 def generators_of(loop):
     """Reference generators of all axes."""
     return carray(address_pointer(loop.generators), loop.axis_count, GENERATOR)

@@ -19,7 +19,7 @@ from rtloop.engine.context import (
     generators_of,
     integers,
     law_of,
-    octets,
+    loop_at,
     snapshot_ring,
     tick_ring,
     words_of,
@@ -29,8 +29,8 @@ from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
 from rtloop.engine.trips import publish_trip
 from rtloop.hil.native.atomics import load_acquire
-from rtloop.hil.native.compiled import jit, seldom
-from rtloop.hil.native.pointers import call
+from rtloop.hil.native.compiled import entry, jit, seldom
+from rtloop.hil.native.pointers import call, copy
 from rtloop.law.access import loop_of, state_of
 from rtloop.law.extras import inputs_of, outputs_of
 from rtloop.law.law import all_fit, evaluate, set_mode, update
@@ -86,18 +86,20 @@ LATENESS_BEGINS, LATENESS_OVER = int(Kind.PERIODS_MISSED), int(Kind.LATENESS_OVE
 DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
 LOOP_STATE_BYTES = LOOP_STATE.itemsize
 US_PER_NS = 1e-3
+TICK_BYTES = 8
+"""A snapshot begins with its tick."""
 GIVE_UP_S = 1.0
 """A card that refuses every write for so long is left to whoever parks it."""
 
 
-@jit
-def run_ticks(loop, until_tick):
+@entry("int64(intp, int64)")
+def run_ticks(loop_address, until_tick):
     """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome.
 
-    A count beyond its record, or an index beyond its array, ends the run at once: whoever called brings the outputs
-    down, for the law's memory is not to be believed any more.
+    `loop_address` is that of a LOOP record. A count beyond its record, or an index beyond its array, ends the run at
+    once: whoever called brings the outputs down, for the law's memory is not to be believed any more.
     """
-    outcome = BROKEN
+    loop, outcome = loop_at(loop_address), BROKEN
     try:
         if not all_fit(law_of(loop)):
             raise IndexError("a count of the law is beyond its record")
@@ -349,16 +351,17 @@ def _end_lateness(loop):
 def _publish_snapshot(loop):
     """Tick, coefficients and state as bytes, as they are after the commands of this tick."""
     ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)
-    row = ring.slots[claim(ring, position)]
-    for i in range(8):
-        row[i] = (loop.tick >> (8 * i)) & 0xFF
-    law, offset = law_of(loop), 8
+    slot, law, offset = claim(ring, position), law_of(loop), TICK_BYTES
+    for i in range(TICK_BYTES):
+        ring.slots[slot, i] = (loop.tick >> (8 * i)) & 0xFF
     for address, count in (
         (law.coefficients, law.axis_count * law.coefficients_bytes),
         (law.axes, law.axis_count * law.axes_bytes),
         (law.loop, LOOP_STATE_BYTES),
     ):
-        row[offset : offset + count] = octets(address, count)
+        if offset + count > loop.snapshot_bytes:
+            raise IndexError("the law is larger than a snapshot")
+        copy(loop.snapshots_slots + slot * loop.snapshot_bytes + offset, address, count)
         offset += count
     publish(ring, position)
     loop.snapshots += 1

@@ -22,8 +22,7 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
-from rtloop.hil.native.atomics import load_acquire, store_release
-from rtloop.hil.native.compiled import guarded
+from rtloop.hil.native.words import load_acquire, store_release
 
 DIRECTORY_BYTES = 8192
 _LOCK = "hhqqi4x"
@@ -108,6 +107,9 @@ class SharedBlock:
             ).reshape(shape)
             for name, (offset, descr, shape) in directory.items()
         }
+        words = self._arrays["words"]
+        self._words = range(words.ctypes.data, words.ctypes.data + words.nbytes, words.itemsize)
+        """Their addresses."""
 
     @staticmethod
     def reserve() -> int:
@@ -144,11 +146,11 @@ class SharedBlock:
 
     def load(self, word: Word) -> int:
         """A control word; what its writer wrote before it is seen after it, on any processor."""
-        return int(_load(self._arrays["words"], int(word)))
+        return load_acquire(self._words[word])
 
     def store(self, word: Word, value: int) -> None:
         """Set a control word; who loads it sees what was written before it, on any processor."""
-        _store(self._arrays["words"], int(word), np.uint64(value))
+        store_release(self._words[word], int(value))
 
     @property
     def fault(self) -> str | None:
@@ -195,16 +197,6 @@ class SharedBlock:
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
-
-
-@guarded
-def _load(words, index):
-    return load_acquire(words, index)
-
-
-@guarded
-def _store(words, index, value):
-    store_release(words, index, value)
 
 
 def ring_ticks(rate_hz: float) -> int:

@@ -10,9 +10,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
-from rtloop.hil.native.compiled import jit
+from rtloop.hil.native.compiled import entry, jit
+from rtloop.hil.native.pointers import address_pointer, carray, copy
 
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 ONE = np.uint64(1)
@@ -28,8 +30,14 @@ class Ring(NamedTuple):
 
 @jit
 def slot_of(ring, position):
-    """Slot of a position; the number of slots is a power of two."""
-    return np.int64(position & np.uint64(ring.marks.shape[0] - 1))
+    """Slot of a position."""
+    return _slot(ring.marks.shape[0], position)
+
+
+@jit
+def _slot(count, position):
+    """The number of slots is a power of two."""
+    return np.int64(position & np.uint64(count - 1))
 
 
 @jit
@@ -48,33 +56,48 @@ def publish(ring, position):
     store_release(ring.head, 0, position + ONE)
 
 
-@jit
-def drain(ring, cursor, out):
+def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int]:
     """Copy what is readable from position `cursor` on into `out` (m, …), whole slots, oldest first.
 
     Returns (copied, first, lost): `out[:copied]` holds positions first … first + copied − 1, without a hole, and
     `lost` positions from `cursor` to `first` were overwritten before they could be read. The next cursor is
     first + copied.
     """
-    capacity = np.uint64(ring.marks.shape[0])
-    head = load_acquire(ring.head, 0)
-    first = cursor
+    slots, first = ring.slots, np.array([cursor], np.uint64)
+    if out.dtype != slots.dtype or out.shape[1:] != slots.shape[1:] or not out.flags.c_contiguous:
+        raise ValueError(f"{out.dtype} {out.shape}, where whole slots of {slots.dtype} {slots.shape} go")
+    copied = _drain(
+        ring.head.ctypes.data, ring.marks.ctypes.data, slots.ctypes.data, len(slots), slots.strides[0],
+        out.ctypes.data, len(out), first.ctypes.data,
+    )  # fmt: skip
+    return copied, int(first[0]), int(first[0]) - int(cursor)
+
+
+@entry("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
+def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, first_address):
+    """Slots copied; `first`, the position to begin with, becomes that of the first of them."""
+    head_word = carray(address_pointer(head_address), 1, np.uint64)
+    marks = carray(address_pointer(marks_address), count, np.uint64)
+    first_word = carray(address_pointer(first_address), 1, np.uint64)
+    capacity, first = np.uint64(count), first_word[0]
+    head = load_acquire(head_word, 0)
     if head > first + capacity:
         first = head - capacity
     copied = 0
-    while copied < out.shape[0] and first + np.uint64(copied) < head:
+    while copied < room and first + np.uint64(copied) < head:
         position = first + np.uint64(copied)
-        slot = slot_of(ring, position)
-        intact = load_acquire(ring.marks, slot) == position + ONE
+        slot = _slot(count, position)
+        intact = load_acquire(marks, slot) == position + ONE
         if intact:
-            out[copied] = ring.slots[slot]
+            copy(out + copied * slot_bytes, slots + slot * slot_bytes, slot_bytes)
             fence_acquire()
-            intact = load_acquire(ring.marks, slot) == position + ONE
+            intact = load_acquire(marks, slot) == position + ONE
         if intact:
             copied += 1
         elif copied > 0:
             break
         else:
-            head = load_acquire(ring.head, 0)
+            head = load_acquire(head_word, 0)
             first = max(first + ONE, head - min(head, capacity) + ONE)
-    return copied, first, first - cursor
+    first_word[0] = first
+    return copied

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import from_dtype, types
-from numba.core.errors import NumbaError
 
-from rtloop.hil.native.compiled import UNCOMPILED, checked, native_address
+from rtloop.hil.native.compiled import UNCOMPILED, checked, kept_address, native_address
 from rtloop.hil.native.pointers import carray
 from rtloop.law.layout import FUNCTIONS, told_by
 from rtloop.law.memory import LawRecords
@@ -36,13 +34,15 @@ def _bound(reference: LawReference) -> npt.NDArray[Any]:
     """One law, shape (1,): compiled and looked through once in a process, however often it is asked for."""
     law, found = law_class(reference), np.zeros(1, FUNCTIONS)
     keeps = law.records(reference.axes)
-    for name, signature in signatures_of(law, keeps).items():
-        found[name] = _address(law, keeps, name, signature)
+    for name in functions_in(law):
+        found[name] = _address(law, keeps, name)
     return found
 
 
 def signatures_of(law: type[Law], keeps: LawRecords) -> dict[str, Any]:
     """What each function that a law has takes and returns, for the compiler."""
+    from numba import from_dtype, types
+
     told = from_dtype(told_by(keeps.axes)) if keeps.axes else types.float64
     returns = {
         "output": types.void if keeps.axes > 1 else types.float64,
@@ -52,22 +52,30 @@ def signatures_of(law: type[Law], keeps: LawRecords) -> dict[str, Any]:
     return {
         name: result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
         for name, result in returns.items()
-        if getattr(law, name) is not None
+        if name in functions_in(law)
     }
 
 
-def _address(law: type[Law], keeps: LawRecords, name: str, signature: Any) -> int:
+def functions_in(law: type[Law]) -> list[str]:
+    """Names of the functions that a law has."""
+    return [name for name in ("output", "update", "enter") if getattr(law, name) is not None]
+
+
+def _address(law: type[Law], keeps: LawRecords, name: str) -> int:
     function = getattr(law, name)
     if UNCOMPILED:
         return native_address(_from_addresses(function, keeps), None)
-    kernel = function if law.shipped else _kernel(function)
+    if law.shipped:
+        of_axes = f".{keeps.axes}" if keeps.axes > 1 else ""
+        place = f"{law.__module__}.{law.__qualname__}.{name}{of_axes}"
+        return kept_address(function, place, lambda: signatures_of(law, keeps)[name])
+    kernel, signature = _kernel(function), signatures_of(law, keeps)[name]
     try:
         address = native_address(kernel, signature)
     except Exception as error:  # whatever the compiler comes upon
         raise ValueError(f"law {law.kind!r}: {name} cannot be compiled: {_short(error)}") from error
-    if not law.shipped:
-        for called, reason in foreign_calls(kernel, signature, law.libm).items():
-            raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
+    for called, reason in foreign_calls(kernel, signature, law.libm).items():
+        raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
     return address
 
 
@@ -79,6 +87,8 @@ def _kernel(function: Callable[..., Any]) -> Any:
 
 def _short(error: Exception) -> str:
     """What the compiler says, without its advice: the lines that say what is wrong, and where."""
+    from numba.core.errors import NumbaError
+
     if not isinstance(error, NumbaError):
         return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]

@@ -61,7 +61,7 @@ class Desk:
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
         events: np.ndarray[Any, Any] = np.zeros(64, MESSAGE)
         while time.monotonic() < deadline:
-            copied, first, _ = drain(ring, np.uint64(cursor), events)
+            copied, first, _ = drain(ring, cursor, events)
             cursor = int(first) + copied
             for event in events[:copied]:
                 if event["identity"] == identity:

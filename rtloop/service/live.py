@@ -255,7 +255,7 @@ class LiveLaw:
     def _in_raw_mode(self) -> bool:
         ring = self._block.ring("ticks")
         rows = np.empty((1, ring.slots.shape[1]))
-        copied, _, _ = drain(ring, np.uint64(max(int(ring.head[0]) - 1, 0)), rows)
+        copied, _, _ = drain(ring, max(int(ring.head[0]) - 1, 0), rows)
         return copied == 1 and rows[0, MODE] == Mode.RAW
 
     def _submit_table(self, number: int, values: list[Any], samples: np.ndarray[Any, Any]) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 from rtloop.configuration.prepare import Prepared
 from rtloop.engine.plan import Plan
-from rtloop.hil.native.compiled import cpu_identity
+from rtloop.hil.native.cache import cpu_identity
 
 FORMAT = 1
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")

@@ -127,7 +127,7 @@ class Supervisor:
         """Up to `count` newest records (n, columns), oldest first."""
         ring = self.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
-        copied, _, _ = drain(ring, np.uint64(max(self.ticks - count, 0)), rows)
+        copied, _, _ = drain(ring, max(self.ticks - count, 0), rows)
         return rows[:copied]
 
     @property
@@ -135,7 +135,7 @@ class Supervisor:
         """Axis, value and limit of the newest trip, as far as an axis is to blame."""
         ring = self.block.ring("events")
         events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
-        copied, _, _ = drain(ring, np.uint64(max(int(ring.head[0]) - events.size, 0)), events)
+        copied, _, _ = drain(ring, max(int(ring.head[0]) - events.size, 0), events)
         plan = self.prepared.plan
         trips = [event for event in events[:copied] if event["kind"] == Kind.TRIPPED]
         return trip_reason(trips[-1], plan.axes, [law.kind for law in plan.laws]) if trips else None

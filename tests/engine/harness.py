@@ -118,7 +118,7 @@ class LoopBench:
         """What ring `name` has published since the last call; nothing may be lost."""
         ring = self.block.ring(name)
         out = np.empty((ring.marks.size, *ring.slots.shape[1:]), ring.slots.dtype)
-        copied, _, lost = drain(ring, np.uint64(self._cursors[name]), out)
+        copied, _, lost = drain(ring, self._cursors[name], out)
         assert lost == 0
         self._cursors[name] += int(copied)
         return out[: int(copied)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 
 import numba
 import numpy as np
 import pytest
 
-from rtloop.engine.ring import ONE, Ring, claim, drain, publish
+from rtloop.engine.ring import ONE, Ring, _drain, claim, drain, publish
 from rtloop.hil.native.atomics import load_acquire
 
 COLUMNS = 40
@@ -27,7 +28,7 @@ def write(ring: Ring, first: int, count: int) -> None:
 def read(ring: Ring, cursor: int, room: int = 100) -> tuple[list[float], int, int]:
     """(values, first, lost); each slot must be of one piece."""
     out = np.full((room, COLUMNS), np.nan)
-    copied, first, lost = drain(ring, np.uint64(cursor), out)
+    copied, first, lost = drain(ring, cursor, out)
     assert np.all(out[:copied] == out[:copied, :1])
     return out[:copied, 0].tolist(), int(first), int(lost)
 
@@ -87,20 +88,33 @@ def hammer(ring, stop):
         position += ONE
 
 
+_POINTERS, _NUMBER = [ctypes.c_ssize_t] * 3, ctypes.c_int64
+DRAIN = ctypes.CFUNCTYPE(
+    ctypes.c_int32, *_POINTERS[:2], *_POINTERS, _NUMBER, _NUMBER, ctypes.c_ssize_t, _NUMBER, ctypes.c_ssize_t
+)(_drain.address)
+"""The reader's machine code, as `drain` calls it: compiled code calls it often enough to meet the writer."""
+
+
 @numba.njit(nogil=True)
 def watch(ring, out, wanted):
     """Drain until `wanted` slots were read: slots torn or out of place, lost, laps."""
     cursor, read_, wrong, lost, laps = np.uint64(0), 0, 0, 0, 0
+    first, copied, raised = np.zeros(1, np.uint64), np.zeros(1, np.int64), np.zeros(1, np.int64)
     while read_ < wanted:
-        copied, first, missed = drain(ring, cursor, out)
-        lost += np.int64(missed)
-        laps += 1 if missed > np.uint64(0) else 0
-        for i in range(copied):
+        first[0] = cursor
+        DRAIN(
+            copied.ctypes.data, raised.ctypes.data, ring.head.ctypes.data, ring.marks.ctypes.data,
+            ring.slots.ctypes.data, ring.marks.size, ring.slots.strides[0],
+            out.ctypes.data, out.shape[0], first.ctypes.data,
+        )  # fmt: skip
+        lost += np.int64(first[0] - cursor)
+        laps += 1 if first[0] > cursor else 0
+        for i in range(copied[0]):
             for j in range(out.shape[1]):
-                if out[i, j] != float(first + np.uint64(i)):
+                if out[i, j] != float(first[0] + np.uint64(i)):
                     wrong += 1
-        cursor = first + np.uint64(copied)
-        read_ += copied
+        cursor = first[0] + np.uint64(copied[0])
+        read_ += copied[0]
     return wrong, lost, laps
 
 

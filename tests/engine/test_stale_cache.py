@@ -62,7 +62,7 @@ def test_an_edited_law_runs(project):
 def test_this_test_can_fail(project):
     """With a cache that does not look at the sources the edited law is the old one."""
     blind = 'def source_digest() -> str:\n    return "blind"\n\n\ndef unused() -> str:'
-    edit(project, "rtloop/hil/native/compiled.py", "def source_digest() -> str:", blind)
+    edit(project, "rtloop/hil/native/cache.py", "def source_digest() -> str:", blind)
     assert run(project) == {"tap_index": -1, "from_cache": False}
     edit(project, *EDIT)
     assert run(project) == {"tap_index": -1, "from_cache": True}

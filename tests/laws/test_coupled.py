@@ -49,7 +49,7 @@ def prepared(text: str, folder: Path = Path()) -> Prepared:
 
 def referenced(text: str, x: str, y: str) -> str:
     """With other references of the two axes."""
-    head, first, second = text.split("[axis.reference]\n")
+    head, first, _ = text.split("[axis.reference]\n")
     return f"{head}[axis.reference]\n{x}\n[[axis]]{first.split('[[axis]]')[1]}[axis.reference]\n{y}\n"
 
 

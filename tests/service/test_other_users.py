@@ -18,7 +18,7 @@ from rtloop.drivers.base import Wiring
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.hil import board
-from rtloop.hil.native.compiled import _owned_folder
+from rtloop.hil.native.cache import _owned_folder
 from rtloop.hil.options import BoardOptions
 from rtloop.service.client import Client
 from rtloop.service.daemon import _bind

@@ -19,7 +19,7 @@ class RingReader:
 
     def take_into(self, out: np.ndarray[Any, Any]) -> tuple[int, int]:
         """Copy whole slots into `out` as far as it reaches; returns (slots copied, slots lost in front of them)."""
-        copied, first, lost = drain(self._ring, np.uint64(self.position), out)
+        copied, first, lost = drain(self._ring, self.position, out)
         self.position = int(first) + copied
         self.lost += int(lost)
         return copied, int(lost)

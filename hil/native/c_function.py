@@ -1,0 +1,123 @@
+"""Compiled kernels that are reached from outside of other kernels: by their address, or by a call from Python.
+
+They are compiled once, and from then on loaded without the compiler. One that cannot do without numba's own help would
+be compiled in each process; there is none here, and a test sees to that.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import pickle
+import re
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+from rtloop.hil.native import machine_code
+
+C_TYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_uint64, "intp": ctypes.c_ssize_t}
+C_TYPES |= {"voidptr": ctypes.c_ssize_t, "CPointer(float64)": ctypes.c_ssize_t}
+ENTRY = {"error_model": "numpy"}
+
+
+class Outward:
+    """A kernel and its signature, such as "int64(intp, uint64)"; addresses are integers to Python."""
+
+    def __init__(self, function: Callable[..., Any], signature: str) -> None:
+        self.__name__, self._function, self._signature = function.__name__, function, signature
+        self._name = f"{function.__module__}.{function.__qualname__}"
+
+    @cached_property
+    def address(self) -> int:
+        """Where its machine code is."""
+        return machine_code.loaded(self._name) or self._compiled()
+
+    def _compiled(self) -> int:
+        raise NotImplementedError
+
+    @property
+    def _types(self) -> list[Any]:
+        """Of its result, and of what it is given."""
+        return [C_TYPES[one] for one in re.findall(r"\w+\(float64\)|\w+", self._signature)]
+
+
+class CFunction(Outward):
+    """A kernel as a C function. It raises nothing, or numba's own C function says so where nobody can catch it."""
+
+    def __call__(self, *arguments: int) -> Any:
+        """Run it."""
+        return self._callable(*arguments)
+
+    @cached_property
+    def _callable(self) -> Any:
+        """With the interpreter waiting, as for every kernel."""
+        result, *given = self._types
+        return ctypes.PYFUNCTYPE(result, *given)(self.address)
+
+    def _compiled(self) -> int:
+        from rtloop.hil.native.compiler import numba
+        from rtloop.hil.native.standalone import c_function
+
+        self._made = numba.cfunc(self._signature, error_model="numpy")(self._function)
+        if found := c_function(self._made, self._name):
+            machine_code.keep(self._name, found)
+        address: Any = self._made.address
+        return address
+
+
+class Entry(Outward):
+    """A kernel that Python calls. What is raised within it is raised."""
+
+    def __call__(self, *arguments: int) -> Any:
+        """Run it."""
+        result, raised = self._types[0](), ctypes.c_void_p()
+        status = self._callable(ctypes.byref(result), ctypes.byref(raised), *arguments)
+        if status:
+            raise _what_was(raised.value or 0)
+        return result.value
+
+    @cached_property
+    def _callable(self) -> Any:
+        """As compiled functions call each other: places for result and exception, and a status."""
+        _, *given = self._types
+        return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *given)(self.address)
+
+    def _compiled(self) -> int:
+        from rtloop.hil.native.compiler import signature_of
+
+        return kernel_address(self._function, signature_of(self._signature), self._name, ENTRY, raises=True)
+
+
+def kernel_address(
+    function: Callable[..., Any], signature: Any, name: str, options: dict[str, Any], raises: bool = False
+) -> int:
+    """Compile a kernel, and keep it under `name` for `machine_code` to load.
+
+    Whoever calls one that `raises` looks at its status.
+    """
+    from rtloop.hil.native.compiler import numba
+    from rtloop.hil.native.standalone import kernel
+
+    made: Any = numba.njit(**options)(function)
+    made.compile(signature)
+    found = made.overloads[signature.args]
+    if code := kernel(found.library, found.fndesc.llvm_func_name, name, raises):
+        machine_code.keep(name, code)
+    _made.append(made)
+    return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
+
+
+_made: list[Any] = []
+"""Compiled code lives as long as its dispatcher."""
+
+
+class _Raised(ctypes.Structure):
+    """The begin of numba's description of an exception."""
+
+    _fields_ = (("pickled", ctypes.c_void_p), ("size", ctypes.c_int32))
+
+
+def _what_was(raised: int) -> Exception:
+    found = _Raised.from_address(raised)
+    kind, arguments, *_ = pickle.loads(ctypes.string_at(found.pickled, found.size))
+    return kind(*(arguments or ()))

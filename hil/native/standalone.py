@@ -1,0 +1,76 @@
+"""What numba compiled, without what only numba can run: machine code that needs the C library, and no more.
+
+numba's own C functions hold the interpreter's calls that report an exception. A kernel that raises none does not need
+them, and what is left is that kernel, instruction by instruction, with a C function of the same shape around it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import llvmlite.binding as llvm
+
+RAISES = ".const.pickle"
+"""How constants are called that describe an exception."""
+C_FUNCTION = """
+target datalayout = "{layout}"
+target triple = "{triple}"
+declare i32 @"{kernel}"({all_types})
+define {result} @"{name}"({arguments}) {{
+  %result = alloca {result}
+  %raised = alloca ptr
+  %status = call i32 @"{kernel}"(ptr %result, ptr %raised, {arguments})
+  %value = load {result}, ptr %result
+  ret {result} %value
+}}
+"""
+"""A kernel wants places for its result and for what it raises, and returns a status."""
+
+
+def kernel(library: Any, symbol: str, name: str, raises: bool) -> bytes | None:
+    """Object code of a compiled kernel, its symbol named `name`; None for one that needs numba where it runs.
+
+    One that `raises` may hold what describes an exception.
+    """
+    module = llvm.parse_bitcode(library._final_module.as_bitcode())
+    module.get_function(symbol).name = name
+    return _object_code(module, name, library._codegen._tm, raises)
+
+
+def c_function(made: Any, name: str) -> bytes | None:
+    """As `kernel`, for a compiled numba.cfunc, whose shape it has; None also for one that may raise."""
+    library = made._library
+    module = llvm.parse_bitcode(library._final_module.as_bitcode())
+    module.link_in(llvm.parse_assembly(_around_kernel(module, made.native_name, name)))
+    return _object_code(module, name, library._codegen._tm, raises=False)
+
+
+def _object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
+    for one in (*module.functions, *module.global_variables):
+        if one.name != name and not one.is_declaration:
+            one.linkage = "internal"
+    passes = llvm.create_new_module_pass_manager()
+    passes.add_global_dead_code_eliminate_pass()
+    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
+    process = ctypes.CDLL(None)
+    needed = [one.name for one in (*module.functions, *module.global_variables) if one.is_declaration]
+    if not all(one.startswith("llvm.") or hasattr(process, one) for one in needed):
+        return None
+    if not raises and any(one.name.startswith(RAISES) for one in module.global_variables):
+        return None
+    return machine.emit_object(module)
+
+
+def _around_kernel(module: Any, theirs: str, name: str) -> str:
+    """The text of a C function `name`, of the shape of `theirs`, which is numba's for the same kernel."""
+    kernel, function = module.get_function(theirs.removeprefix("cfunc.")), module.get_function(theirs)
+    return C_FUNCTION.format(
+        layout=module.data_layout,
+        triple=module.triple,
+        kernel=kernel.name,
+        all_types=", ".join(str(one.type) for one in kernel.arguments),
+        result=str(function.global_value_type).partition(" ")[0],
+        name=name,
+        arguments=", ".join(f"{one.type} %given.{i}" for i, one in enumerate(function.arguments)),
+    )

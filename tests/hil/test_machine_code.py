@@ -1,0 +1,121 @@
+"""Machine code that is kept: loaded without the compiler, whole or not at all, with the exceptions of its kernel."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from rtloop.hil.native import cache, machine_code
+from rtloop.hil.native.c_function import CFunction, Entry, Outward
+
+OUTWARD = ("rtloop.engine.assembly", *(f"rtloop.drivers.{name}" for name in ("sim", "shm", "comedi", "playback")))
+ROOT = Path(__file__).parents[2]
+WITHOUT_COMPILER = """
+import sys
+from importlib import import_module
+from rtloop.commands.run import run_configuration
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
+from rtloop.engine import process
+from rtloop.recording.capture.recorder import Recorder
+from rtloop.engine.memory import SharedBlock
+
+prepared = prepare(load("deploy/paper.toml"))
+Recorder(SharedBlock.create(prepared.plan.sizes))
+process.rehearse()
+print("numba" in sys.modules)
+"""
+
+
+def halved(number):
+    """Half of an even number."""
+    if number % 2 != 0:
+        raise IndexError("an odd number")
+    return number // 2
+
+
+def doubled(number):
+    """Twice a number."""
+    return number * 2
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
+    return tmp_path
+
+
+def compilations(kind: type[Entry | CFunction], monkeypatch) -> list[str]:
+    """Names of the kernels that are compiled from here on."""
+    found, compiled = [], kind._compiled
+
+    def noted(one):
+        found.append(one.__name__)
+        return compiled(one)
+
+    monkeypatch.setattr(kind, "_compiled", noted)
+    return found
+
+
+def test_a_run_needs_no_compiler() -> None:
+    """Neither the command nor the recorder nor the loop, once their kernels have been compiled."""
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", WITHOUT_COMPILER], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "False"
+
+
+def test_all_that_is_called_from_outside_is_kept() -> None:
+    for module in OUTWARD:
+        import_module(module)
+    found = [one for one in gc.get_objects() if isinstance(one, Outward) and one._name.startswith("rtloop.")]
+    assert len(found) > 15
+    for one in found:
+        assert one.address
+        assert machine_code.loaded(one._name), one._name
+
+
+def test_it_is_compiled_once_and_does_the_same(folder, monkeypatch) -> None:
+    compiled = compilations(Entry, monkeypatch)
+    for _ in range(2):
+        entry = Entry(halved, "int64(int64)")
+        assert entry(14) == 7
+        with pytest.raises(IndexError, match="an odd number"):
+            entry(13)
+    assert compiled == ["halved"]
+    assert len(list(folder.glob("*.o"))) == 1
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: b"", lambda data: data[:99] + b"\0" * 99])
+def test_what_is_damaged_is_compiled_anew(folder, monkeypatch, damage) -> None:
+    compiled = compilations(Entry, monkeypatch)
+    assert Entry(doubled, "int64(int64)")(4) == 8
+    (kept,) = folder.glob("*.o")
+    kept.write_bytes(damage(kept.read_bytes()))
+    assert Entry(doubled, "int64(int64)")(4) == 8
+    assert compiled == ["doubled", "doubled"]
+
+
+def test_a_c_function_is_called_by_its_address(folder, monkeypatch) -> None:
+    compiled = compilations(CFunction, monkeypatch)
+    for _ in range(2):
+        address = CFunction(doubled, "int64(int64)").address
+        assert ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(address)(21) == 42
+    assert compiled == ["doubled"]
+
+
+def test_a_c_function_that_raises_is_left_to_numba(folder) -> None:
+    """Nobody looks at a status: only numba's own says what was raised."""
+    assert CFunction(halved, "int64(int64)").address
+    assert not list(folder.glob("*.o"))
+
+
+def test_a_folder_that_cannot_be_written_is_no_obstacle(folder, monkeypatch) -> None:
+    monkeypatch.setattr(machine_code, "_path", lambda name: folder / "missing" / name)
+    assert Entry(doubled, "int64(int64)")(4) == 8
