@@ -75,9 +75,10 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
         if plant.hysteresis.history_v:
             _rest_after(plant.hysteresis.history_v, coefficients[i], state[i])
     _couple(options, axes, coefficients)
-    for i in range(len(axes)):
-        if (input_um := _moved_um(coefficients, state, i)) != 0:
-            dynamics.settle(coefficients[i], state[i], input_um)
+    own_um = state["hysteresis_um"]
+    moved_um = own_um + coefficients["coupling"][:, : len(axes)] @ own_um[:MAX_COUPLED]
+    for i in np.flatnonzero(moved_um):
+        dynamics.settle(coefficients[i], state[i], float(moved_um[i]))
     return coefficients, state
 
 
