@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -11,19 +11,20 @@ from rich.markup import escape
 from rich.table import Table
 
 from rtloop import signals
-from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.file import Configuration
-from rtloop.configuration.prepare import Prepared
-from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class, kinds
 from rtloop.errors import RtloopError
 from rtloop.recording.load import load
 from rtloop.recording.views.steps import step_metrics
 from rtloop.signals import Mode
-from rtloop.supervision.supervisor import Supervisor
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
+
+if TYPE_CHECKING:
+    from rtloop.configuration.axis import AxisOptions
+    from rtloop.configuration.file import Configuration
+    from rtloop.configuration.prepare import Prepared
+    from rtloop.supervision.supervisor import Supervisor
 
 BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
@@ -165,6 +166,8 @@ def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[st
     """What the specification that an axis names asks of a step, and what it says that was claimed."""
     if axis.specification is None:
         return
+    from rtloop.design.synthesis.specification_file import load_specification  # slow; no recording shown needs it
+
     name = escape(axis.specification)
     try:
         asked = load_specification(configuration.folder / axis.specification).design.specification
