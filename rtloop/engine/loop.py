@@ -228,8 +228,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
     )
     generators, table = generators_of(loop), floats(loop.table, loop.table_count)
     law = law_of(loop)
-    extras = law.extra_input_count + law.extra_output_count
-    if extras != 0:
+    if law.extra_count != 0:
         _read_extras(loop, inputs)
     for a in range(loop.axis_count):
         adc_v[a] = inputs[input_index[a]]
@@ -244,7 +243,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
     evaluate(law, adc_v, references, conditions)
     for a in range(loop.axis_count):
         outputs[output_index[a]] = state_of(law, a).drive_v
-    if extras != 0:
+    if law.extra_count != 0:
         _set_extras(loop, outputs)
 
 
@@ -301,10 +300,9 @@ def _fill_signals(loop, row):
         row[column + DEMAND] = state.demand_v
         row[column + DRIVE] = state.drive_v
     column = COMMON_COUNT + loop.axis_count * PER_AXIS_COUNT
-    extras = law.extra_input_count + law.extra_output_count
-    if extras != 0:
+    if law.extra_count != 0:
         _fill_extras(loop, row, column)
-    column += extras
+    column += law.extra_count
     for i in range(loop.observed_count):
         row[column + i] = inputs[loop.input_count + 1 + i]
 

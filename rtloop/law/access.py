@@ -31,10 +31,6 @@ class Law(NamedTuple):
     controller_coefficients: int
     controller_state: int
     axis_count: int
-    extra_inputs: int
-    extra_outputs: int
-    extra_input_count: int
-    extra_output_count: int
 
 
 @jit
@@ -43,7 +39,6 @@ def opened(law):
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
         law.functions, law.result, law.raised, law.controller_coefficients, law.controller_state, int(law.axis_count),
-        law.extra_inputs, law.extra_outputs, int(law.extra_input_count), int(law.extra_output_count),
     )  # fmt: skip
 
 

@@ -12,8 +12,15 @@ import numpy as np
 
 from rtloop.hil.native.compiled import jit, seldom
 from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.layout import EXTRA_OUTPUT, MAX_EXTRAS
+from rtloop.law.access import CONTROL_BYTES, coefficients_of, loop_of, opened, state_of
+from rtloop.law.layout import EXTRA_OUTPUT, MAX_EXTRAS, TOLD
 from rtloop.law.safety import clip, usable
+from rtloop.law.slots import CONTROLLER_OUTPUT, note_failure
+from rtloop.signals import Flag, Mode
+
+CLOSED_LOOP, TRIP_LAW = int(Mode.CLOSED_LOOP), int(Flag.TRIP_LAW)
+TOLD_BYTES = len(TOLD) * 8
+"""What a controller is told of one axis; of several, inputs and outputs stand behind that of all."""
 
 
 class ExtraOutput(NamedTuple):
@@ -39,44 +46,56 @@ class Extras(NamedTuple):
 
 
 @jit
-def inputs_of(law):
+def inputs_of(record):
     """What the inputs read in this tick, (MAX_EXTRAS,)."""
-    return carray(address_pointer(law.extra_inputs), MAX_EXTRAS, np.float64)
+    return carray(address_pointer(record.extra_inputs), MAX_EXTRAS, np.float64)
 
 
 @jit
-def outputs_of(law):
+def outputs_of(record):
     """The outputs, EXTRA_OUTPUT records (MAX_EXTRAS,)."""
-    return carray(address_pointer(law.extra_outputs), MAX_EXTRAS, EXTRA_OUTPUT)
+    return carray(address_pointer(record.extra_outputs), MAX_EXTRAS, EXTRA_OUTPUT)
+
+
+@jit
+def _told(law, a, count):
+    """Inputs and outputs that the controller of `count` axes from `a` on is told, (2 * MAX_EXTRAS,)."""
+    place = law.controls if count == 1 else law.together
+    return carray(address_pointer(place + a * CONTROL_BYTES + count * TOLD_BYTES), 2 * MAX_EXTRAS, np.float64)
 
 
 @seldom
-def hand_in(law, place):
-    """Tell a controller, at the address `place`, the inputs, and the outputs at their safe values."""
-    told = carray(address_pointer(place), 2 * MAX_EXTRAS, np.float64)
-    inputs, outputs = inputs_of(law), outputs_of(law)
-    for k in range(law.extra_input_count):
-        told[k] = inputs[k]
-    for k in range(law.extra_output_count):
-        told[MAX_EXTRAS + k] = outputs[k].safe_v
+def hand_in(record):
+    """Tell every controller the inputs, and the outputs at their safe values."""
+    law, inputs, outputs = opened(record), inputs_of(record), outputs_of(record)
+    for a in range(law.axis_count):
+        count = np.int64(coefficients_of(law, a).controller_axes)
+        if count != 0:
+            told = _told(law, a, count)
+            for k in range(record.extra_input_count):
+                told[k] = inputs[k]
+            for k in range(record.extra_output_count):
+                told[MAX_EXTRAS + k] = outputs[k].safe_v
 
 
 @seldom
-def hand_out(law, first, count, place):
-    """Take over what the controller of `count` axes from `first` on has set; one that is no number, or 0."""
-    told, outputs = carray(address_pointer(place), 2 * MAX_EXTRAS, np.float64), outputs_of(law)
-    for k in range(law.extra_output_count):
-        if first <= outputs[k].axis < first + count:
-            value_v = told[MAX_EXTRAS + k]
-            if not usable(value_v):
-                return value_v
-            outputs[k].value_v = clip(value_v, outputs[k].lowest_v, outputs[k].highest_v)
-    return 0.0
+def hand_out(record):
+    """Take over the outputs that the controllers have set; all are safe where the loop is not closed.
 
-
-@seldom
-def make_outputs_safe(law):
-    """All of them."""
-    outputs = outputs_of(law)
-    for k in range(law.extra_output_count):
+    One that is no number is safe, and trips the next tick, as what goes wrong behind the drives does.
+    """
+    law, outputs = opened(record), outputs_of(record)
+    loop = loop_of(law)
+    for k in range(record.extra_output_count):
         outputs[k].value_v = outputs[k].safe_v
+    for a in range(law.axis_count):
+        count = np.int64(coefficients_of(law, a).controller_axes)
+        told = _told(law, a, max(count, 1))
+        for k in range(record.extra_output_count):
+            if loop.mode == CLOSED_LOOP and a <= outputs[k].axis < a + count:
+                value_v = told[MAX_EXTRAS + k]
+                if usable(value_v):
+                    outputs[k].value_v = clip(value_v, outputs[k].lowest_v, outputs[k].highest_v)
+                else:
+                    note_failure(state_of(law, a), CONTROLLER_OUTPUT, value_v)
+                    loop.pending |= TRIP_LAW

@@ -29,7 +29,7 @@ from rtloop.law.access import (
     state_of,
     together_of,
 )
-from rtloop.law.extras import hand_in, hand_out, make_outputs_safe
+from rtloop.law.extras import hand_in, hand_out
 from rtloop.law.layout import COEFFICIENTS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TOLD
 from rtloop.law.prefilter import fill_prefilter_anew, prefilter
 from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
@@ -55,8 +55,6 @@ RAMPING = int(Flag.RAMPING)
 HEARTBEAT_LOST = int(Flag.HEARTBEAT_LOST)
 TRIP_LAW = int(Flag.TRIP_LAW)
 COMMAND = TOLD.index("command_um")
-EXTRAS_BEGIN = len(TOLD) * 8
-"""Behind what a controller of one axis is told of it; of several, behind that of all."""
 NEGLIGIBLE_BUMP = 1e-9
 ANOTHER_MODE, ANOTHER_CONTROLLER = 1, 2
 
@@ -147,6 +145,8 @@ def evaluate(record, adc_v, references, conditions):
         loop.mode = OFF
     loop.tick_flags = HEARTBEAT_LOST if conditions.heartbeat_lost != 0 else 0
     loop.settled = 1
+    if record.extra_count != 0:
+        hand_in(record)
     for a in range(law.axis_count):
         count = np.int64(coefficients_of(law, a).controller_axes)
         if count > 1:
@@ -155,8 +155,8 @@ def evaluate(record, adc_v, references, conditions):
             if loop.mode == CLOSED_LOOP and not _control(law, a):
                 _trip_by_law(loop)
             _drive(law, a, loop, references[a])
-    if law.extra_output_count != 0 and loop.mode != CLOSED_LOOP:
-        make_outputs_safe(law)
+    if record.extra_count != 0:
+        hand_out(record)
     loop.tick_flags |= loop.trip
 
 
@@ -173,14 +173,9 @@ def _control(law, a):
     """Command of one axis that has a controller of its own; False where that failed."""
     coefficients, state = coefficients_of(law, a), state_of(law, a)
     _tell(law, a, coefficients, state, coefficients.resting_error[0] * state.applied_command_um)
-    extras = law.extra_input_count + law.extra_output_count
-    if extras != 0:
-        hand_in(law, law.controls + a * CONTROL_BYTES + EXTRAS_BEGIN)
     good = state.entering == 0 or controller_enter(law, a, law.controls)
     succeeded, command_um = controller_output(law, a, coefficients, law.controls)
     good = good and succeeded
-    if extras != 0:
-        good = _take_outputs(law, a, 1, law.controls + a * CONTROL_BYTES + EXTRAS_BEGIN) and good
     return _command(law, a, coefficients, state, command_um) and good
 
 
@@ -207,27 +202,14 @@ def _control_together(law, first, count):
         _tell(law, i, coefficients, state_of(law, i), resting_um)
         entering = entering or state_of(law, i).entering != 0
     _gather(law, first, count)
-    extras = law.together + first * CONTROL_BYTES + count * EXTRAS_BEGIN
-    hand_in(law, extras)
     good = not entering or controller_enter(law, first, law.together)
     succeeded, _ = controller_output(law, first, coefficients_of(law, first), law.together)
     good = good and succeeded
-    good = _take_outputs(law, first, count, extras) and good
     commands_um = together_of(law, first, count)[COMMAND]
     for i in range(count):
         a = first + i
         good = _command(law, a, coefficients_of(law, a), state_of(law, a), commands_um[i]) and good
     return good
-
-
-@seldom
-def _take_outputs(law, first, count, place):
-    """Take over the outputs that a controller has set; False where one is no number."""
-    failed_v = hand_out(law, first, count, place)
-    if failed_v == 0.0:
-        return True
-    note_failure(state_of(law, first), CONTROLLER_OUTPUT, failed_v)
-    return False
 
 
 @jit

@@ -191,7 +191,7 @@ LAW = np.dtype(
         *((name, np.int64) for name in ("coefficients", "coefficients_bytes", "axes", "axes_bytes", "loop")),
         *((name, np.int64) for name in ("controls", "together", "functions", "rules", "result", "raised")),
         *((name, np.int64) for name in ("controller_coefficients", "controller_state")),
-        *((name, np.int64) for name in ("extra_inputs", "extra_outputs")),
+        *((name, np.int64) for name in ("extra_inputs", "extra_outputs", "extra_count")),
         *((name, np.uint32) for name in ("axis_count", "law_count", "extra_input_count", "extra_output_count")),
     ],
     align=True,

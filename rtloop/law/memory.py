@@ -239,6 +239,7 @@ class LawMemory:
         self.law.coefficients_bytes, self.law.axes_bytes = coefficients.itemsize, axes.itemsize
         self.law.axis_count, self.law.law_count = axes.size, len(layout.laws)
         self.law.extra_input_count, self.law.extra_output_count = len(extras.inputs), len(extras.outputs)
+        self.law.extra_count = len(extras.inputs) + len(extras.outputs)
         own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.room("feedforward")
         self.law.controller_coefficients = own[0] + feedforward[0]
         self.law.controller_state = own[1] + feedforward[1]

@@ -14,6 +14,7 @@ from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.law.extras import ExtraOutput
 from rtloop.recording.capture.session import Session
+from rtloop.recording.file.events import event_of
 from rtloop.recording.replay.laws import Trust
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
@@ -126,8 +127,12 @@ def test_an_output_that_is_no_number_trips(folder):
     (folder / "mine.py").write_text(MINE.replace("= 0.1 * s.seen", "= 1e308 * 1e308"))
     bench = LoopBench(prepare(parse(configuration(), "test", folder, "test"), paced=False).plan)
     rows = bench.run(50)
-    assert set(bench.column(rows, "mode")) == {float(Mode.OFF)}
+    assert set(bench.column(rows, "mode")[1:]) == {float(Mode.OFF)}
     assert set(bench.column(rows, "count_v")) == {0.0}
+    said = event_of(
+        next(event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED), ("x",), 0, ["", "", "mine"]
+    )
+    assert "law 'mine' returned inf from output of the controller" in said["what"]["reason"]
 
 
 def test_a_replay_comes_to_the_same(folder):
