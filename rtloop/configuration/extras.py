@@ -22,15 +22,14 @@ class ExtraInputOptions(Options):
 
 
 class ExtraOutputOptions(Options):
-    """A channel that the controller of an axis sets; at `safe_v` wherever it does not."""
+    """A channel that the controller of an axis sets; at what is safe on it wherever it does not."""
 
     channel: str
     axis: str
     min_v: float | None = None
     max_v: float | None = None
-    """Where it may be; the channel's range by default."""
-    safe_v: float | None = None
-    """The channel's own by default."""
+    """Where it may be; the channel's range by default. What is safe on the channel lies between: parking brings it
+    there whatever a configuration says."""
 
 
 def extra_faults(
@@ -74,7 +73,7 @@ def extras_of(
         taken[channel.name] = f"output {name}"
         lowest_v = channel.minimum_v if options.min_v is None else options.min_v
         highest_v = channel.maximum_v if options.max_v is None else options.max_v
-        safe_v = channel.safe_v if options.safe_v is None else options.safe_v
+        safe_v = channel.safe_v
         if not channel.minimum_v <= lowest_v <= safe_v <= highest_v <= channel.maximum_v:
             raise ValueError(
                 f"outputs.{name}: from {lowest_v:g} to {highest_v:g} V, safe at {safe_v:g}; the channel has "

@@ -112,14 +112,14 @@ def test_a_law_reads_and_sets_them(folder):
 
 
 def test_where_the_loop_is_not_closed_they_are_safe(folder):
-    text = configuration(("max_v = 0.75", "min_v = -1.0\nsafe_v = -0.5"))
+    text = configuration(("max_v = 0.75", "min_v = -1.0"))
     bench = LoopBench(prepare(parse(text, "test", folder, "test"), paced=False).plan)
     closed = bench.run(500)
     assert bench.column(closed, "count_v")[-1] > 0
     for mode in (Mode.FEEDFORWARD, Mode.OFF):
         bench.send(Kind.SET_MODE, mode)
         rows = bench.run(200)
-        assert set(bench.column(rows, "count_v")) == {-0.5}
+        assert set(bench.column(rows, "count_v")) == {0.0}
         assert set(bench.column(rows, "pulse_v")) == {0.0}
 
 
