@@ -43,13 +43,14 @@ def linearised(law: Controller) -> Sampled | SampledTogether:
             wide, narrow = _derivatives(tick, STEP), _derivatives(tick, STEP / 2)
     except (ArithmeticError, IndexError, ValueError) as error:
         raise ValueError(f"at rest it fails: {type(error).__name__}: {error}") from error
+    n = tick.size
+    seen = _reached(narrow[:n, :n], narrow[:n, n:]) & _reached(narrow[:n, :n].T, narrow[n:, :n].T)
+    kept = np.concatenate([np.flatnonzero(seen), np.arange(n, len(narrow))])
+    wide, narrow, n = wide[np.ix_(kept, kept)], narrow[np.ix_(kept, kept)], int(seen.sum())
     scale = np.abs(wide).max(axis=1, keepdims=True, initial=0.0) + 1e-12
     if not np.all(np.abs(wide - narrow) <= AGREEMENT * scale):
         raise ValueError("it is not smooth at rest")
-    n = tick.size
     a, b, c, d = narrow[:n, :n], narrow[:n, n:], narrow[n:, :n], narrow[n:, n:]
-    kept = np.flatnonzero(_reached(a, b) & _reached(a.T, c.T))
-    a, b, c = a[np.ix_(kept, kept)], b[kept], c[:, kept]
     if law.count > 1:
         return SampledTogether(SystemTogether(a, b, c, d), law.period_s)
     return Sampled(System(a, b[:, 0], c[0], float(d[0, 0])), law.period_s)

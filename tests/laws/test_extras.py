@@ -94,7 +94,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_law_reads_and_sets_them(folder):
     """A pulse at each line that the position passes, which comes back a tick later and is counted, to the limit."""
-    plan = prepare(parse(configuration(), "test", folder, "test"), paced=False).plan
+    prepared = prepare(parse(configuration(), "test", folder, "test"), paced=False)
+    plan = prepared.plan
+    assert prepared.checks[0].running.stable  # what it counts and marks, no command sees: it is no part of the loop
     assert plan.extras.outputs == (ExtraOutput("count", 0, -10.0, 0.75, 0.0), ExtraOutput("pulse", 0, 0.0, 10.0, 0.0))
     bench = LoopBench(plan)
     rows = bench.run(3000)
