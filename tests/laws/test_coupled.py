@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy import signal
 
 import rtloop
 from rtloop.analysis.coupled_loop import CoupledLoop
+from rtloop.cli import main
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.commands import send
@@ -162,6 +165,29 @@ def test_the_loop_is_as_it_was_predicted(tmp_path):
     assert predicted.max_sensitivity == pytest.approx(np.linalg.norm(sensitivity, 2, axis=(1, 2)).max(), rel=0.01)
     disk = 1 / np.linalg.norm(sensitivity - np.eye(2) / 2, 2, axis=(1, 2)).max()
     assert predicted.disk_margin == pytest.approx(disk, rel=0.01)
+
+
+def test_it_is_verified_as_it_runs():
+    """What `design verify` promises of a step is what the rig does; there is no C(s), and nothing is said of one."""
+    answer = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["coupled"]), "--json"])
+    assert answer.exit_code == 0
+    found = json.loads(answer.stdout)
+    assert [axis["name"] for axis in found["axes"]] == ["x", "y"]
+    assert found["axes"][0]["together"] == prepared(EXAMPLE).checks[0].together.margins.as_dict()
+    rows = {row["name"]: row for row in found["axes"][0]["rows"]}
+    assert all(row["continuous"] is None for row in rows.values())
+    bench, ticks = run(referenced(invertible(EXAMPLE), 'kind = "hold"\nvalue = 10.0', 'kind = "hold"'), 600)
+    position_um = bench.column(ticks, "x_true_position_um")
+    assert rows["peak_command"]["running"] == pytest.approx(bench.column(ticks, "x_command_um").max() / 10.0, rel=0.01)
+    outside = np.flatnonzero(np.abs(position_um / position_um[-1] - 1) > 0.05)
+    assert rows["settling_ms"]["running"] == pytest.approx((outside[-1] + 1) * 0.1, abs=0.15)
+
+
+def test_a_law_of_one_axis_is_verified_too():
+    answer = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["pid"])])
+    assert answer.exit_code == 0
+    assert "as it runs C(z)" in answer.stdout
+    assert "continuous" not in answer.stdout
 
 
 MINE = PAIR.replace("class Pair", "class Mine")

@@ -82,6 +82,8 @@ def robustness(found: Verification) -> list[tuple[str, ...]]:
 
 def together(margins: TogetherMargins) -> list[tuple[str, str]]:
     """What all axes of a controller bear at once."""
+    if math.isnan(margins.max_sensitivity):
+        return [("stable", "NO")]
     rows = [
         ("largest σ(S)", f"{margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz"),
         ("largest σ(T)", f"{margins.max_tracking:.3f}"),
