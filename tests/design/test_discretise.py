@@ -64,6 +64,17 @@ def worst_error(transfer: Transfer, method, prewarp_hz, hz=HZ) -> float:
     return float(np.max(np.abs(controller.response(hz) - wanted) / size))
 
 
+def rounding(controller, hz) -> float:
+    """Relative error of C(z), counted as in `worst_error`, that rounding A brings about: ε κ(zI − A) |c||x| / |C|."""
+    found = 0.0
+    for z in np.exp(2j * np.pi * np.asarray(hz) * T):
+        terms = np.abs(controller.system.states(z)[0]) @ np.abs(controller.c) + abs(controller.d)
+        size = max(abs(controller.system.response(z)[0]), 1e-5 * terms)
+        pencil = z * np.eye(controller.b.size) - controller.a
+        found = max(found, np.finfo(float).eps * np.linalg.cond(pencil) * terms / size if controller.b.size else 0.0)
+    return found
+
+
 @pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)
 def test_paper_controller_to_1e9(method, prewarp_hz) -> None:
     """Eq (20) at 10 kHz."""
@@ -110,13 +121,14 @@ roots = st.tuples(st.lists(rates, max_size=3), st.lists(pairs, max_size=3)).map(
 def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
     """State space = C(z), anti-windup stable and exact, steady state right; whatever the poles.
 
-    To 1e-8 here: six zeros near 3 Hz among poles far away cancel inside the cascade as well, and cost another digit.
+    To 1e-8 here: six zeros near 3 Hz among poles far away cancel inside the cascade as well, and cost another digit. Or
+    to what rounding A alone must cost, where eight of them cancel and zI − A is all but singular.
     """
     poles = (poles + poles if repeat and len(poles) <= 5 else poles) + ([0.0] if integrator else [])
     zeros = zeros[: len(poles)] if len(zeros) <= len(poles) else []
     transfer = Transfer.from_zpk(zeros, poles, float(np.prod([abs(p) or 1 for p in poles])))
     controller = discretise(transfer, T, *how)
-    assert worst_error(transfer, *how, hz=HZ[1::3]) < 1e-8
+    assert worst_error(transfer, *how, hz=HZ[1::3]) < max(1e-8, rounding(controller, HZ[1::3]))
     a, b, c, m = controller.a, controller.b, controller.c, controller.antiwindup
     if np.abs(c).max(initial=0) > 1e-6:  # otherwise every pole has its zero
         assert c @ m == pytest.approx(1.0, rel=1e-9)
