@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rtloop import signals
 from rtloop.configuration.axis import AxisOptions
 from rtloop.drivers.base import Facts, Wiring, index_of
 from rtloop.hil.options import Options
@@ -64,6 +65,11 @@ def extras_of(
     """With the driver's channels. Raises ValueError for one that is not there, is taken, or cannot go so far."""
     for name, read in inputs.items():
         _at(f"inputs.{name}.channel", facts.inputs, read.channel)
+    columns = signals.columns(axes, facts.observed)
+    for name in (*inputs, *outputs):
+        if f"{name}_v" in columns:
+            section = "inputs" if name in inputs else "outputs"
+            raise ValueError(f"{section}.{name}: the record has a column {name}_v already; another name is needed")
     taken = {one.output: f"the drive of axis {axis}" for axis, one in wiring.items()}
     found = []
     for name, options in outputs.items():

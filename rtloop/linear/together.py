@@ -97,11 +97,6 @@ class SampledTogether:
         return self.system.d.shape[0]
 
     @cached_property
-    def poles(self) -> Complex:
-        """Poles, (n,)."""
-        return np.linalg.eigvals(self.system.a).astype(complex) if self.order else np.empty(0, complex)
-
-    @cached_property
     def at_rest(self) -> Real:
         """C just beside z = 1, (m, m): large in the directions that integrate."""
         return self.system.response(1.0 + BESIDE_ONE)[0].real

@@ -216,6 +216,8 @@ class Mine(CoupledController):
         ('channel = "dac1"\naxis = "x"', 'channel = "dac1"\naxis = "z"', "outputs.pulse.axis: 'z' is not an axis"),
         ("[inputs.back]", "[inputs.black]", "law 'mine' needs the input 'back' in .inputs.; there are spare, black"),
         ("[outputs.count]", "[outputs.spare]", "outputs.spare: an input has this name"),
+        ("[inputs.spare]", "[inputs.enable]", "inputs.enable: the record has a column enable_v already"),
+        ("[inputs.spare]", "[inputs.x_drive]", "inputs.x_drive: the record has a column x_drive_v already"),
         ("rate_hz = 10000\n", 'rate_hz = 10000\nhold_input = "gate"\n', "hold_input: 'gate' is not among"),
     ],
 )  # fmt: skip

@@ -46,12 +46,18 @@ STATE = whole_lines([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float64, (M
 def commands(c, s, told):
     """v = C x + D e in µm, the decoupling in C and D."""
     for i in range(c.count):
-        command_um = 0.0
-        for j in range(c.order):
-            command_um += c.c[i, j] * s.x[j]
-        for j in range(c.count):
-            command_um += c.d[i, j] * told.error_um[j]
-        told.command_um[i] = command_um
+        told.command_um[i] = _command(c, s, told, i)
+
+
+@jit
+def _command(c, s, told, i):
+    """Of axis `i`."""
+    command_um = 0.0
+    for j in range(c.order):
+        command_um += c.c[i, j] * s.x[j]
+    for j in range(c.count):
+        command_um += c.d[i, j] * told.error_um[j]
+    return command_um
 
 
 @jit
@@ -78,11 +84,7 @@ def go_on(c, s, told):
         for i in range(c.count):
             s.x[j] += c.steady_state[j, i] * told.error_um[i]
     for i in range(c.count):
-        gap_um = told.command_um[i]
-        for j in range(c.order):
-            gap_um -= c.c[i, j] * s.x[j]
-        for j in range(c.count):
-            gap_um -= c.d[i, j] * told.error_um[j]
+        gap_um = told.command_um[i] - _command(c, s, told, i)
         for j in range(c.order):
             s.scratch[j] = (s.scratch[j] if i > 0 else 0.0) + c.tracking[j, i] * gap_um
     for j in range(c.order):
