@@ -13,26 +13,42 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from rtloop.analysis.held_plant import Between, held_plant
+from rtloop.analysis.reference import AS_IT_IS, ReferencePath
 from rtloop.hil.modal import Complex, Real
-from rtloop.linear.discretise import DiscreteController, held
+from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System, beside_imaginary_axis, realise
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
 
+class Injection(NamedTuple):
+    """What is added to the command moves: the states by `b` (n,), the position between samples by `between` (POINTS,)."""
+
+    b: Real
+    between: Real
+
+
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz."""
+    """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz.
+
+    `between` is D's position within a period, of its own states and input; None in continuous time, and where only
+    the samples are known. `reference` is what the reference passes on its way in.
+    """
 
     controller: System
     plant: System
     static_gain: float
     roots: Complex
     period_s: float | None = None
+    between: Between | None = None
+    reference: ReferencePath = AS_IT_IS
 
     def open(self, hz: npt.ArrayLike) -> Complex:
         """L at frequencies (k,) in Hz."""
@@ -61,6 +77,43 @@ class Loop:
         a = np.block([[ac, -np.outer(bc, cp)], [np.outer(bp, cc), ap - dc * np.outer(bp, cp)]])
         c = np.vstack([np.concatenate([0 * cc, cp]), np.concatenate([cc, -dc * cp])])
         return a, np.concatenate([bc, dc * bp]), c, np.array([0.0, dc])
+
+    @cached_property
+    def positions(self) -> Between:
+        """Within a period, of the closed loop's states and of what the error is made of; the samples alone if so."""
+        _, _, c, d = self.matrices
+        if self.between is None:
+            return Between(c[:1], d[:1])
+        _, _, cc, dc = self.controller
+        rows, direct = self.between
+        return Between(np.hstack([np.outer(direct, cc), rows - dc * np.outer(direct, self.plant.c)]), dc * direct)
+
+    @property
+    def injection(self) -> Injection:
+        """What is added to the command."""
+        between = np.zeros(1) if self.between is None else self.between.direct
+        return Injection(np.concatenate([np.zeros(self.controller.b.size), self.plant.b]), between)
+
+    @cached_property
+    def final(self) -> tuple[float, float]:
+        """Where position and command of a stable loop come to rest after a unit step of the reference."""
+        a, b, c, d = self.matrices
+        toward_error, toward_command = (float(gain[0].real) for gain in self.reference.response(1.0))
+        inputs = toward_error * b + toward_command * self.injection.b
+        states = np.linalg.solve(-a if self.period_s is None else np.eye(b.size) - a, inputs)
+        position, command = c @ states + toward_error * d
+        return float(position), float(command) + toward_command
+
+    def from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
+        """To position and command, at frequencies (k,) in Hz, with what the reference passes."""
+        a, b, c, d = self.matrices
+        points = self._points(hz)
+        toward_error, toward_command = self.reference.response(points)
+        position, command = (toward_error * System(a, b, c[i], float(d[i])).response(points) for i in (0, 1))
+        if self.reference.commands:
+            position = position + toward_command * System(a, self.injection.b, c[0], 0.0).response(points)
+            command = command + toward_command * System(a, self.injection.b, c[1], 1.0).response(points)
+        return position, command
 
     @cached_property
     def poles(self) -> Complex:
@@ -103,29 +156,23 @@ def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
     return Loop(realised(controller), realised(plant), (controller * plant).dc_gain, roots)
 
 
-def discrete_loop(controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int = 0) -> Loop:
+def discrete_loop(
+    controller: DiscreteController | Sampled,
+    plant: Transfer,
+    delay_ticks: int = 0,
+    reference: ReferencePath = AS_IT_IS,
+) -> Loop:
     """The loop as it runs: D(s) behind a zero-order hold at the controller's period, `delay_ticks` samples before it.
 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """
     _check(plant)
     period_s = controller.period_s
-    sampled = sampled_plant(plant, period_s, delay_ticks)
+    sampled, between = held_plant(plant, period_s, delay_ticks)
     images = np.concatenate([controller.zeros, controller.poles])
     roots = np.concatenate([_rates(images, period_s), plant.poles])
-    return Loop(controller.system, sampled, controller.dc_gain * plant.dc_gain, roots, period_s)
-
-
-def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
-    """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
-    if delay_ticks < 0:
-        raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
-    found = held(plant, period_s)
-    for _ in range(delay_ticks):
-        n = found.b.size
-        a = np.block([[found.a, found.b[:, None]], [np.zeros((1, n + 1))]])
-        found = System(a, np.eye(n + 1)[-1], np.append(found.c, 0.0), 0.0)
-    return found
+    static_gain = controller.dc_gain * plant.dc_gain
+    return Loop(controller.system, sampled, static_gain, roots, period_s, between, reference)
 
 
 def _rates(images: Complex, period_s: float) -> Complex:

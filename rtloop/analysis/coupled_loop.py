@@ -19,8 +19,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.analysis.closed_loop import Loop, sampled_plant
+from rtloop.analysis.closed_loop import Injection, Loop
+from rtloop.analysis.held_plant import Between, HeldPlant, held_plant
 from rtloop.analysis.margins import highest
+from rtloop.analysis.reference import AS_IT_IS, ReferencePath
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import System
 from rtloop.linear.together import BESIDE_ONE, SampledTogether, SystemTogether, beside_each_other
@@ -28,6 +30,7 @@ from rtloop.linear.transfer import Transfer
 
 NOTHING = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
 """What leaves a signal as it is."""
+NO_INJECTION = Injection(np.empty(0), np.empty(0))
 BALANCINGS = 30
 INTEGRATES = 1e6
 """A loop whose gain beside z = 1 is above this is without limit there."""
@@ -49,13 +52,13 @@ class CoupledPlant:
             delay_ticks=(*self.delay_ticks[:number], delay_ticks, *self.delay_ticks[number + 1 :]),
         )
 
-    def sampled(self, period_s: float) -> SystemTogether:
-        """Behind a zero-order hold. Raises ValueError for an axis with direct feedthrough."""
+    def held(self, period_s: float) -> list[HeldPlant]:
+        """Each axis behind a zero-order hold. Raises ValueError for one with direct feedthrough."""
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
                 raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
         pairs = zip(self.dynamics, self.delay_ticks, strict=True)
-        return beside_each_other([sampled_plant(plant, period_s, ticks) for plant, ticks in pairs]).mixed(self.coupling)
+        return [held_plant(plant, period_s, ticks) for plant, ticks in pairs]
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
@@ -66,9 +69,18 @@ def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]
 
 @dataclass(frozen=True, eq=False)
 class BrokenLoop(Loop):
-    """One axis's loop, the others closed: `plant` is from its error to its position, `command` to its command."""
+    """One axis's loop, the others closed: `plant` is from its error to its position, `command` to its command.
+
+    `added` is what is added to its command.
+    """
 
     command: System = NOTHING
+    added: Injection = NO_INJECTION
+
+    @property
+    def injection(self) -> Injection:
+        """What is added to its command."""
+        return self.added
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
         """From its reference to its command."""
@@ -107,10 +119,12 @@ class CoupledLoop:
 
     def __init__(self, controller: SampledTogether, plant: CoupledPlant) -> None:
         self.period_s = controller.period_s
-        self._controller, self._plant = controller.system, plant.sampled(controller.period_s)
+        self._held, self._coupling = plant.held(controller.period_s), plant.coupling
+        self._controller = controller.system
+        self._plant = beside_each_other([one.system for one in self._held]).mixed(plant.coupling)
         self.count = controller.count
 
-    def alone(self, number: int) -> BrokenLoop:
+    def alone(self, number: int, reference: ReferencePath = AS_IT_IS) -> BrokenLoop:
         """The loop of one axis, broken at its sensor, the others closed."""
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
@@ -125,7 +139,19 @@ class CoupledLoop:
         rates = np.asarray(np.log(poles[np.abs(poles) > 1e-9]) / self.period_s, np.complex128)
         at_rest = float(own.response(1.0 + BESIDE_ONE)[0].real)
         static = at_rest if abs(at_rest) < INTEGRATES else np.copysign(np.inf, at_rest)
-        return BrokenLoop(NOTHING, own, float(static), rates, self.period_s, command)
+        added = Injection(np.concatenate([bp[:, number], np.zeros(ac.shape[0])]), self._held[number].between.direct)
+        between = self._between(number, closed)
+        return BrokenLoop(NOTHING, own, float(static), rates, self.period_s, between, reference, command, added)
+
+    def _between(self, number: int, closed: Real) -> Between:
+        """Positions of one axis within a period, of all states and of its error; `closed` are the other axes."""
+        _, _, cc, dc = self._controller
+        rows, direct = self._held[number].between
+        before = sum(one.system.b.size for one in self._held[:number])
+        behind = self._plant.a.shape[0] - before - rows.shape[1]
+        of_commands = np.outer(direct, self._coupling[number])
+        plants = np.pad(rows, ((0, 0), (before, behind))) - of_commands @ dc @ closed @ self._plant.c
+        return Between(np.hstack([plants, of_commands @ cc]), of_commands @ dc[:, number])
 
     @cached_property
     def poles(self) -> Complex:

@@ -25,7 +25,8 @@ class LoopAnalysis:
     """What there is to know about one loop. Percentages and |S| refer to the reference; NaN: undefined or unstable.
 
     `max_re_pole` (rad/s) is NaN in discrete time, `max_abs_pole` in continuous time. `static_error_percent` is
-    100·|S(0)|. The settling time is that to ±5 % of the final value, and overshoot counts from it.
+    what a step leaves, relative to its height. The settling time is that to ±5 % of the final value, and overshoot counts
+    from it.
     """
 
     period_s: float | None
@@ -82,7 +83,7 @@ def analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float] = TIMES_S) ->
         stable=loop.is_stable,
         max_re_pole=float(poles.real.max(initial=-math.inf)) if continuous else math.nan,
         max_abs_pole=math.nan if continuous else float(np.abs(poles).max(initial=0.0)),
-        static_error_percent=100 * abs(1 / (1 + loop.static_gain)) if loop.static_gain != -1 else math.inf,
+        static_error_percent=step.static_error_percent,
         sensitivity_1hz=float(loop.sensitivity(1.0)[0]),
         settling_time_s=step.settling_time_s,
         overshoot_percent=step.overshoot_percent,

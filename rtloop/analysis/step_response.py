@@ -1,4 +1,7 @@
-"""Step response of a loop, exact at its samples, and what a specification asks of it."""
+"""Step response of a loop, and what a specification asks of it.
+
+Exact: in discrete time the plant's input stands still for a period, within which `POINTS` positions are known.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,10 @@ COUNT = 1 << 16
 
 
 class StepResponse(NamedTuple):
-    """Answer to a unit step of the reference at 0 s: `time_s`, `position` x, `command` v, each (k,)."""
+    """Answer to a unit step of the reference at 0 s: `time_s`, `position` x, `command` v, each (k,).
+
+    In discrete time there are `POINTS` of each period, over which the command stands still.
+    """
 
     time_s: Real
     position: Real
@@ -25,42 +31,52 @@ class StepResponse(NamedTuple):
 
 
 class StepMetrics(NamedTuple):
-    """Settling to within 5 % of the final value, overshoot over it, largest |v|, x at the times asked for."""
+    """Of a unit step: settling to within 5 % of the final value, overshoot over it, how far that is from 1, the largest
+    |v|, x at the times asked for.
+    """
 
     settling_time_s: float
     overshoot_percent: float
+    static_error_percent: float
     peak_command: float
     position_at: tuple[float, ...]
 
 
 def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
-    """Samples until the slowest closed-loop pole has died away, or `duration_s`; ticks if the loop is discrete."""
-    duration_s = duration_s or _duration(loop)
+    """Until the slowest closed-loop pole has died away, or for `duration_s`."""
     if loop.period_s is not None:
-        return _sampled(loop, loop.period_s, min(math.ceil(duration_s / loop.period_s) + 1, COUNT))
-    fine, coarse = _sampled(loop, duration_s / COUNT / 64, COUNT), _sampled(loop, duration_s / COUNT, COUNT)
+        return _sampled(loop, loop.period_s, duration_s)
+    duration_s = duration_s or _duration(loop)
+    fine, coarse = _continuous(loop, duration_s / COUNT / 64), _continuous(loop, duration_s / COUNT)
     later = coarse.time_s > fine.time_s[-1]
     return StepResponse(*(np.concatenate([early, late[later]]) for early, late in zip(fine, coarse, strict=True)))
 
 
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
-    """Of a stable loop; NaN throughout for an unstable one. A discrete loop is judged at its ticks, not between."""
+    """Of a stable loop; NaN throughout for an unstable one. Between ticks as well as at them."""
     if not loop.is_stable:
-        return StepMetrics(math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
+        return StepMetrics(*[math.nan] * 4, tuple(math.nan for _ in times_s))
     response = step_response(loop)
-    final = 1.0 if math.isinf(loop.static_gain) else loop.static_gain / (1 + loop.static_gain)
+    final, command = loop.final
     overshoot = 100 * max(0.0, float(np.max(response.position / final)) - 1) if final else math.nan
-    at = tuple(position_at(loop, t) for t in times_s)
-    return StepMetrics(_settling(response, final), overshoot, float(np.max(np.abs(response.command))), at)
+    return StepMetrics(
+        _settling(response, final),
+        overshoot,
+        100 * abs(1 - final),
+        float(np.max(np.abs(response.command), initial=abs(command))),
+        tuple(position_at(loop, t) for t in times_s),
+    )
 
 
 def position_at(loop: Loop, time_s: float) -> float:
-    """x at one time after a unit step; at the last tick before it if the loop is discrete."""
-    joint = _joint(loop, time_s if loop.period_s is None else loop.period_s)
-    if loop.period_s is not None:
-        joint = np.linalg.matrix_power(joint, math.floor(time_s / loop.period_s + 1e-9))
-    _, _, c, _ = loop.matrices
-    return float(c[0] @ joint[:-1, -1])
+    """x at one time after a unit step; of a discrete loop at the last point of its response before it."""
+    if loop.period_s is None:
+        a, b, c, _ = loop.matrices
+        joint = np.zeros((b.size + 1, b.size + 1))
+        joint[:-1, :-1], joint[:-1, -1] = a, b
+        return float(c[0] @ expm(joint * time_s)[:-1, -1])
+    response = step_response(loop, time_s + loop.period_s)
+    return float(response.position[np.flatnonzero(response.time_s <= time_s + 1e-9 * loop.period_s)[-1]])
 
 
 def _settling(response: StepResponse, final: float) -> float:
@@ -76,29 +92,48 @@ def _settling(response: StepResponse, final: float) -> float:
     return float(response.time_s[i] + part * (response.time_s[i + 1] - response.time_s[i]))
 
 
-def _joint(loop: Loop, interval_s: float) -> Real:
-    """The closed loop with its constant reference as one more state, advanced by one interval (n + 1, n + 1)."""
-    a, b, _, _ = loop.matrices
-    n = b.size
-    joint = np.zeros((n + 1, n + 1))
-    joint[:n, :n], joint[:n, n] = a, b
-    if loop.period_s is None:
-        return np.asarray(expm(joint * interval_s), dtype=float)
-    joint[n, n] = 1.0
-    return joint
+def _continuous(loop: Loop, interval_s: float) -> StepResponse:
+    """COUNT samples from rest."""
+    a, b, c, d = loop.matrices
+    joint = np.zeros((b.size + 1, b.size + 1))
+    joint[:-1, :-1], joint[:-1, -1] = a, b
+    states = _doubled(np.asarray(expm(joint * interval_s), dtype=float), COUNT)
+    position, command = c @ states + d[:, None]
+    return StepResponse(interval_s * np.arange(COUNT, dtype=float), position, command)
 
 
-def _sampled(loop: Loop, interval_s: float, count: int) -> StepResponse:
-    """`count` samples from rest: blocks of states that double, [X, Aᵏ X], rather than a loop over samples."""
-    _, _, c, d = loop.matrices
-    power = _joint(loop, interval_s)
+def _sampled(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
+    """From rest: what a step of the error's reference and one of the command do, each behind what the reference passes."""
+    a, b, c, d = loop.matrices
+    reference, (rows, direct), added = loop.reference, loop.positions, loop.injection
+    duration_s = duration_s or _duration(loop) + reference.ticks * period_s
+    count = min(math.ceil(duration_s / period_s) + 1, COUNT)
+    states = _stepped(a, b, count)
+    position = reference.toward_error(rows @ states + direct[:, None])
+    command = reference.toward_error(c[1] @ states + d[1])
+    if reference.commands:
+        states = _stepped(a, added.b, count)
+        position += reference.toward_command(rows @ states + added.between[:, None])
+        command += reference.toward_command(c[1] @ states + 1.0)
+    points = rows.shape[0]
+    time_s = period_s / points * np.arange(count * points, dtype=float)
+    return StepResponse(time_s, position.T.ravel(), np.repeat(command, points))
+
+
+def _stepped(a: Real, b: Real, count: int) -> Real:
+    """States (n, count) of a discrete system from rest whose input is 1."""
+    joint = np.eye(b.size + 1)
+    joint[:-1, :-1], joint[:-1, -1] = a, b
+    return _doubled(joint, count)
+
+
+def _doubled(power: Real, count: int) -> Real:
+    """Powers of a matrix on its last unit vector, (n − 1, count), the last row of 1 left out: in blocks that double."""
     states = np.eye(power.shape[0])[:, -1:]
     while states.shape[1] < count:
         states = np.hstack([states, power @ states])
         power = power @ power
-    states = states[:, :count]
-    position, command = c @ states[:-1] + d[:, None]
-    return StepResponse(interval_s * np.arange(count, dtype=float), position, command)
+    return states[:-1, :count]
 
 
 def _duration(loop: Loop) -> float:

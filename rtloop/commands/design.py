@@ -118,7 +118,7 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
     margins = None if check.together is None else check.together.margins
     try:
         subject = Subject(check.loop, check.controller, check.discrete)
-        return verify(subject, model.transfer(), design, model.delay_ticks, margins), design
+        return verify(subject, model.transfer(), design, max(model.delay_ticks, check.delay_ticks), margins), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{where}: {error}"]) from None
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from rtloop.analysis.reference import ReferencePath
 from rtloop.configuration.laws import ControllerTable, FeedforwardTable
 from rtloop.hil.options import Numbers, Options
 from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
@@ -41,6 +42,13 @@ class PrefilterOptions(Options):
             if not np.all(np.abs(np.roots([1.0, *section[3:]])) < 1):
                 raise ValueError(f"section {list(section)}: unstable; 1 + a1/z + a2/z² needs its roots within 1")
         return self
+
+    def path(self) -> ReferencePath:
+        """What the reference passes."""
+        return ReferencePath(
+            taps=np.array(self.taps or (1.0,)),
+            sections=np.array(self.sections, float).reshape(-1, 5),
+        )
 
 
 class LimitsOptions(Options):

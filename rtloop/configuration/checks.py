@@ -9,11 +9,13 @@ from dataclasses import dataclass, field, replace
 from rtloop.analysis.closed_loop import Loop, discrete_loop
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, TogetherMargins, coupling_matrix
-from rtloop.analysis.loop_analysis import LoopAnalysis, analyse, analyse_continuous, analyse_discrete
+from rtloop.analysis.loop_analysis import LoopAnalysis, analyse, analyse_continuous
+from rtloop.analysis.reference import AS_IT_IS, ReferencePath
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import controller_of
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
+from rtloop.hil.options import RigOptions
 from rtloop.laws.contract import Controller, CoupledController
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import ControllerOptions
@@ -54,18 +56,19 @@ class Together:
     plant: CoupledPlant | None = None
     margins: TogetherMargins | None = None
 
-    def alone(self, dynamics: Transfer, delay_ticks: int) -> Loop:
+    def alone(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
         """The loop of this axis with other dynamics, broken alone. Raises ValueError where a part is not known."""
         if self.linear is None or self.plant is None:
             raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
         plant = self.plant.changed(self.place, dynamics, delay_ticks)
-        return CoupledLoop(self.linear, plant).alone(self.place)
+        return CoupledLoop(self.linear, plant).alone(self.place, reference)
 
 
 @dataclass(frozen=True)
 class AxisCheck:
     """What is known of an axis before it runs; None where there is no controller or no model.
 
+    `delay_ticks` are those of its loop, as its model or the simulated rig has them, and `reference` is its pre-filter.
     Of an axis that shares its controller, `running` is its loop broken alone, and `together` knows the rest.
     """
 
@@ -77,6 +80,7 @@ class AxisCheck:
     comparison: Comparison | None = None
     plant: Transfer | None = None
     delay_ticks: int = 0
+    reference: ReferencePath = AS_IT_IS
     continuous: LoopAnalysis | None = None
     running: LoopAnalysis | None = None
     together: Together | None = None
@@ -91,20 +95,20 @@ class AxisCheck:
     def loop(self, dynamics: Transfer, delay_ticks: int) -> Loop:
         """The loop as it runs, on such dynamics. Raises ValueError where nothing linear is known of its law."""
         if self.together is not None:
-            return self.together.alone(dynamics, delay_ticks)
+            return self.together.alone(dynamics, delay_ticks, self.reference)
         if self.linear is None:
             raise ValueError("controller: nothing linear is known of it")
-        return discrete_loop(self.linear, dynamics, delay_ticks)
+        return discrete_loop(self.linear, dynamics, delay_ticks, self.reference)
 
 
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
     """Of every axis, in their order; what is wrong with one goes to `findings`."""
-    found, period_s = list[AxisCheck](), 1.0 / configuration.loop.rate_hz
+    found = list[AxisCheck]()
     for number, axis in enumerate(configuration.axes):
         if len(configuration.together(number)) == 1:
-            found.append(_check(axis, period_s, findings))
+            found.append(_check(configuration, axis, findings))
         elif number == configuration.owners[number]:
-            found += _check_together(configuration, number, period_s, findings)
+            found += _check_together(configuration, number, findings)
         law = found[-1].law
         if law is not None and number == configuration.owners[number]:
             owned = [configuration.axes[i].name for i in configuration.together(number)]
@@ -113,13 +117,21 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
     return found
 
 
-def _check(axis: AxisOptions, period_s: float, findings: Findings) -> AxisCheck:
+def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
+    """Samples of delay in an axis's loop: what its model says, and no fewer than the simulated rig has."""
+    options = configuration.driver_options
+    of_rig = options.latency_ticks if configuration.driver_kind == "sim" and isinstance(options, RigOptions) else 0
+    return max(of_rig, 0 if axis.model is None else axis.model.delay_ticks)
+
+
+def _check(configuration: Configuration, axis: AxisOptions, findings: Findings) -> AxisCheck:
     """The controller, C(z)'s agreement with C(s), and the loop on the axis's model as far as the law is linear."""
+    delay, period_s = delay_ticks(configuration, axis), 1.0 / configuration.loop.rate_hz
     if axis.controller is None:
         return AxisCheck(axis.name)
     where, linear = f"axis.{axis.name}.controller", None
     law = controller_of(axis, period_s)
-    check = AxisCheck(axis.name, law)
+    check = AxisCheck(axis.name, law, delay_ticks=delay, reference=axis.prefilter.path())
     if isinstance(law, TransferController):
         with findings.at(f"{where}: "):
             linear, transfer = law.discrete, law.options.transfer()
@@ -138,14 +150,13 @@ def _check(axis: AxisOptions, period_s: float, findings: Findings) -> AxisCheck:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
         return replace(check, linear=linear)
     plant, continuous, running = axis.model.transfer(), None, None
+    check = replace(check, linear=linear)
     with findings.at(f"axis.{axis.name}.model: "):
         continuous = None if check.controller is None else analyse_continuous(check.controller, plant)
-        running = analyse_discrete(linear, plant, axis.model.delay_ticks)
+        running = analyse(check.loop(plant, delay), delay)
     if running is not None:
         _require_stable(running, axis.controller, where, f"axis.{axis.name}.model", findings)
-    return replace(
-        check, linear=linear, plant=plant, delay_ticks=axis.model.delay_ticks, continuous=continuous, running=running
-    )
+    return replace(check, plant=plant, continuous=continuous, running=running)
 
 
 def _require_stable(
@@ -163,15 +174,25 @@ def _require_stable(
         findings.faults.append(f"{message_}; allow_unstable = true runs it all the same")
 
 
-def _check_together(configuration: Configuration, number: int, period_s: float, findings: Findings) -> list[AxisCheck]:
+def _check_together(configuration: Configuration, number: int, findings: Findings) -> list[AxisCheck]:
     """Of axes that share the controller of axis `number`: each one's loop broken alone, and all of them at once."""
     axes = [configuration.axes[i] for i in configuration.together(number)]
     names, options, where = tuple(axis.name for axis in axes), axes[0].controller, f"axis.{axes[0].name}.controller"
-    law = controller_of(axes[0], period_s, [axis.model for axis in axes])
+    law = controller_of(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
     assert isinstance(law, CoupledController)
     assert options is not None
-    checks = [AxisCheck(name, law, together=Together(names, place, law)) for place, name in enumerate(names)]
-    linear, plant, loop = None, _coupled_plant(axes, findings), None
+    delays = [delay_ticks(configuration, axis) for axis in axes]
+    checks = [
+        AxisCheck(
+            axis.name,
+            law,
+            delay_ticks=delay,
+            reference=axis.prefilter.path(),
+            together=Together(names, place, law),
+        )
+        for place, (axis, delay) in enumerate(zip(axes, delays, strict=True))
+    ]
+    linear, plant, loop = None, _coupled_plant(axes, delays, findings), None
     try:
         linear = linear_part(law)
     except ValueError as error:
@@ -186,22 +207,14 @@ def _check_together(configuration: Configuration, number: int, period_s: float, 
         return checks
     margins, found = loop.margins, []
     for place, check in enumerate(checks):
-        running = analyse(loop.alone(place), plant.delay_ticks[place])
+        running = analyse(loop.alone(place, check.reference), check.delay_ticks)
         together = Together(names, place, law, linear, plant, margins)
-        found.append(
-            replace(
-                check,
-                plant=plant.dynamics[place],
-                delay_ticks=plant.delay_ticks[place],
-                running=running,
-                together=together,
-            )
-        )
+        found.append(replace(check, plant=plant.dynamics[place], running=running, together=together))
     _require_stable(found[0].running, options, where, f"the models of {', '.join(names)}", findings)
     return found
 
 
-def _coupled_plant(axes: Sequence[AxisOptions], findings: Findings) -> CoupledPlant | None:
+def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings: Findings) -> CoupledPlant | None:
     """The plant of axes that have a model each, None where one has none."""
     models = [axis.model for axis in axes if axis.model is not None]
     names = [axis.name for axis in axes]
@@ -215,6 +228,6 @@ def _coupled_plant(axes: Sequence[AxisOptions], findings: Findings) -> CoupledPl
         return None
     return CoupledPlant(
         tuple(model.transfer() for model in models),
-        tuple(model.delay_ticks for model in models),
+        tuple(delays),
         coupling_matrix(names, [model.coupling for model in models]),
     )

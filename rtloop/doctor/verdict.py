@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.analysis.margins import delay_tolerated
 from rtloop.configuration.prepare import Prepared
 from rtloop.doctor.examine import Examination, Latency
@@ -30,9 +29,9 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     """For each axis that has a controller and a model: 360° · f · lateness."""
     delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
     for check in prepared.checks:
-        if check.linear is None or check.plant is None or check.running is None or not check.running.stable:
+        if check.plant is None or check.running is None or not check.running.stable:
             continue
-        loop = discrete_loop(check.linear, check.plant, check.running.delay_ticks)
+        loop = check.loop(check.plant, check.delay_ticks)
         tolerated_s, hz = delay_tolerated(loop)
         p50_deg, p99_deg = (360 * hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
         delays.append(AxisDelay(check.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))

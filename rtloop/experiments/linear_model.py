@@ -1,6 +1,8 @@
 """What the configuration promises of an axis: [axis.model] behind hold and delay, and the loop that C(z) makes of it.
 
-    P(z)   plant, held and delayed        L = C P,   S = 1/(1 + L),   T = L S,   F the pre-filter: x = T F x_d
+    P(z)   plant, held and delayed        L = C P,   S = 1/(1 + L),   T = L S,   F_x, F_v the pre-filter:
+
+    x = (T F_x + P S F_v) x_d
 
 Linear throughout: what the hysteresis leaves is not in it, and is part of what an experiment finds.
 """
@@ -12,10 +14,11 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
+from rtloop.analysis.closed_loop import Loop, discrete_loop
+from rtloop.analysis.held_plant import held_plant
 from rtloop.analysis.perturbation import Range, changes, lightest_pair, maker, until_unstable, with_resonance_shifted
 from rtloop.analysis.step_response import step_metrics
-from rtloop.configuration.axis import AxisOptions, ModelOptions, PrefilterOptions
+from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.coefficients import controller_of
 from rtloop.hil.modal import Complex, Real
 from rtloop.laws.linearise import linear_part
@@ -32,14 +35,13 @@ class LinearModel:
         self.rate_hz = rate_hz
         self.dynamics = model.transfer()
         self._delay_ticks = model.delay_ticks
-        self._prefilter = axis.prefilter
-        self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
+        self._plant = held_plant(self.dynamics, 1 / rate_hz, model.delay_ticks).system
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
         shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
         if not shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
-            loop = discrete_loop(controller, self.dynamics, model.delay_ticks)
+            loop = discrete_loop(controller, self.dynamics, model.delay_ticks, axis.prefilter.path())
             self.loop = loop if loop.is_stable else None
 
     @property
@@ -62,11 +64,8 @@ class LinearModel:
         return self._plant.response(np.exp(2j * np.pi * np.atleast_1d(hz) / self.rate_hz))
 
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
-        """T·F at frequencies (k,) in Hz."""
-        if self.loop is None:
-            return None
-        opened = self.loop.open(hz)
-        return opened / (1 + opened) * _prefilter(self._prefilter, np.atleast_1d(hz) / self.rate_hz)
+        """From the reference to the position, at frequencies (k,) in Hz."""
+        return None if self.loop is None else self.loop.from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
         """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz."""
@@ -76,18 +75,21 @@ class LinearModel:
         """Position (n,) at each tick for a command (n,), from rest and without a controller."""
         return simulated(*self._plant, command)[0]
 
-    def closed_answer(self, filtered_reference: Real) -> tuple[Real, Real] | None:
-        """Position and command (n,) at each tick for a reference (n,) behind the pre-filter, from rest."""
+    def closed_answer(self, reference: Real) -> tuple[Real, Real] | None:
+        """Position and command (n,) at each tick for a reference (n,), from rest."""
         if self.loop is None:
             return None
-        position, command = simulated(*self.loop.matrices, filtered_reference)
-        return position, command
+        a, b, c, d = self.loop.matrices
+        path = self.loop.reference
+        answer = simulated(a, b, c, d, path.toward_error(reference))
+        if path.commands:
+            answer += simulated(a, self.loop.injection.b, c, np.array([0.0, 1.0]), path.toward_command(reference))
+        return answer[0], answer[1]
 
     def left_of(self, disturbance: Real) -> Real | None:
         """Position (n,) that the loop at rest leaves of a disturbance (n,) before the dynamics: d − T d, d = D Ω."""
-        moved = simulated(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
-        answer = self.closed_answer(moved)
-        return None if answer is None else moved - answer[0]
+        moved = simulated(*held_plant(self.dynamics, 1 / self.rate_hz).system, disturbance)[0]
+        return None if self.loop is None else moved - simulated(*self.loop.matrices, moved)[0]
 
     @cached_property
     def step_peak(self) -> float | None:
@@ -97,7 +99,7 @@ class LinearModel:
     @cached_property
     def sine_peak(self) -> float | None:
         """Largest command per amplitude of a sine of the reference, at any frequency."""
-        return None if self.loop is None else float(self.loop.command_sensitivity(self.loop.frequencies).max())
+        return None if self.loop is None else float(np.abs(self.loop.from_reference(self.loop.frequencies)[1]).max())
 
     @cached_property
     def tracking_peak(self) -> float | None:
@@ -145,12 +147,3 @@ def simulated(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
     for k, value in enumerate(values.tolist()):
         states[k + 1] = a @ states[k] + b * value
     return np.atleast_2d(c) @ states[:-1].T + np.outer(d, values)
-
-
-def _prefilter(options: PrefilterOptions, turns_per_tick: Real) -> Complex:
-    """F at frequencies (k,): taps, then the sections [b0, b1, b2, a1, a2]."""
-    back = np.exp(-2j * np.pi * turns_per_tick)
-    found = np.polyval(options.taps[::-1], back) if options.taps else np.ones_like(back)
-    for b0, b1, b2, a1, a2 in options.sections:
-        found = found * (b0 + b1 * back + b2 * back**2) / (1 + a1 * back + a2 * back**2)
-    return np.asarray(found, dtype=complex)

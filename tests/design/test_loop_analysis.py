@@ -8,6 +8,7 @@ import pytest
 from scipy import linalg
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
+from rtloop.analysis.held_plant import POINTS
 from rtloop.analysis.loop_analysis import (
     analyse_continuous,
     analyse_discrete,
@@ -108,8 +109,8 @@ def test_discrete_step_equals_a_simulation_tick_by_tick() -> None:
     loop = discrete_loop(discretise(Transfer.from_factors(2, [], [[1, 0]]), 1e-3, "tustin"),
                          Transfer.from_factors(9e4, [], [[1, 40, 9e4]]), 2)  # fmt: skip
     response = step_response(loop, 0.199)
-    assert response.position[:200] == pytest.approx(positions, abs=1e-12)
-    assert response.command[:200] == pytest.approx(commands, abs=1e-12)
+    assert response.position[::POINTS] == pytest.approx(positions, abs=1e-12)
+    assert response.command[::POINTS] == pytest.approx(commands, abs=1e-12)
 
 
 def test_integral_control_of_a_lag() -> None:

@@ -60,9 +60,10 @@ def test_answers_to_a_step(model: LinearModel) -> None:
     assert model.open_overshoot == pytest.approx(opened.max(), abs=1e-9)
     answer = model.closed_answer(STEP)
     assert answer is not None
-    position = signal.lfilter(above, closed, STEP)
+    filtered = signal.lfilter(TAPS, 1.0, STEP)
+    position = signal.lfilter(above, closed, filtered)
     np.testing.assert_allclose(answer[0], position, atol=1e-9)
-    command = signal.lfilter(np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), plant()[1]), closed, STEP)
+    command = signal.lfilter(np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), plant()[1]), closed, filtered)
     np.testing.assert_allclose(answer[1], command, atol=1e-9)
 
 

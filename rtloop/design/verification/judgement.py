@@ -47,7 +47,7 @@ def specified(loop: Loop, asked: SpecificationOptions) -> dict[str, float]:
         return dict.fromkeys((*SPECIFIED, *(["disturbance_hz"] if asked.disturbance else [])), math.nan)
     step = step_metrics(loop, ())
     found = {
-        "static_error_percent": 100 * abs(1 / (1 + loop.static_gain)),
+        "static_error_percent": step.static_error_percent,
         "settling_ms": 1e3 * step.settling_time_s,
         "overshoot_percent": step.overshoot_percent,
         "peak_command": step.peak_command,

@@ -60,15 +60,13 @@ class Step(NamedTuple):
 def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
     """Overshoot, settling and static error of every step; the middle one of each stands in the verdicts."""
     (taken,) = recordings
-    reference, error, position, command, drive = taken.read(
-        "reference_um", "error_um", "position_um", "command_um", "drive_v"
-    )
+    reference, position, command, drive = taken.read("reference_um", "position_um", "command_um", "drive_v")
     found = _steps(taken, reference, position, command)
     if not found:
         raise UnsuitableData("no level differs from the one before, or none is held for long enough")
     middle = np.median([one.numbers for one in found], axis=0)
     start = taken.labelled("rest")[0].start_tick
-    answer = taken.model.closed_answer((error + position)[start:]) if taken.model else None
+    answer = taken.model.closed_answer(reference[start:]) if taken.model else None
     modelled: list[Step] = []
     if answer is not None:
         answer = np.concatenate([np.zeros((2, start)), answer], axis=1)

@@ -1,0 +1,53 @@
+"""A plant behind a zero-order hold: from sample to sample, and exactly in between.
+
+The input stands still for a period, so that an eighth of it after a sample the state is that of the plant held for an
+eighth: x(kT + jT/8) = c Aʲ x_k + Σ_{i<j} c Aⁱ b u_k, with A and b of T/8.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.linear.discretise import held
+from rtloop.linear.realisation import System
+from rtloop.linear.transfer import Transfer
+
+POINTS = 8
+"""Of time within a period at which a position is known, that of the sample included."""
+
+
+class Between(NamedTuple):
+    """Positions at the `POINTS` of a period: `rows` (POINTS, n) on the states, `direct` (POINTS,) on the input."""
+
+    rows: Real
+    direct: Real
+
+
+class HeldPlant(NamedTuple):
+    """From sample to sample, and the positions between, of the same states."""
+
+    system: System
+    between: Between
+
+
+def held_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
+    """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
+    if delay_ticks < 0:
+        raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
+    fine = held(plant, period_s / POINTS)
+    row, state, moved = fine.c, np.eye(fine.b.size), np.zeros_like(fine.b)
+    rows, direct = [], []
+    for _ in range(POINTS):
+        rows.append(row @ state)
+        direct.append(float(row @ moved))
+        state, moved = fine.a @ state, fine.a @ moved + fine.b
+    found, between = System(state, moved, row, fine.d), Between(np.array(rows), np.array(direct))
+    for _ in range(delay_ticks):
+        n = found.b.size
+        a = np.block([[found.a, found.b[:, None]], [np.zeros((1, n + 1))]])
+        between = Between(np.hstack([between.rows, between.direct[:, None]]), np.zeros(POINTS))
+        found = System(a, np.eye(n + 1)[-1], np.append(found.c, 0.0), 0.0)
+    return HeldPlant(found, between)

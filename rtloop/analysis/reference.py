@@ -1,0 +1,61 @@
+"""What a reference passes on its way into a loop: taps and sections toward the error, taps toward the command.
+
+v[k] = Σ f_v[i]·r[k−i] + C(z)·( F_x(z)·r[k] − x[k] ),     F_x = Σ f_x[i] z^−i · sections
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter, sosfilt
+
+from rtloop.hil.modal import Complex, Real
+
+FORGOTTEN = 1e-12
+"""A section's memory counts until this part of it is left."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePath:
+    """`taps` are f_x, `command_taps` f_v, `sections` (k, 5) rows b0, b1, b2, a1, a2; by default the reference as it is."""
+
+    taps: Real = field(default_factory=lambda: np.ones(1))
+    command_taps: Real = field(default_factory=lambda: np.empty(0))
+    sections: Real = field(default_factory=lambda: np.empty((0, 5)))
+
+    @property
+    def commands(self) -> bool:
+        """Whether the reference goes past the controller, too."""
+        return bool(np.any(self.command_taps))
+
+    @property
+    def ticks(self) -> int:
+        """Until its answer to a step stands still."""
+        poles = [np.abs(np.roots([1.0, *section[3:]])).max(initial=0.0) for section in self.sections]
+        slowest = max(poles, default=0.0)
+        ringing = np.log(FORGOTTEN) / np.log(slowest) if 0 < slowest < 1 else 2.0
+        return max(self.taps.size, self.command_taps.size) + len(self.sections) * int(np.ceil(ringing))
+
+    def toward_error(self, values: npt.ArrayLike) -> Real:
+        """Values (…, ticks) behind taps and sections, from rest."""
+        found = lfilter(self.taps, 1.0, values)
+        if len(self.sections):
+            found = sosfilt(np.insert(self.sections, 3, 1.0, axis=1), found)
+        return np.asarray(found, np.float64)
+
+    def toward_command(self, values: npt.ArrayLike) -> Real:
+        """Values (…, ticks) behind the command's taps, from rest."""
+        return np.asarray(lfilter(self.command_taps, 1.0, values), np.float64)
+
+    def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
+        """F_x and F_v at points (k,) of the z plane."""
+        back = 1 / np.atleast_1d(np.asarray(points, complex))
+        found = np.polyval(self.taps[::-1], back)
+        for b0, b1, b2, a1, a2 in self.sections:
+            found = found * (b0 + b1 * back + b2 * back**2) / (1 + a1 * back + a2 * back**2)
+        return np.asarray(found, complex), np.polyval(self.command_taps[::-1], back) + 0j * back
+
+
+AS_IT_IS = ReferencePath()

@@ -1,0 +1,142 @@
+"""The loop as it runs, with taps, sections and delay, between ticks too: against a simulation in tiny steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import linalg, signal
+
+from rtloop.analysis.closed_loop import Loop, discrete_loop
+from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant
+from rtloop.analysis.held_plant import POINTS
+from rtloop.analysis.reference import ReferencePath
+from rtloop.analysis.step_response import step_metrics, step_response
+from rtloop.linear.discretise import discretise
+from rtloop.linear.realisation import System
+from rtloop.linear.sampled import Sampled
+from rtloop.linear.together import SampledTogether, SystemTogether
+from rtloop.linear.transfer import Transfer
+
+PERIOD_S, OMEGA, ZETA, KI, KP = 1e-3, 2 * np.pi * 90.0, 0.1, 30.0, 0.05
+PLANT = Transfer.from_factors(OMEGA**2, [], [[1.0, 2 * ZETA * OMEGA, OMEGA**2]])
+TAPS, COMMAND_TAPS = np.array([0.2, 0.5, 0.0, 0.25]), np.array([0.7, -0.4, 0.0, 0.0, 0.1])
+SECTION = [0.2, 0.1, 0.05, -0.9, 0.25]
+TICKS = 500
+
+
+def controller() -> Sampled:
+    """v = KP e + KI T Σ e up to the tick before."""
+    return Sampled(System(np.eye(1), np.ones(1), np.array([KI * PERIOD_S]), KP), PERIOD_S)
+
+
+def by_hand(
+    delay_ticks: int, path: tuple[np.ndarray, np.ndarray, list[float] | None], plants: int = 1, cross: float = 0.0
+):
+    """Positions (POINTS·TICKS,) of axis 0 and its commands (TICKS,) after a unit step there, by expm of T/POINTS.
+
+    Of two `plants` each one's input takes `cross` of the other one's command; the other's loop is closed, too.
+    """
+    a = np.array([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]])
+    grown = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) * PERIOD_S / POINTS)
+    taps, command_taps, section = path
+    step = np.ones(TICKS)
+    wanted = signal.lfilter(taps, 1.0, step)
+    if section is not None:
+        wanted = signal.lfilter(section[:3], [1.0, *section[3:]], wanted)
+    direct = signal.lfilter(command_taps, 1.0, step) if command_taps.size else 0 * step
+    states, sums = np.zeros((plants, 2)), np.zeros(plants)
+    queues = [[0.0] * delay_ticks for _ in range(plants)]
+    positions, commands = [], []
+    for k in range(TICKS):
+        errors = np.array([wanted[k] if i == 0 else 0.0 for i in range(plants)]) - states[:, 0]
+        v = KP * errors + KI * PERIOD_S * sums
+        v[0] += direct[k]
+        sums += errors
+        commands.append(v[0])
+        held = v + cross * (v.sum() - v) if plants > 1 else v
+        for i in range(plants):
+            queues[i].append(held[i])
+        now = np.array([queue.pop(0) for queue in queues])
+        for _ in range(POINTS):
+            positions.append(states[0, 0])
+            states = states @ grown[:2, :2].T + np.outer(now, grown[:2, 2])
+    return np.array(positions), np.array(commands)
+
+
+PATHS = [
+    (np.ones(1), np.empty(0), None),
+    (TAPS, np.empty(0), SECTION),
+    (TAPS, COMMAND_TAPS, None),
+    (TAPS, COMMAND_TAPS, SECTION),
+]
+
+
+def path_of(taps: np.ndarray, command_taps: np.ndarray, section: list[float] | None) -> ReferencePath:
+    return ReferencePath(taps, command_taps, np.array([section] if section else []).reshape(-1, 5))
+
+
+@pytest.mark.parametrize("delay_ticks", [0, 1, 3])
+@pytest.mark.parametrize("path", PATHS)
+def test_steps_of_the_loop_as_it_runs(path, delay_ticks: int) -> None:
+    loop = discrete_loop(controller(), PLANT, delay_ticks, path_of(*path))
+    assert loop.is_stable
+    positions, commands = by_hand(delay_ticks, path)
+    found = step_response(loop, (TICKS - 1) * PERIOD_S)
+    np.testing.assert_allclose(found.position, positions, atol=1e-11)
+    np.testing.assert_allclose(found.command[::POINTS], commands, atol=1e-11)
+    np.testing.assert_allclose(found.time_s, np.arange(TICKS * POINTS) * PERIOD_S / POINTS, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay_ticks", [0, 2])
+@pytest.mark.parametrize("path", PATHS)
+def test_steps_of_one_of_two_coupled_axes(path, delay_ticks: int) -> None:
+    cross = 0.2
+    one = controller().system
+    both = SystemTogether(np.eye(2), np.eye(2), KI * PERIOD_S * np.eye(2), KP * np.eye(2))
+    assert one.d == both.d[0, 0]
+    plant = CoupledPlant((PLANT, PLANT), (delay_ticks,) * 2, np.array([[1.0, cross], [cross, 1.0]]))
+    loop = CoupledLoop(SampledTogether(both, PERIOD_S), plant).alone(0, path_of(*path))
+    assert loop.is_stable
+    positions, commands = by_hand(delay_ticks, path, 2, cross)
+    found = step_response(loop, (TICKS - 1) * PERIOD_S)
+    np.testing.assert_allclose(found.position, positions, atol=1e-11)
+    np.testing.assert_allclose(found.command[::POINTS], commands, atol=1e-11)
+
+
+def settled(path) -> Loop:
+    return discrete_loop(controller(), PLANT, 1, path_of(*path))
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_figures_of_a_step_are_those_between_ticks(path) -> None:
+    """An integrator: the final value is that of the error's path, and nothing of the command's."""
+    positions, commands = by_hand(1, path)
+    taps, _, section = path
+    final = taps.sum() * (1.0 if section is None else sum(section[:3]) / (1 + sum(section[3:])))
+    found = step_metrics(settled(path), ())
+    assert found.static_error_percent == pytest.approx(100 * abs(1 - final), abs=1e-8)
+    assert found.overshoot_percent == pytest.approx(100 * max(0.0, positions.max() / final - 1), abs=1e-3)
+    assert found.peak_command == pytest.approx(np.abs(commands).max(), abs=1e-6)
+    outside = np.flatnonzero(np.abs(positions - final) > 0.05 * final)[-1]
+    assert found.settling_time_s == pytest.approx((outside + 0.5) * PERIOD_S / POINTS, abs=0.51 * PERIOD_S / POINTS)
+
+
+def test_without_an_integrator_the_command_path_moves_the_final_value() -> None:
+    """P-control, K = 2, of D(0) = 1: x = (K F_x + F_v)/(1 + K)."""
+    loop = discrete_loop(discretise(Transfer.from_zpk([], [], 2.0), PERIOD_S), Transfer.from_zpk([], [-50.0], 50.0), 0,
+                         ReferencePath(np.array([0.5, 0.4]), np.array([0.9, 0.2])))  # fmt: skip
+    assert loop.final == pytest.approx(((2 * 0.9 + 1.1) / 3, 2 * (0.9 - (2 * 0.9 + 1.1) / 3) + 1.1))
+    assert step_metrics(loop, ()).static_error_percent == pytest.approx(100 * abs(1 - 2.9 / 3))
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_responses_to_the_reference_are_those_of_its_step(path) -> None:
+    """The z-transform of the differences of a step's answer."""
+    loop, hz = settled(path), np.array([1.0, 30.0, 88.0, 300.0])
+    positions, commands = by_hand(1, path)
+    tail = TICKS + 1  # what is left after so many ticks is far below the tolerance of a decayed answer
+    back = np.exp(-2j * np.pi * hz[:, None] * PERIOD_S * np.arange(tail - 1))
+    position, command = loop.from_reference(hz)
+    for found, answer, final in ((position, positions[::POINTS], loop.final[0]), (command, commands, loop.final[1])):
+        assert abs(answer[-1] - final) < 1e-3
+        np.testing.assert_allclose(found, (np.diff(answer, prepend=0.0) * back).sum(axis=1), atol=5e-3)
