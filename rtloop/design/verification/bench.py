@@ -1,0 +1,154 @@
+"""A configuration on a simulated rig, run in this process and in virtual time by the very loop that would run it.
+
+A rig that is configured is taken as it is. In place of hardware stands what is known of it: the dynamics of the axis's
+model behind its delay, its own model of the hysteresis, and the sensor of its specification. What identification left
+of the hysteresis is not known here; `residual_percent` puts as much of it back.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.configuration.axis import AxisOptions, HoldOptions, ModelOptions, StepsOptions
+from rtloop.configuration.checks import delay_ticks
+from rtloop.configuration.file import ChannelOptions, Configuration
+from rtloop.configuration.prepare import prepare
+from rtloop.configuration.references import TableOfSamples, generator_values
+from rtloop.hysteresis.leftover import with_hysteresis_left
+from rtloop.engine.assembly import Assembly, law_at_rest
+from rtloop.engine.clock import clock_context, unpaced_clock
+from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.plan import Plan
+from rtloop.hil.modal import Real
+from rtloop.hil.options import (
+    BoardOptions,
+    DynamicsOptions,
+    HysteresisOptions,
+    PlantOptions,
+    RigOptions,
+    SensorOptions,
+)
+from rtloop.signals import Mode
+
+SMALLEST_RING_HZ = 1.0
+UNLIMITED_SLACK = 1 << 62
+
+
+class Stand(NamedTuple):
+    """What is known of an axis beside its configuration: its plant, white noise (µm rms) and resolution of its sensor,
+    and how much hysteresis its inverse leaves (h/H in percent, 0 where nobody says).
+    """
+
+    model: ModelOptions | None
+    noise_um: float
+    resolution_um: float
+    bandwidth_hz: float | None
+    residual_percent: float
+
+
+class Bench:
+    """Runs steps of one axis, the others at rest. Raises ValueError where no rig can stand for the hardware, and
+    ConfigError for what cannot run at all."""
+
+    def __init__(self, configuration: Configuration, stands: Mapping[str, Stand]) -> None:
+        self.is_configured = configuration.driver_kind == "sim" or isinstance(configuration.driver_options, BoardOptions)
+        on_rig = _on_rig(configuration, stands, self.is_configured)
+        plan = prepare(on_rig, paced=False).plan
+        self._plan = replace(plan, mode=Mode.CLOSED_LOOP)
+        assert isinstance(on_rig.driver_options, RigOptions)
+        self.rig, self.rate_hz = on_rig.driver_options, plan.pacing.rate_hz
+
+    def run(self, axis: str, levels_um: Sequence[float], dwell_s: float) -> dict[str, Real]:
+        """Every column of a record, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`."""
+        table, generators = TableOfSamples(), self._plan.generators.copy()
+        steps = StepsOptions(kind="steps", levels=tuple(levels_um), dwell_s=dwell_s, repeat=False)
+        values = generator_values(steps, self.rate_hz, (), Path(), table)
+        number = self._plan.axes.index(axis)
+        generators["kind"][number] = values[0]
+        generators["parameters"][number, : len(values) - 1] = values[1:]
+        ticks = round(dwell_s * self.rate_hz) * len(levels_um)
+        plan = replace(self._plan, generators=generators, table=table.samples, ticks=ticks)
+        return dict(zip(plan.columns, _records(plan, ticks).T, strict=True))
+
+
+def _records(plan: Plan, ticks: int) -> Real:
+    """What the loop recorded, (ticks, columns); no process, no clock, no file."""
+    driver, context = plan.driver(), clock_context(plan.pacing.rate_hz)
+    block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
+    try:
+        ring = block.ring("ticks")
+        clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
+        assembly = Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan))
+        found, room = np.empty((ticks, len(plan.columns))), len(ring.slots)
+        for first in range(0, ticks, room):
+            assembly.run(min(first + room, ticks))
+            count = int(assembly.loop.tick) - first
+            found[first : first + count] = ring.slots[:count]
+        driver.close()
+        return found[: int(assembly.loop.tick)]
+    finally:
+        os.close(block.fd)
+
+
+def _on_rig(configuration: Configuration, stands: Mapping[str, Stand], is_configured: bool) -> Configuration:
+    """The configuration in closed loop, at rest, on a rig. Raises ValueError for what no rig has."""
+    loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
+    axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)
+    changed = replace(configuration, loop=loop, axes=axes, schedule=())
+    if configuration.driver_kind == "sim":
+        return changed
+    if configuration.inputs or configuration.outputs:
+        raise ValueError("it has channels beside those of its axes, and no rig answers them")
+    given: Any = configuration.driver_options
+    channels = {}
+    for number, axis in enumerate(axes):
+        scale = abs(configuration.channels[axis.name].um_per_v)
+        channels[axis.name] = ChannelOptions(input=f"adc{number}", output=f"dac{number}", um_per_v=scale)
+    if is_configured:
+        rig = RigOptions(**{name: getattr(given, name) for name in RigOptions.model_fields})
+    else:
+        coupling = {axis.name: axis.model.coupling for axis in axes if axis.model and axis.model.coupling}
+        rig = RigOptions(
+            plants={
+                axis.name: _plant(axis, stands[axis.name], channels[axis.name].um_per_v)
+                for axis in axes
+                if axis.name in stands
+            },
+            latency_ticks=max(delay_ticks(configuration, axis) for axis in axes),
+            coupling=coupling,
+        )
+    return replace(changed, driver_kind="sim", driver_options=rig, channels=channels)
+
+
+def _plant(axis: AxisOptions, stand: Stand, um_per_v: float) -> PlantOptions:
+    """What stands for an axis's hardware. Raises ValueError without a model."""
+    model = stand.model
+    if model is None:
+        raise ValueError(f"axis.{axis.name}.model: missing; nothing can stand for its hardware")
+    plant, actuator = model.transfer(), with_hysteresis_left(axis.feedforward.actuator(), stand.residual_percent,
+                                                             axis.limits.drive_v)  # fmt: skip
+    return PlantOptions(
+        hysteresis=HysteresisOptions(
+            truth="custom",
+            thresholds_v=tuple(actuator.thresholds.tolist()),
+            weights_um_per_v=tuple(actuator.weights.tolist()),
+        ),
+        dynamics=DynamicsOptions(
+            form="zpk",
+            gain=plant.gain,
+            zeros=tuple((root.real, root.imag) for root in plant.zeros.tolist()),
+            poles=tuple((root.real, root.imag) for root in plant.poles.tolist()),
+        ),
+        sensor=SensorOptions(
+            um_per_v=um_per_v,
+            noise_um=stand.noise_um,
+            resolution_um=stand.resolution_um,
+            bandwidth_hz=stand.bandwidth_hz,
+        ),
+    )

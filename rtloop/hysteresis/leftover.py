@@ -1,0 +1,47 @@
+"""An actuator that differs from its model by as much hysteresis as an inverse is known to leave.
+
+What is put in is a play of half the drive's range against the first one, δ·(2 F_{U/2} − F_{r_0}): full drives reach what
+they reached, and in between a loop is left.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+
+from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.plays import loading_curve, model_output
+from rtloop.laws.shipped.play_model import PlayModel
+
+SAMPLES, CYCLES = 2000, 2.5
+LARGEST_SHARE = 0.5
+"""δ as a part of the model's mean slope: beyond it the actuator is not that of the model any more."""
+
+
+def with_hysteresis_left(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
+    """The model changed so that its inverse leaves a loop of h/H = `percent` over ±`drive_v`; itself for 0.
+
+    Raises ValueError where that is less than its own dead band leaves, or more than can be put in.
+    """
+    if percent == 0:
+        return model
+    reach_um = float(loading_curve(model, drive_v))
+    command_um = reach_um * np.sin(np.linspace(0, 2 * np.pi * CYCLES, round(SAMPLES * CYCLES)))
+    drives_v = np.clip(model_output(model.without_dead_band().inverse(), command_um), -drive_v, drive_v)
+
+    def left(share: float) -> float:
+        return loop_shape(command_um, model_output(_changed(model, share, drive_v), drives_v)).percent
+
+    least, most = left(0.0), left(LARGEST_SHARE)
+    if not least < percent < most:
+        raise ValueError(f"residual_percent: {percent:g}; above {least:.3g} and below {most:.3g} are allowed here")
+    return _changed(model, float(brentq(lambda share: left(share) - percent, 0.0, LARGEST_SHARE, xtol=1e-5)), drive_v)
+
+
+def _changed(model: PlayModel, share: float, drive_v: float) -> PlayModel:
+    added = share * float(loading_curve(model, drive_v)) / drive_v
+    thresholds, place = np.unique(np.append(model.thresholds, 0.5 * drive_v), return_inverse=True)
+    weights = np.zeros(thresholds.size)
+    np.add.at(weights, place, np.append(model.weights, 2 * added))
+    weights[0] -= added
+    return PlayModel(thresholds, weights)
