@@ -1,7 +1,7 @@
 """What a loop is asked to do, and the weights that follow from it: the models of SPEC.toml.
 
 [plant]  [specification]  [specification.disturbance]  [specification.command]  [specification.claims]
-[sensor]  [weights]  [synthesis]  [controller]
+[sensor]  [weights]  [synthesis]  [controller]  [scenarios]  [robust]  [shape]  [shape.scenarios]
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from rtloop.configuration.axis import ModelOptions
+from rtloop.design.robust.options import RobustOptions, ScenarioOptions, ShapeOptions
 from rtloop.design.synthesis.weights import (
     DisturbanceRule,
     Weights,
@@ -202,6 +203,9 @@ class DesignOptions(Options):
     weights: WeightOptions = WeightOptions()
     synthesis: SynthesisOptions = SynthesisOptions()
     controller: OutputOptions = OutputOptions()
+    scenarios: ScenarioOptions = ScenarioOptions()
+    robust: RobustOptions = RobustOptions()
+    shape: ShapeOptions = ShapeOptions()
 
 
 def weights_of(design: DesignOptions) -> Weights:

@@ -1,0 +1,101 @@
+"""Proof of what a search has found, by other means: each loop put together as it runs, poles and |S| of each by itself.
+
+The search sees a grid of scenarios and of frequencies; here are lines through all of them, and plants drawn at random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+
+from rtloop.analysis.closed_loop import Loop, discrete_loop
+from rtloop.analysis.margins import margins
+from rtloop.design.robust.objective import BAND, Walls
+from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.linear.discretise import DiscreteController
+
+SWEPT, DRAWN = 41, 200
+
+
+class Worst(NamedTuple):
+    """A value and where it was found."""
+
+    value: float
+    scenario: Scenario
+
+
+class Certificate(NamedTuple):
+    """The worst of `count` plants: stable or not, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
+
+    count: int
+    radius: Worst
+    decay_ms: Worst
+    sensitivity: Worst
+    disturbance: Worst
+    noise_gain: Worst
+
+    @property
+    def is_stable(self) -> bool:
+        """Every loop is."""
+        return self.radius.value < 1
+
+    def missed(self, walls: Walls, decay_ms: float | None) -> list[str]:
+        """What is not kept, in words; nothing where all is."""
+        if not self.is_stable:
+            return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]
+        asked = [
+            ("max |S|", self.sensitivity, walls.sensitivity),
+            (f"|S| at {walls.disturbance_hz:g} Hz", self.disturbance, walls.disturbance),
+            ("noise gain into v", self.noise_gain, walls.noise_gain),
+            ("slowest mode around a resonance, in ms,", self.decay_ms, decay_ms or math.inf),
+        ]
+        return [
+            f"{name} is {found.value:.4g} with {found.scenario}; at most {limit:.4g} is asked for"
+            for name, found, limit in asked
+            if found.value > limit * (1 + 1e-9)
+        ]
+
+    def worst(self) -> list[Scenario]:
+        """The scenarios that are worst in something, each once."""
+        return list(dict.fromkeys(found.scenario for found in self[1:]))
+
+
+def certified(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
+    """Of a controller, over sweeps and random draws of a family's plants."""
+    scenarios = dict.fromkeys([*family.corners(), *family.swept(SWEPT), *family.drawn(DRAWN, seed)])
+    found = {scenario: _measured(controller, family, walls, scenario) for scenario in scenarios}
+    worst = [Worst(*max((values[i], scenario) for scenario, values in found.items())) for i in range(5)]
+    return Certificate(len(found), *worst)
+
+
+def slowest_ms(loop: Loop, bands: Iterable[float]) -> float:
+    """Time constant in ms of the slowest closed-loop mode in BAND around one of the frequencies (rad/s); 0 for none."""
+    sizes, middle = np.abs(loop.rates.imag), list(bands)
+    counted = np.zeros(sizes.shape, bool) if middle else np.ones(sizes.shape, bool)
+    for size in middle:
+        counted |= (sizes > BAND[0] * size) & (sizes < BAND[1] * size)
+    return float(np.max(-1e3 / loop.rates.real[counted], initial=0.0)) if loop.is_stable else math.inf
+
+
+def noise_gain(loop: Loop) -> float:
+    """rms of v per rms of white noise of the sensor, from the stationary covariance."""
+    a, b, c, d = loop.matrices
+    covariance = c[1] @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c[1]
+    return math.sqrt(covariance + d[1] ** 2)
+
+
+def _measured(
+    controller: DiscreteController, family: Family, walls: Walls, scenario: Scenario
+) -> tuple[float, float, float, float, float]:
+    """Largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain; infinite if unstable."""
+    loop = discrete_loop(controller, family.plant(scenario), scenario.delay_ticks)
+    radius = float(np.max(np.abs(loop.poles)))
+    if not loop.is_stable:
+        return radius, math.inf, math.inf, math.inf, math.inf
+    disturbance = float(loop.sensitivity(walls.disturbance_hz)[0]) if walls.disturbance_hz else 0.0
+    decay = slowest_ms(loop, np.abs(family.modes))
+    return radius, decay, margins(loop).max_sensitivity, disturbance, noise_gain(loop)

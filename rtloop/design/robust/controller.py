@@ -1,0 +1,96 @@
+"""C(z), a PI part and second-order sections, from the numbers that a search varies.
+
+    C(z) = k (z − z₀)/(z − 1) · Π (z² + n₁z + n₂)/(z² + d₁z + d₂)
+
+Numbers of a point: log k, log(1 − z₀), then for each section log ω and ζ of its zeros, log ω and log ζ of its poles,
+ω in radians a sample; roots are exp(−ζω ± jω√(1 − ζ²)). Poles are stable, zeros may be anywhere.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.hil.modal import Complex, Real
+from rtloop.linear.discretise import discretised
+from rtloop.linear.transfer import Transfer
+
+FASTEST, SLOWEST = 2.5, 1e-3
+"""Radians a sample of a root; at π a pair would fold over."""
+LOWEST = [math.log(1e-9), -9.0]
+HIGHEST = [math.log(1e6), -0.01]
+SECTION = [(math.log(SLOWEST), math.log(FASTEST)), (-1.5, 4.0), (math.log(SLOWEST), math.log(FASTEST)), (-4.0, 1.6)]
+
+
+class Candidates(NamedTuple):
+    """k controllers: gains (k,), zeros of the PI part (k,), coefficients of m sections, each (k, m, 2)."""
+
+    gain: Real
+    zero: Real
+    above: Real
+    below: Real
+
+    def response(self, z: Complex) -> Complex:
+        """C at points (f,) of the z plane, (k, f)."""
+        value = self.gain[:, None] * (z - self.zero[:, None]) / (z - 1)
+        for i in range(self.above.shape[1]):
+            value = value * _quadratic(self.above[:, i], z) / _quadratic(self.below[:, i], z)
+        return value
+
+    def matrices(self) -> tuple[Real, Real, Real, Real]:
+        """A (k, n, n), b (k, n), c (k, n), d (k,) of the sections in series."""
+        count, sections = self.above.shape[:2]
+        n = 1 + 2 * sections
+        a, b, c = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
+        a[:, 0, 0], b[:, 0], c[:, 0] = 1.0, 1.0, self.gain * (1 - self.zero)
+        for i in range(sections):
+            row = 1 + 2 * i
+            a[:, row, row : row + 2], a[:, row + 1, row] = -self.below[:, i], 1.0
+            a[:, row, :row], b[:, row] = c[:, :row], self.gain
+            c[:, row : row + 2] = self.above[:, i] - self.below[:, i]
+        return a, b, c, self.gain
+
+
+def bounds(sections: int) -> tuple[Real, Real]:
+    """Least and largest numbers of a point, each (2 + 4·sections,)."""
+    low, high = zip(*(SECTION * sections), strict=True)
+    return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])
+
+
+def candidates(points: Real) -> Candidates:
+    """Controllers of points (k, 2 + 4m) within their bounds."""
+    sections = points[:, 2:].reshape(points.shape[0], -1, 4)
+    above = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
+    below = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
+    return Candidates(np.exp(points[:, 0]), 1 - np.exp(points[:, 1]), above, below)
+
+
+def transfer_of(point: Real, period_s: float) -> Transfer:
+    """C(s) of which the method "matched" makes C(z) again, root by root: none stands at infinity or on a fold."""
+    sections = point[2:].reshape(-1, 4)
+    above = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
+    below = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]
+    zeros = np.array([math.log1p(-math.exp(point[1])), *above]) / period_s
+    poles = np.array([0.0, *below]) / period_s
+    image = discretised(Transfer(zeros, poles, 1.0), period_s, "matched")
+    return Transfer(zeros, poles, math.exp(point[0]) / image.gain)
+
+
+def _coefficients(size: Real, damping: Real) -> Real:
+    """Of z² + c₁z + c₂ with roots exp(ω(−ζ ± √(ζ² − 1))), (…, 2)."""
+    spread = size * np.sqrt(damping**2 - 1 + 0j)
+    decay = np.exp(-size * damping)
+    return np.stack([-2 * decay * np.cosh(spread).real, decay**2], axis=-1)
+
+
+def _rates(size: float, damping: float) -> list[complex]:
+    """ω(−ζ ± √(ζ² − 1))."""
+    spread = cmath.sqrt(damping**2 - 1)
+    return [size * (-damping + spread), size * (-damping - spread)]
+
+
+def _quadratic(coefficients: Real, z: Complex) -> Complex:
+    return z * z + coefficients[:, :1] * z + coefficients[:, 1:]

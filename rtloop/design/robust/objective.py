@@ -1,0 +1,126 @@
+"""What a search minimises: the slowest decay around the resonances over all scenarios, behind walls.
+
+    cost = log(τ/T) + 10 Σ max(0, log(value/limit))        stable in every scenario
+         = FAR·(1 + largest |pole|)                         otherwise
+
+Everything is computed for many controllers and all scenarios at once, and stays apart from what certifies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.closed_loop import sampled_plant
+from rtloop.design.robust.controller import bounds, candidates
+from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.hil.modal import Complex, Real
+from rtloop.linear.realisation import System
+
+BAND = (0.55, 1.85)
+"""Modes of the closed loop between these multiples of a light mode's frequency are judged by their decay."""
+FAR, STEEP = 100.0, 10.0
+INSIDE = 0.99
+"""A search keeps a hundredth away from its walls, for what lies between its frequencies and its scenarios."""
+
+
+class Walls(NamedTuple):
+    """Limits on max |S|, on |S| at `disturbance_hz`, and on the rms of v per rms of the sensor's noise."""
+
+    sensitivity: float
+    noise_gain: float
+    disturbance: float
+    disturbance_hz: float
+
+
+class Measures(NamedTuple):
+    """The worst over all scenarios, (k,) each: largest |pole|, τ in s, max |S|, |S| at the disturbance, noise gain."""
+
+    radius: Real
+    decay_s: Real
+    sensitivity: Real
+    disturbance: Real
+    noise_gain: Real
+
+
+class Objective:
+    """Cost of points over scenarios."""
+
+    def __init__(self, family: Family, scenarios: Sequence[Scenario], walls: Walls, sections: int):
+        self.walls, self.period_s = walls, family.period_s
+        self.low, self.high = bounds(sections)
+        self.bands = np.abs(family.modes)[:, None] * np.array(BAND)
+        plants = [sampled_plant(family.plant(one), family.period_s, one.delay_ticks) for one in scenarios]
+        self.plants = _alike(plants)
+        hz, self.shares = _grid(family, walls)
+        self.z = np.exp(2j * np.pi * hz * family.period_s)
+        self.responses = np.array([plant.response(self.z) for plant in plants])
+
+    def __call__(self, points: Real) -> Real:
+        """Costs (k,) of points (k, n); outside the bounds what the nearest point within costs, and the distance."""
+        within = np.clip(points, self.low, self.high)
+        found, walls = self.measured(within), self.walls
+        beyond = [(found.sensitivity, walls.sensitivity), (found.noise_gain, walls.noise_gain)]
+        if walls.disturbance_hz:
+            beyond.append((found.disturbance, walls.disturbance))
+        with np.errstate(invalid="ignore"):
+            excess = sum(np.maximum(0, np.log(value / (INSIDE * limit))) for value, limit in beyond)
+            cost = np.log(np.maximum(found.decay_s / self.period_s, 1.0)) + STEEP * excess
+        cost = np.where((found.radius < 1) & np.isfinite(cost), cost, FAR * (1 + np.minimum(found.radius, FAR)))
+        return cost + np.sum((points - within) ** 2, axis=1)
+
+    def measured(self, points: Real) -> Measures:
+        """The worst of every quantity for points (k, n) within the bounds."""
+        chosen = candidates(points)
+        images = self._poles(*chosen.matrices())
+        rates = np.log(np.maximum(np.abs(images), 1e-300)) / self.period_s
+        sizes = np.abs(np.angle(images)) / self.period_s
+        counted = np.zeros(images.shape, bool) if self.bands.size else np.ones(images.shape, bool)
+        for low, high in self.bands:
+            counted |= (sizes > low) & (sizes < high)
+        decay = np.where(counted, -1 / np.minimum(rates, -1e-9), 0.0).max(axis=(1, 2))
+        controller = chosen.response(self.z)
+        sensitivity = 1 / np.abs(1 + controller[:, None] * self.responses)
+        noise = np.sqrt((np.abs(controller[:, None]) * sensitivity) ** 2 @ self.shares)
+        at_disturbance = sensitivity[:, :, 0] if self.walls.disturbance_hz else np.zeros(sensitivity.shape[:2])
+        return Measures(
+            np.abs(images).max(axis=(1, 2)),
+            decay,
+            sensitivity.max(axis=(1, 2)),
+            at_disturbance.max(axis=1),
+            noise.max(axis=1),
+        )
+
+    def _poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
+        """Closed-loop poles in z, (k, scenarios, n)."""
+        ap, bp, cp = self.plants
+        n, order = a.shape[1], a.shape[1] + ap.shape[1]
+        joint = np.zeros((a.shape[0], ap.shape[0], order, order))
+        joint[:, :, :n, :n] = a[:, None]
+        joint[:, :, :n, n:] = -b[:, None, :, None] * cp[None, :, None, :]
+        joint[:, :, n:, :n] = bp[None, :, :, None] * c[:, None, None, :]
+        joint[:, :, n:, n:] = ap - (d[:, None, None] * bp)[..., None] * cp[:, None, :]
+        return np.linalg.eigvals(joint).astype(complex)
+
+
+def _alike(plants: Sequence[System]) -> tuple[Real, Real, Real]:
+    """Matrices stacked; plants of less delay get states that nothing moves and nobody sees."""
+    order = max(plant.b.size for plant in plants)
+    a, b, c = (np.zeros((len(plants), *shape)) for shape in ((order, order), (order,), (order,)))
+    for i, plant in enumerate(plants):
+        n = plant.b.size
+        a[i, :n, :n], b[i, :n], c[i, :n] = plant.a, plant.b, plant.c
+    return a, b, c
+
+
+def _grid(family: Family, walls: Walls) -> tuple[Real, Real]:
+    """Frequencies in Hz and their shares of half the rate; that of the disturbance stands first and has none."""
+    top = 0.5 / family.period_s
+    grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]
+    for mode in np.abs(family.modes) / (2 * np.pi):
+        grids.append(np.linspace(0.5 * mode, 2 * mode, 50))
+    hz = np.unique(np.minimum(np.concatenate(grids), 0.999 * top))
+    edges = np.concatenate([[0.0], 0.5 * (hz[1:] + hz[:-1]), [top]])
+    return np.append(max(walls.disturbance_hz, hz[0]), hz), np.append(0.0, np.diff(edges) / top)

@@ -1,0 +1,93 @@
+"""Plants around a model: every combination that a search looks at, lines and clouds of them that a proof looks at."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.comparison import LIGHT_DAMPING
+from rtloop.design.robust.options import ScenarioOptions
+from rtloop.hil.modal import Complex
+from rtloop.linear.transfer import Transfer
+
+
+class Scenario(NamedTuple):
+    """Percent on each light mode's frequency, a factor on their damping, percent on the gain, samples of delay."""
+
+    resonance: tuple[float, ...]
+    damping: float
+    gain: float
+    delay_ticks: int
+
+    def __str__(self) -> str:
+        moved = [f"resonance {'/'.join(f'{percent:+.3g}' for percent in self.resonance)} %"] if self.resonance else []
+        return ", ".join(
+            [*moved, f"damping × {self.damping:.3g}", f"gain {self.gain:+.3g} %", f"delay_ticks {self.delay_ticks}"]
+        )
+
+
+class Family:
+    """A model, its light modes, and the plants around it. `period_s` is the loop's: faster modes are not moved."""
+
+    def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
+        self.model, self.options, self.period_s = model, options, period_s
+        self.modes = light_modes(model, period_s)
+        self.delays = options.delay_ticks or (delay_ticks,)
+
+    def plant(self, scenario: Scenario) -> Transfer:
+        """The model, changed; ratios of damping and D(0) stay but for the factors asked for."""
+        poles, gain = self.model.poles.copy(), self.model.gain * (1 + scenario.gain / 100)
+        for mode, percent in zip(self.modes, scenario.resonance, strict=True):
+            size, ratio = abs(mode) * (1 + percent / 100), -mode.real / abs(mode) * scenario.damping
+            moved = size * complex(-ratio, np.sqrt(max(1 - ratio**2, 0.0)))
+            poles[self.model.poles == mode], poles[self.model.poles == np.conj(mode)] = moved, np.conj(moved)
+            gain *= (size / abs(mode)) ** 2
+        return Transfer(self.model.zeros, poles, gain)
+
+    @property
+    def nominal(self) -> Scenario:
+        """The model as it is."""
+        return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
+
+    def corners(self) -> list[Scenario]:
+        """The model, every combination of the ends, and resonances in the middle and halfway to them."""
+        r, g = self.options.resonance_percent, self.options.gain_percent
+        ends = sorted({*self.options.damping})
+        dampings = sorted({ends[0], ends[-1]})
+        shifts = [*itertools.product(sorted({-r, 0.0, r}), repeat=self.modes.size)]
+        halfway = [*itertools.product(sorted({-r / 2, r / 2}), repeat=self.modes.size)] if self.modes.size else []
+        found = [self.nominal]
+        for ticks in self.delays:
+            found += [
+                Scenario(*one, ticks) for one in itertools.product(shifts, dampings, sorted({-g, g}))
+            ]  # fmt: skip
+            found += [Scenario(shift, ends[0], gain, ticks) for shift in halfway for gain in sorted({-g, g})]
+        return list(dict.fromkeys(found))
+
+    def swept(self, count: int) -> Iterator[Scenario]:
+        """All light modes moved together, `count` places, at every corner of damping, gain and delay."""
+        r, g = self.options.resonance_percent, self.options.gain_percent
+        places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]
+        damping = sorted({min(self.options.damping), 1.0, max(self.options.damping)}) if self.modes.size else [1.0]
+        for ticks, factor, gain in itertools.product(self.delays, damping, sorted({-g, 0.0, g})):
+            yield from (Scenario((float(place),) * self.modes.size, factor, gain, ticks) for place in places)
+
+    def drawn(self, count: int, seed: int) -> Iterator[Scenario]:
+        """Jointly at random: frequencies and gain evenly, damping evenly in its logarithm."""
+        random, options = np.random.default_rng(seed), self.options
+        r, g = options.resonance_percent, options.gain_percent
+        low, high = np.log([min(options.damping), max(options.damping)])
+        for _ in range(count):
+            shift = tuple(float(value) for value in random.uniform(-r, r, self.modes.size))
+            damping, gain = float(np.exp(random.uniform(low, high))), float(random.uniform(-g, g))
+            yield Scenario(shift, damping, gain, int(random.choice(self.delays)))
+
+
+def light_modes(model: Transfer, period_s: float) -> Complex:
+    """Poles of positive imaginary part that are lightly damped and slow enough to be seen, slowest first."""
+    upper = model.poles[(model.poles.imag > 0) & (model.poles.imag < np.pi / period_s)]
+    light = upper[-upper.real < LIGHT_DAMPING * np.abs(upper)]
+    return light[np.argsort(np.abs(light))]

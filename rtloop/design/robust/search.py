@@ -1,0 +1,129 @@
+"""The search for C(z): short ones from many places, long ones from the best, and once more with what proved worst."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.design.robust.certificate import Certificate, certified
+from rtloop.design.robust.controller import bounds, transfer_of
+from rtloop.design.robust.evolution import Minimum, evolve
+from rtloop.design.robust.objective import FAR, Objective, Walls
+from rtloop.design.robust.scenarios import Family
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.hil.modal import Real
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
+
+POPULATION, SCREENED, SHORT, TAKEN_ON, ROUNDS = 20, 300, 4, 3, 3
+"""Points of a generation; points at random of which the best starts a search; the short searches' share of generations;
+how many are taken to the end; how often the worst plants of a proof may join the scenarios."""
+Progress = Callable[[str], None]
+
+
+class Robust(NamedTuple):
+    """`controller` in s, to be discretised by "matched"; its family, walls, proof, and scenarios searched over."""
+
+    controller: Transfer
+    family: Family
+    walls: Walls
+    certificate: Certificate
+    searched: int
+
+
+def robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> Robust:
+    """A controller for all scenarios of `design`. Raises ValueError for a specification that lacks something, and
+    NoController where the search finds none, with what is missed.
+    """
+    if design.plant is None:
+        raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
+    plant = design.sensor.seen_through(design.plant.transfer())
+    if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
+        raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
+    options, period_s = design.robust, 1 / design.controller.rate_hz
+    family = Family(plant, design.plant.delay_ticks, design.scenarios, period_s)
+    if family.modes.size > 2:
+        raise ValueError(f"plant: {family.modes.size} light modes below half the rate; at most 2 are allowed")
+    walls = walls_of(design)
+    scenarios = family.corners()
+    random = np.random.default_rng(options.seed)
+    for number in range(ROUNDS):
+        objective = Objective(family, scenarios, walls, options.biquads)
+        if number == 0:
+            best = _searched(objective, design, random, progress)
+        else:
+            best = evolve(objective, best.point, 0.05, options.generations, random, POPULATION)
+        if best.cost >= FAR:
+            raise NoController(
+                f"robust: no controller of order {1 + 2 * options.biquads} found that is stable in all of "
+                f"{len(scenarios)} scenarios; a smaller scenarios.resonance_percent, fewer delay_ticks, or more "
+                "robust.restarts would help"
+            )
+        point = np.clip(best.point, *bounds(options.biquads))
+        controller = transfer_of(point, period_s)
+        proof = certified(discretise(controller, period_s, "matched"), family, walls, options.seed)
+        missed = proof.missed(walls, options.decay_ms)
+        progress(f"proof over {proof.count} plants: " + ("; ".join(missed) or "everything is kept"))
+        new = [one for one in proof.worst() if one not in scenarios]
+        if not missed or not new:
+            break
+        scenarios = [*scenarios, *new]
+    if missed:
+        raise NoController(
+            "robust: the best controller found misses: "
+            + "; ".join(missed)
+            + ". More room there, a smaller [scenarios], more robust.restarts or biquads would help"
+        )
+    return Robust(controller, family, walls, proof, len(scenarios))
+
+
+def walls_of(design: DesignOptions) -> Walls:
+    """From [robust] and from the disturbance of a specification. Raises ValueError for one without up_to_hz."""
+    options, asked = design.robust, design.specification.disturbance
+    if asked is None:
+        return Walls(options.largest_sensitivity, options.noise_gain, 1.0, 0.0)
+    if asked.up_to_hz is None:
+        raise ValueError("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
+    if asked.up_to_hz >= design.controller.rate_hz / 2:
+        raise ValueError(f"specification.disturbance.up_to_hz: {asked.up_to_hz:g} Hz; below half the rate is allowed")
+    return Walls(
+        options.largest_sensitivity, options.noise_gain, asked.error_um / asked.largest_um, asked.up_to_hz
+    )  # fmt: skip
+
+
+def _searched(
+    objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress
+) -> Minimum:
+    """The best of `restarts` short searches of which some go on."""
+    options, found = design.robust, list[Minimum]()
+    for number in range(options.restarts):
+        points = _anywhere(objective, options.biquads, random)
+        start = points[np.argmin(objective(points))]
+        found.append(evolve(objective, start, 0.3, max(1, options.generations // SHORT), random, POPULATION))
+        progress(f"search {number + 1} of {options.restarts}: {_words(objective, found[-1])}")
+    found.sort(key=lambda one: one.cost)
+    for number, one in enumerate(found[:TAKEN_ON]):
+        found.append(evolve(objective, one.point, 0.1, options.generations, random, POPULATION))
+        progress(f"continued {number + 1} of {min(TAKEN_ON, len(found))}: {_words(objective, found[-1])}")
+    return min(found, key=lambda one: one.cost)
+
+
+def _anywhere(objective: Objective, sections: int, random: np.random.Generator) -> Real:
+    """Points at random around the resonance: low gains, sections near it."""
+    middle = np.log(np.mean(objective.bands) * objective.period_s) if objective.bands.size else np.log(0.3)
+    centre = np.array([np.log(0.02), np.log(0.05), *([middle, 0.0, middle, np.log(0.5)] * sections)])
+    spread = np.array([1.0, 1.0, *([0.7, 0.7, 0.7, 0.5] * sections)])
+    return centre + spread * random.standard_normal((SCREENED, centre.size))
+
+
+def _words(objective: Objective, found: Minimum) -> str:
+    measures = objective.measured(np.clip(found.point, objective.low, objective.high)[None])
+    if found.cost >= FAR:
+        return f"unstable, largest |pole| {measures.radius[0]:.4f}"
+    return (
+        f"τ {1e3 * measures.decay_s[0]:.3f} ms, max |S| {measures.sensitivity[0]:.3f}, "
+        f"noise gain {measures.noise_gain[0]:.2f}, |S| at the disturbance {measures.disturbance[0]:.4f}"
+    )
