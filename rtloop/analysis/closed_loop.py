@@ -175,6 +175,11 @@ def discrete_loop(
     return Loop(controller.system, sampled, static_gain, roots, period_s, between, reference)
 
 
+def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
+    """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
+    return held_plant(plant, period_s, delay_ticks).system
+
+
 def _rates(images: Complex, period_s: float) -> Complex:
     """log(z)/T, without what dies within a sample."""
     return (np.log(images[np.abs(images) > 1e-9].astype(complex)) / period_s).astype(complex)

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
+from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
+from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.hinf.augment import augmented
 from rtloop.design.synthesis.section import controller_configuration, controller_section
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
+from rtloop.design.verification.bench import Bench, Stand
 from rtloop.design.verification.page import page
+from rtloop.design.verification.robustness import Plants
+from rtloop.design.verification.simulated import simulate
 from rtloop.design.verification.verify import Subject, Verification, as_dict, verify
-from rtloop.errors import ConfigError, NoDesign, OutputError
+from rtloop.errors import ConfigError, NoDesign, OutputError, RtloopError
+from rtloop.linear.transfer import Transfer
 from rtloop.terminal.design import print_synthesis, print_verification
 
 
@@ -63,6 +70,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     judged = {check.name: verified(configuration, check, spec) for check in checks if check.law}
     if not judged:
         raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
+    judged = with_simulation(configuration, judged)
     meets = all(found.meets for found, _ in judged.values())
     report: dict[str, Any] = {
         "name": configuration.name,
@@ -106,6 +114,14 @@ def _as_dict(found: Synthesis, other: float | None, out: Path | None) -> dict[st
     }
 
 
+def _scenarios(design: DesignOptions, plant: Transfer, delay_ticks: int, period_s: float) -> Plants:
+    """The plants of [scenarios], where a specification has it."""
+    if "scenarios" not in design.model_fields_set:
+        return ()
+    family = Family(plant, delay_ticks, design.scenarios, period_s)
+    return [(str(one), family.plant(one), one.delay_ticks) for one in family.corners()]
+
+
 def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) -> tuple[Verification, DesignOptions]:
     """An axis against the specification at `spec`, else against its own. Raises ConfigError."""
     axis = next(one for one in configuration.axes if one.name == check.name)
@@ -118,13 +134,43 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
     margins = None if check.together is None else check.together.margins
     try:
         subject = Subject(check.loop, check.controller, check.discrete)
-        return verify(subject, model.transfer(), design, max(model.delay_ticks, check.delay_ticks), margins), design
+        plant, delay = model.transfer(), max(model.delay_ticks, check.delay_ticks)
+        plants = _scenarios(design, plant, delay, 1 / configuration.loop.rate_hz)
+        return verify(subject, plant, design, delay, margins, plants), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{where}: {error}"]) from None
 
 
+Judged = dict[str, tuple[Verification, DesignOptions]]
+"""Of each axis, by its name: what was found, and what it was judged by."""
+
+
+def with_simulation(configuration: Configuration, judged: Judged) -> Judged:
+    """With steps of every stable axis simulated; where no rig can stand for the hardware, a warning that says so."""
+    axes = {axis.name: axis for axis in configuration.axes}
+    stands = {name: _stand(axes[name], design) for name, (_, design) in judged.items()}
+    try:
+        bench = Bench(configuration, stands)
+    except (ValueError, RtloopError) as error:
+        note = f"steps are not simulated: {error}"
+        return {name: (replace(found, warnings=(*found.warnings, note)), of) for name, (found, of) in judged.items()}
+    return {
+        name: (replace(found, simulated=simulate(bench, axes[name], found.slowest_s, of)), of)
+        if found.running.is_stable
+        else (found, of)
+        for name, (found, of) in judged.items()
+    }
+
+
+def _stand(axis: AxisOptions, design: DesignOptions) -> Stand:
+    """What is known of an axis's hardware."""
+    sensor, residual_percent = design.sensor, design.simulation.residual_percent
+    model = axis.model or design.plant
+    return Stand(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)
+
+
 def _write_report(
-    folder: Path, name: str, judged: dict[str, tuple[Verification, DesignOptions]], report: dict[str, Any]
+    folder: Path, name: str, judged: Judged, report: dict[str, Any]
 ) -> list[Path]:
     """verify.json, verify.html and the pictures of each axis."""
     from rtloop.design.verification.plots import pictures

@@ -14,8 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.analysis.closed_loop import Loop, discrete_loop
-from rtloop.analysis.held_plant import held_plant
+from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
 from rtloop.analysis.perturbation import Range, changes, lightest_pair, maker, until_unstable, with_resonance_shifted
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions
@@ -35,7 +34,7 @@ class LinearModel:
         self.rate_hz = rate_hz
         self.dynamics = model.transfer()
         self._delay_ticks = model.delay_ticks
-        self._plant = held_plant(self.dynamics, 1 / rate_hz, model.delay_ticks).system
+        self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
         shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
@@ -88,7 +87,7 @@ class LinearModel:
 
     def left_of(self, disturbance: Real) -> Real | None:
         """Position (n,) that the loop at rest leaves of a disturbance (n,) before the dynamics: d − T d, d = D Ω."""
-        moved = simulated(*held_plant(self.dynamics, 1 / self.rate_hz).system, disturbance)[0]
+        moved = simulated(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
         return None if self.loop is None else moved - simulated(*self.loop.matrices, moved)[0]
 
     @cached_property

@@ -8,7 +8,17 @@ import click
 from rich.table import Table
 
 from rtloop.design.synthesis.synthesise import Synthesis
-from rtloop.design.verification.text import NOTE, answer, robustness, shifts, table, together
+from rtloop.design.verification.text import (
+    NOTE,
+    answer,
+    robustness,
+    scenarios,
+    shifts,
+    simulated,
+    simulation_notes,
+    table,
+    together,
+)
 from rtloop.design.verification.verify import Verification
 from rtloop.terminal.table import console
 from rtloop.terminal.table import table as lines
@@ -35,6 +45,12 @@ def print_verification(name: str, found: Verification) -> None:
     out.print(f"[bold]axis {name}[/]")
     headings, *rows = table(found)
     out.print(_table(headings, rows))
+    for lines_ in (scenarios(found), simulated(found)):
+        if lines_:
+            out.print()
+            out.print(_table(lines_[0], lines_[1:]))
+    for note in simulation_notes(found):
+        out.print(note)
     if found.together is not None:
         out.print("\nAll axes of its controller together, as they run")
         out.print(_table(("", ""), together(found.together)))

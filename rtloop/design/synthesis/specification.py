@@ -1,7 +1,7 @@
 """What a loop is asked to do, and the weights that follow from it: the models of SPEC.toml.
 
 [plant]  [specification]  [specification.disturbance]  [specification.command]  [specification.claims]
-[sensor]  [weights]  [synthesis]  [controller]  [scenarios]  [robust]  [shape]  [shape.scenarios]
+[sensor]  [simulation]  [weights]  [synthesis]  [controller]  [scenarios]  [robust]  [shape]  [shape.scenarios]
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rtloop.design.synthesis.weights import (
     disturbance_weight,
     tracking_weight,
 )
-from rtloop.hil.options import Options
+from rtloop.hil.options import Numbers, Options
 from rtloop.linear.options import TransferOptions
 from rtloop.linear.transfer import Transfer
 
@@ -74,6 +74,13 @@ class SpecificationOptions(Options):
     """To within 5 % of the final value."""
     bandwidth_hz: float | None = Field(default=None, gt=0)
     """|S| stays below 1/√2 up to here."""
+    modulus_margin: float | None = Field(default=None, gt=0, lt=1)
+    """Least distance of L from −1, which is 1/max |S|."""
+    resonance_decay_ms: float | None = Field(default=None, gt=0)
+    """Time constant of the slowest closed-loop mode near the resonance: what a disturbance excites there rings for so
+    long. Near is from 0.55 to 1.85 times the resonance of the model."""
+    resonance_shift_percent: float | None = Field(default=None, gt=0, le=50)
+    """The resonance may move by so much, up and down, and the loop stays stable."""
     disturbance: DisturbanceOptions | None = None
     command: CommandOptions | None = None
     claims: dict[str, Annotated[ClaimOptions, BeforeValidator(_claim)]] = Field(default_factory=dict)
@@ -97,6 +104,8 @@ QUANTITIES = {
     "settling_ms": ("settling (5 %)", "ms"),
     "overshoot_percent": ("overshoot", "%"),
     "peak_command": ("peak of v per unit step", ""),
+    "resonance_decay_ms": ("slowest mode near the resonance", "ms"),
+    "resonance_shift_percent": ("resonance may move by ±", "%"),
     "bandwidth_hz": ("bandwidth, |S| < 0.71", "Hz"),
     "disturbance_hz": ("disturbance held up to", "Hz"),
     "max_re_pole": ("largest real part of a pole", "rad/s"),
@@ -107,8 +116,8 @@ QUANTITIES = {
     "modulus_margin": ("modulus margin", ""),
     "max_sensitivity": ("max |S|", ""),
     "sensitivity_1hz": ("|S| at 1 Hz", ""),
-    "noise_x_nm": ("sensor noise in x, rms", "nm"),
-    "noise_v_nm": ("sensor noise in v, rms", "nm"),
+    "noise_x_nm": ("sensor noise in x, rms, linear", "nm"),
+    "noise_v_nm": ("sensor noise in v, rms, linear", "nm"),
     "gamma": ("‖F_l(P, C)‖∞", ""),
 }
 """Label and unit of everything that is computed of a loop."""
@@ -156,6 +165,23 @@ class SensorOptions(Options):
         return plant * Transfer.from_zpk([], [-rate], rate)
 
 
+class SimulationOptions(Options):
+    """Steps that are simulated, with everything that is not linear."""
+
+    steps_um: Annotated[Numbers, Field(min_length=1, max_length=16)] = (1.0, 5.0, 20.0, 40.0)
+    """Their heights."""
+    judged: bool = False
+    """Whether they must keep static_error_percent, settling_ms and overshoot_percent."""
+    residual_percent: float = Field(default=0.0, ge=0, lt=100)
+    """h/H that the inverse leaves, as a compensation experiment finds it. Of a driver that is no simulated rig."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not all(height > 0 for height in self.steps_um):
+            raise ValueError(f"steps_um {list(self.steps_um)}: heights above 0 are allowed")
+        return self
+
+
 class WeightOptions(Options):
     """Weights of one's own, instead of those that the rules of the paper make of the specification."""
 
@@ -200,6 +226,7 @@ class DesignOptions(Options):
     plant: ModelOptions | None = None
     specification: SpecificationOptions = SpecificationOptions()
     sensor: SensorOptions = SensorOptions()
+    simulation: SimulationOptions = SimulationOptions()
     weights: WeightOptions = WeightOptions()
     synthesis: SynthesisOptions = SynthesisOptions()
     controller: OutputOptions = OutputOptions()

@@ -1,4 +1,4 @@
-"""What a loop achieves beside what is asked of it: a number, a limit, a verdict for each."""
+"""What a loop achieves beside what is asked of it: a number, a limit, a verdict for each. All of it is linear."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def limits(asked: SpecificationOptions) -> dict[str, Limit]:
     """What is required, by the name of the quantity (`rtloop.design.synthesis.specification.QUANTITIES`)."""
     found: dict[str, Limit] = {}
     for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
-                          ("bandwidth_hz", False)):  # fmt: skip
+                          ("bandwidth_hz", False), ("modulus_margin", False), ("resonance_decay_ms", True),
+                          ("resonance_shift_percent", False)):  # fmt: skip
         if (value := getattr(asked, name)) is not None:
             found[name] = Limit(value, at_most)
     if asked.command is not None:
@@ -41,10 +42,18 @@ def limits(asked: SpecificationOptions) -> dict[str, Limit]:
     return found
 
 
-def specified(loop: Loop, asked: SpecificationOptions) -> dict[str, float]:
-    """The quantities that a specification is about; NaN throughout for an unstable loop."""
+def specified(loop: Loop, asked: SpecificationOptions, resonance: float | None = None) -> dict[str, float]:
+    """The quantities that a specification is about; NaN throughout for an unstable loop.
+
+    `resonance` is that of the model in rad/s, None where it has none.
+    """
+    more = {
+        "disturbance_hz": asked.disturbance,
+        "modulus_margin": asked.modulus_margin,
+        "resonance_decay_ms": resonance,
+    }
     if not loop.is_stable:
-        return dict.fromkeys((*SPECIFIED, *(["disturbance_hz"] if asked.disturbance else [])), math.nan)
+        return dict.fromkeys((*SPECIFIED, *(name for name, wanted in more.items() if wanted)), math.nan)
     step = step_metrics(loop, ())
     found = {
         "static_error_percent": step.static_error_percent,
@@ -55,10 +64,25 @@ def specified(loop: Loop, asked: SpecificationOptions) -> dict[str, float]:
     }
     if asked.disturbance is not None:
         found["disturbance_hz"] = held_up_to(loop, asked.disturbance.error_um / asked.disturbance.largest_um)
+    if asked.modulus_margin is not None:
+        found["modulus_margin"] = 1 / margins(loop).max_sensitivity
+    if resonance is not None:
+        found["resonance_decay_ms"] = 1e3 * slowest_near(loop, resonance)
     return found
 
 
 SPECIFIED = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_command", "bandwidth_hz")
+
+
+NEAR_RESONANCE = (0.55, 1.85)
+"""Where a closed-loop mode counts as one of the resonance, as a part of its frequency."""
+
+
+def slowest_near(loop: Loop, resonance: float) -> float:
+    """Time constant in s of the slowest mode whose frequency is near one in rad/s; 0 where there is none."""
+    frequencies, (low, high) = np.abs(loop.rates.imag), NEAR_RESONANCE
+    near = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]
+    return float(np.max(-1 / near.real, initial=0.0))
 
 
 def described(loop: Loop, sensor: SensorOptions) -> dict[str, float]:

@@ -2,24 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import delay_tolerated
-from rtloop.analysis.perturbation import Change, Maker, Range, until_bad
+from rtloop.analysis.perturbation import Change, Maker, Range, changes, lightest_pair, until_bad, until_unstable
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import Limit, specified
 from rtloop.linear.transfer import Transfer
+
+
+def resonance_of(plant: Transfer) -> float | None:
+    """Of the most lightly damped pair of poles, in rad/s; None where there is none."""
+    return abs(lightest_pair(plant)) if np.any(plant.poles.imag > 0) else None
+
+
+def shift_tolerated(make: Maker, plant: Transfer) -> float:
+    """Percent by which the resonance may move up and down and the loop stays stable; infinite where none was found."""
+    resonance = changes(plant).get("resonance")
+    found = Range(None, None) if resonance is None else until_unstable(make, plant, resonance)
+    return min((end for end in found if end is not None), default=math.inf)
+
+
+class Worst(NamedTuple):
+    """The worst value of a quantity, and the plant that has it."""
+
+    value: float
+    plant: str
+
+
+Plants = Sequence[tuple[str, Transfer, int]]
+"""Name, dynamics and samples of delay of each."""
+LARGER_IS_BETTER = ("bandwidth_hz", "disturbance_hz", "modulus_margin")
+
+
+def worst_of(
+    make: Callable[[Transfer, int], Loop], plants: Plants, asked: SpecificationOptions, resonance: float | None
+) -> dict[str, Worst]:
+    """Of every quantity that a specification is about. NaN, where a loop is unstable, is worst of all."""
+    found = dict[str, Worst]()
+    for name, plant, delay_ticks in plants:
+        for quantity, value in specified(make(plant, delay_ticks), asked, resonance).items():
+            before = found.get(quantity)
+            if before is None or _is_worse(value, before.value, quantity in LARGER_IS_BETTER):
+                found[quantity] = Worst(value, name)
+    return found
+
+
+def _is_worse(value: float, than: float, larger_is_better: bool) -> bool:
+    if math.isnan(value) or math.isnan(than):
+        return math.isnan(value) and not math.isnan(than)
+    return value < than if larger_is_better else value > than
 
 
 def until_missed(
     make: Maker, plant: Transfer, change: Change, asked: SpecificationOptions, required: dict[str, Limit]
 ) -> Range:
     """The range over which every limit of `required` is met; (0, 0) if one is not as it stands."""
+    resonance = resonance_of(plant)
 
     def met(moved: Transfer) -> bool:
         loop = make(moved)
-        values = specified(loop, asked) if loop.is_stable else {}
+        values = specified(loop, asked, resonance) if loop.is_stable else {}
         return bool(values) and all(limit.met(values[name]) for name, limit in required.items())
 
     return until_bad(met, plant, change, coarse=4.0, tolerance=0.01)

@@ -6,15 +6,17 @@ which stands still for a period.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rtloop.analysis.held_plant import POINTS, held_plant
 from rtloop.configuration.axis import AxisOptions
+from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
 from rtloop.design.verification.bench import Bench
+from rtloop.design.verification.judgement import Limit, limits
 from rtloop.hil.modal import Real
 from rtloop.hil.options import RigOptions
 from rtloop.hil.rig import zeros_poles_gain
@@ -27,6 +29,10 @@ SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
 """Of a level: so many of the slowest mode."""
 REST_S, SETTLES_S = 1.0, 0.5
 """How long the rest is looked at, and what passes before."""
+RESTS = (0.03, 0.12, 0.24, 0.48)
+"""Where, as parts of the range."""
+JUDGED = ("settling_ms", "overshoot_percent", "static_error_percent")
+"""Quantities of a step that a specification is about."""
 LIMITED = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
 
 
@@ -49,24 +55,69 @@ class Simulated:
     truth: str
     steps: tuple[SimulatedStep, ...]
     left_out_um: tuple[float, ...]
+    reach_um: float
     noise_x_nm: float
     noise_v_nm: float
+    required: Mapping[str, Limit]
+    judged: bool
+
+    def met(self, step: SimulatedStep, name: str) -> bool | None:
+        """Whether a step keeps what is required of `name`; None where nothing is."""
+        return self.required[name].met(getattr(step, name)) if name in self.required else None
+
+    @property
+    def missed(self) -> list[str]:
+        """What steps that are judged do not keep, in words; nothing where none is judged."""
+        if not self.judged:
+            return []
+        return [
+            f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
+            for step in self.steps
+            for name in JUDGED
+            if self.met(step, name) is False
+        ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        steps = [
+            {**step._asdict(), "met": {name: self.met(step, name) for name in JUDGED if name in self.required}}
+            for step in self.steps
+        ]
+        return {
+            "truth": self.truth,
+            "steps": steps,
+            "left_out_um": list(self.left_out_um),
+            "noise_x_nm": self.noise_x_nm,
+            "noise_v_nm": self.noise_v_nm,
+            "judged": self.judged,
+        }
 
 
-def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, heights_um: Sequence[float]) -> Simulated:
+def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> Simulated:
     """Steps of an axis whose linear loop has `slowest_s` as its slowest time constant."""
+    heights_um, judged = design.simulation.steps_um, design.simulation.judged
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
     reach_um, downwards = _reach(axis)
-    possible = [height for height in heights_um if height <= reach_um]
+    possible = sorted(height for height in set(heights_um) if height <= reach_um)
     found = []
     for height in possible:
         levels = (0.0, height, 0.0, -height, 0.0) if downwards else (0.0, height, 0.0, height, 0.0)
         found.append(_judged(bench.rig, bench.run(axis.name, levels, dwell_s), axis.name, height, bench.rate_hz))
-    rest = bench.run(axis.name, (0.0,), SETTLES_S + REST_S)
-    last = slice(round(SETTLES_S * bench.rate_hz), None)
-    noise = [1e3 * float(rest[f"{axis.name}_{name}"][last].std()) for name in ("true_position_um", "command_um")]
     truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
-    return Simulated(truth, tuple(found), tuple(sorted(set(heights_um) - set(possible))), *noise)
+    left_out = tuple(sorted(set(heights_um) - set(possible)))
+    noise_x_nm, noise_v_nm = _at_rest(bench, axis.name, reach_um)
+    required = limits(design.specification)
+    return Simulated(truth, tuple(found), left_out, reach_um, noise_x_nm, noise_v_nm, required, judged)
+
+
+def _at_rest(bench: Bench, axis: str, reach_um: float) -> list[float]:
+    """Position and command in nm rms, about their means, at some places: a loop hunts where a dead band lets it."""
+    squares = []
+    for part in RESTS:
+        rest = bench.run(axis, (part * reach_um,), SETTLES_S + REST_S)
+        last = slice(round(SETTLES_S * bench.rate_hz), None)
+        squares.append([rest[f"{axis}_{name}"][last].var() for name in ("true_position_um", "command_um")])
+    return [float(1e3 * np.sqrt(mean)) for mean in np.mean(squares, axis=0)]
 
 
 def _reach(axis: AxisOptions) -> tuple[float, bool]:

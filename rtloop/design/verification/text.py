@@ -8,10 +8,13 @@ from itertools import chain
 
 from rtloop.analysis.coupled_loop import TogetherMargins
 from rtloop.analysis.perturbation import Range
+from rtloop.design.synthesis.specification import QUANTITIES
 from rtloop.design.verification.judgement import Limit
+from rtloop.design.verification.simulated import JUDGED
 from rtloop.design.verification.verify import Row, Verification
 
 ON_PAPER, RUNS = "continuous C(s)", "as it runs C(z)"
+LINEAR = "linear"
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
 NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
@@ -23,7 +26,7 @@ def table(found: Verification) -> list[tuple[str, ...]]:
     loops = [loop for loop in (found.continuous, found.running) if loop is not None]
     columns = [ON_PAPER, RUNS][-len(loops) :]
     stable = ["yes" if loop.is_stable else "NO" for loop in loops]
-    rows = [("", "required", *_twos((column, "") for column in columns), "its source says")]
+    rows = [(LINEAR, "required", *_twos((column, "") for column in columns), "its source says")]
     rows.append(("stable", "yes", *_twos((one, verdict(one == "yes")) for one in stable), ""))
     for row in found.rows:
         values = [row.continuous, row.running][-len(loops) :]
@@ -80,6 +83,56 @@ def robustness(found: Verification) -> list[tuple[str, ...]]:
     return [*rows, ("delay", *(more if judged.is_stable else ["–"] * len(more)), "")]
 
 
+def scenarios(found: Verification) -> list[tuple[str, ...]]:
+    """Headings, then the worst of each quantity with its verdict and its plant; nothing where no scenario is asked for."""
+    if found.scenarios is None:
+        return []
+    rows = [(f"worst of {found.scenarios.count} scenarios, linear", "required", "as it runs", "", "on the plant with")]
+    return rows + [
+        (row.label, required(row), _with_unit(row, worst.value), verdict(row.met(worst.value)), worst.plant)
+        for row, worst in found.scenarios.rows
+    ]
+
+
+def simulated(found: Verification) -> list[tuple[str, ...]]:
+    """Headings, then a row for each height of a step, the worst up and down; nothing where nothing was simulated."""
+    if found.simulated is None:
+        return []
+    rows = [
+        ("simulated steps, worst of 4", *(part for name in JUDGED for part in (QUANTITIES[name][0], "")), "peak |u|", "")
+    ]
+    for step in found.simulated.steps:
+        cells = [
+            part
+            for name in JUDGED
+            for part in (
+                f"{getattr(step, name):.4g} {QUANTITIES[name][1]}",
+                verdict(found.simulated.met(step, name)),
+            )
+        ]
+        stopped = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
+        stopped += [f"limited: {', '.join(step.limited)}"] if step.limited else []
+        rows.append((f"{step.height_um:g} µm", *cells, f"{step.peak_drive_v:.4g} V", "; ".join(stopped)))
+    return rows
+
+
+def simulation_notes(found: Verification) -> list[str]:
+    """What was simulated, what was left out, and what the loop does at rest."""
+    if found.simulated is None:
+        return []
+    of = found.simulated
+    notes = [
+        f"Simulated by the law itself on {of.truth}, with hysteresis, limits, rounding and noise; at rest x moves by "
+        f"{of.noise_x_nm:.3g} nm rms, v by {of.noise_v_nm:.3g} nm rms."
+    ]
+    if of.left_out_um:
+        heights = ", ".join(f"{height:g}" for height in of.left_out_um)
+        notes.append(f"Left out: steps of {heights} µm; the command's range ends at {of.reach_um:.4g} µm.")
+    if of.required and not of.judged:
+        notes.append("These verdicts are no part of the answer below; [simulation] judged = true makes them.")
+    return notes
+
+
 def together(margins: TogetherMargins) -> list[tuple[str, str]]:
     """What all axes of a controller bear at once."""
     if math.isnan(margins.max_sensitivity):
@@ -124,7 +177,11 @@ def answer(found: Verification) -> str:
     """The sentence at the end."""
     if not found.running.is_stable:
         return "as it will run, the loop is UNSTABLE"
-    if found.missed:
-        return f"as it will run, the loop misses {', '.join(row.label for row in found.missed)}"
+    missed = [row.label for row in found.missed]
+    if found.scenarios is not None:
+        missed += [f"{row.label} with {worst.plant}" for row, worst in found.scenarios.missed if row not in found.missed]
+    missed += [] if found.simulated is None else [f"simulated, {words}" for words in found.simulated.missed]
+    if missed:
+        return f"as it will run, the loop misses {', '.join(missed)}"
     asked = any(row.limit is not None for row in found.rows)
     return "as it will run, the loop meets its specification" if asked else "stable; nothing is specified"

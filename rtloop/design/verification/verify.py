@@ -1,7 +1,8 @@
 """A controller judged: every specification with what is required, what is achieved and a verdict, and how robust it is.
 
-Twice: in continuous time, C(s)·D(s), as it is designed, where there is a C(s); and as it will run, C(z) behind the hold
-and the delay, seen through the sensor. A controller that meets its specification on paper only does not meet it.
+Twice, and linear: in continuous time, C(s)·D(s), as it is designed, where there is a C(s); and as it will run, C(z)
+with its pre-filter behind the hold and the delay, seen through the sensor. A controller that meets its specification on
+paper only does not meet it, and neither does one that misses it in a scenario that is asked for.
 """
 
 from __future__ import annotations
@@ -21,7 +22,17 @@ from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions, wei
 from rtloop.design.synthesis.synthesise import weighted_norm
 from rtloop.design.synthesis.weights import Weights
 from rtloop.design.verification.judgement import Limit, described, limits, specified
-from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
+from rtloop.design.verification.robustness import (
+    Plants,
+    Worst,
+    delay_margin_us,
+    delay_ticks_tolerated,
+    resonance_of,
+    shift_tolerated,
+    until_missed,
+    worst_of,
+)
+from rtloop.design.verification.simulated import Simulated
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 
@@ -73,6 +84,19 @@ class Robustness(NamedTuple):
     delay_ticks: int
 
 
+@dataclass(frozen=True)
+class Scenarios:
+    """The worst of so many plants, row for row of those quantities that a specification is about."""
+
+    count: int
+    rows: tuple[tuple[Row, Worst], ...]
+
+    @property
+    def missed(self) -> list[tuple[Row, Worst]]:
+        """The required ones that some plant misses."""
+        return [(row, worst) for row, worst in self.rows if row.met(worst.value) is False]
+
+
 @dataclass(frozen=True, eq=False)
 class Verification:
     """Everything found out about one axis. `weights` is None where the specification gives none."""
@@ -86,11 +110,18 @@ class Verification:
     weights: Weights | None
     gamma: float | None
     together: TogetherMargins | None = None
+    scenarios: Scenarios | None = None
+    simulated: Simulated | None = None
 
     @cached_property
     def robustness(self) -> Robustness:
         """How far what may move may move; most of the time that a verification takes."""
         return self.examine()
+
+    @property
+    def slowest_s(self) -> float:
+        """Time constant of the slowest mode as it runs."""
+        return float(-1 / self.running.rates.real.max(initial=-math.inf))
 
     @property
     def missed(self) -> list[Row]:
@@ -99,8 +130,10 @@ class Verification:
 
     @property
     def meets(self) -> bool:
-        """Stable as it will run, with every requirement met."""
-        return self.running.is_stable and not self.missed
+        """Stable as it will run, with every requirement met, in every scenario and simulation that is judged, too."""
+        in_scenarios = self.scenarios is None or not self.scenarios.missed
+        simulated = self.simulated is None or not self.simulated.missed
+        return self.running.is_stable and not self.missed and in_scenarios and simulated
 
 
 def verify(
@@ -109,9 +142,11 @@ def verify(
     design: DesignOptions,
     delay_ticks: int = 0,
     together: TogetherMargins | None = None,
+    plants: Plants = (),
 ) -> Verification:
     """Judge a loop on a plant, behind `delay_ticks` samples; `together` is what its axis shares with others.
 
+    `plants` are others on which it must keep its specification as well.
     Raises ValueError for a plant with direct feedthrough.
     """
     asked, sensed, controller = design.specification, design.sensor.seen_through(plant), subject.controller
@@ -121,10 +156,13 @@ def verify(
     gamma = None
     if weights is not None and controller is not None:
         gamma = weighted_norm(augmented(plant, weights), controller)
+    resonance = resonance_of(plant)
     columns = [
-        {} if loop is None else specified(loop, asked) | described(loop, design.sensor)
+        {} if loop is None else specified(loop, asked, resonance) | described(loop, design.sensor)
         for loop in (continuous, running)
     ]
+    if asked.resonance_shift_percent is not None:
+        columns[1]["resonance_shift_percent"] = shift_tolerated(lambda moved: subject.running(moved, delay_ticks), sensed)
     if gamma is not None:
         columns[0]["gamma"] = gamma
     required = limits(asked)
@@ -133,12 +171,17 @@ def verify(
         for name in QUANTITIES
         if any(name in column for column in columns)
     )
+    scenarios = None
+    if plants:
+        seen = [(name, design.sensor.seen_through(one), ticks) for name, one, ticks in plants]
+        worst = worst_of(subject.running, seen, asked, resonance)
+        scenarios = Scenarios(len(plants), tuple((row, worst[row.name]) for row in rows if row.name in worst))
     warnings: tuple[str, ...] = ()
     if controller is not None and subject.discrete is not None:
         warnings = tuple(compare(controller, subject.discrete, up_to_hz=0.2 / subject.discrete.period_s).warnings)
     return Verification(
         rows, lambda: _robustness(subject, plant, sensed, design, delay_ticks, rows), warnings,
-        continuous, running, delay_ticks, weights, gamma, together,
+        continuous, running, delay_ticks, weights, gamma, together, scenarios,
     )  # fmt: skip
 
 
@@ -162,7 +205,8 @@ def _robustness(
     def runs(moved: Transfer) -> Loop:
         return subject.running(moved, delay_ticks)
 
-    met = {row.name: row.limit for row in rows if row.limit is not None and row.met(row.running)}
+    of_one_loop = [row for row in rows if row.name != "resonance_shift_percent"]
+    met = {row.name: row.limit for row in of_one_loop if row.limit is not None and row.met(row.running)}
     ranges: dict[str, dict[str, Range | None]] = {}
     shifts: dict[str, Range] = {}
     for name, change in changes(plant).items():
@@ -203,8 +247,18 @@ def as_dict(found: Verification) -> dict[str, Any]:
         "delay_margin_us": _number(robust.delay_us),
         "more_delay_ticks": robust.delay_ticks,
         "together": None if found.together is None else found.together.as_dict(),
+        "scenarios": None if found.scenarios is None else _scenarios(found.scenarios),
+        "simulated": None if found.simulated is None else found.simulated.as_dict(),
         "warnings": list(found.warnings),
     }
+
+
+def _scenarios(found: Scenarios) -> dict[str, Any]:
+    rows = [
+        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": row.met(worst.value)}
+        for row, worst in found.rows
+    ]
+    return {"count": found.count, "rows": rows}
 
 
 def _row(row: Row) -> dict[str, Any]:
