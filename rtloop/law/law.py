@@ -137,7 +137,7 @@ def reset_trip(law):
 def evaluate(record, adc_v, references, feeds_um, conditions):
     """Drives of this tick, in `drive_v` of each axis, from the inputs in V and the references (µm; V in RAW mode).
 
-    `feeds_um` is added to the commands of a closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
+    `feeds_um` is added to commands in closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
     """
     law = opened(record)
     loop = loop_of(law)
