@@ -69,6 +69,11 @@ class Loop:
         """|C·S|, from the reference to the command, at frequencies (k,) in Hz."""
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
+    def from_command(self, hz: npt.ArrayLike) -> Complex:
+        """From what is added to the command to the position, at frequencies (k,) in Hz."""
+        a, _, c, _ = self.matrices
+        return System(a, self.injection.b, c[0], 0.0).response(self._points(hz))
+
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
         """A, b, C (2, n), d (2,) from the reference to (x, v)."""
@@ -111,7 +116,7 @@ class Loop:
         toward_error, toward_command = self.reference.response(points)
         position, command = (toward_error * System(a, b, c[i], float(d[i])).response(points) for i in (0, 1))
         if self.reference.commands:
-            position = position + toward_command * System(a, self.injection.b, c[0], 0.0).response(points)
+            position = position + toward_command * self.from_command(hz)
             command = command + toward_command * System(a, self.injection.b, c[1], 1.0).response(points)
         return position, command
 

@@ -169,9 +169,7 @@ def _stand(axis: AxisOptions, design: DesignOptions) -> Stand:
     return Stand(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)
 
 
-def _write_report(
-    folder: Path, name: str, judged: Judged, report: dict[str, Any]
-) -> list[Path]:
+def _write_report(folder: Path, name: str, judged: Judged, report: dict[str, Any]) -> list[Path]:
     """verify.json, verify.html and the pictures of each axis."""
     from rtloop.design.verification.plots import pictures
 

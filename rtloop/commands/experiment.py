@@ -6,12 +6,13 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
+import numpy as np
 
 from rtloop.commands.run import recover_leftovers
 from rtloop.configuration.axis import AxisOptions
@@ -23,7 +24,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
 from rtloop.experiments.derive import derived
 from rtloop.experiments.page import page
-from rtloop.experiments.procedure import Experiment, Run
+from rtloop.experiments.procedure import Experiment, Run, Unsuited
 from rtloop.experiments.registry import chosen, parameters
 from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
@@ -37,11 +38,12 @@ from rtloop.terminal.progress import StatusLine
 
 
 class Planned(NamedTuple):
-    """One run with the configuration that it is made with."""
+    """One run with the configuration that it is made with; `further` is what follows from recordings, if anything."""
 
     experiment: Experiment
     run: Run
     configuration: Configuration
+    further: Callable[[Sequence[Path]], Planned | None] | None = None
 
     @property
     def label(self) -> str:
@@ -63,15 +65,17 @@ def run_experiments(
     about = _axis(base, axis)
     skipped = _unsuitable(experiments, prepared, about)
     setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real, asked=_asked(base, about))
-    planned = [
-        one
-        for experiment in experiments
-        if experiment.name not in skipped
-        for one in _planned(experiment, options[experiment.name], base, setting)
-    ]
+    folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
+    planned: list[Planned] = []
+    for experiment in experiments:
+        if experiment.name in skipped:
+            continue
+        try:
+            planned += _planned(experiment, options[experiment.name], base, setting, folder)
+        except Unsuited as reason:
+            skipped[experiment.name] = str(reason)
     if not planned:
         raise LoopFault("\n  ".join(["no experiment can be done", *(f"{n}: {why}" for n, why in skipped.items())]))
-    folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
     with Interruption() as interruption:
         paths, problems = _record_all(planned, folder, paced or prepared.facts.real, interruption)
     for problem in problems:
@@ -122,13 +126,39 @@ def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: Axi
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
-def _planned(experiment: Experiment, options: Any, base: Configuration, setting: Setting) -> list[Planned]:
+def _planned(
+    experiment: Experiment, options: Any, base: Configuration, setting: Setting, folder: Path
+) -> list[Planned]:
+    """The runs of an experiment; the last one goes on where the experiment does."""
     options = experiment.fitted(options, setting)
     runs = experiment.runs(options, setting)
     values, asked = options.model_dump(mode="json"), setting.asked.model_dump(mode="json", exclude_defaults=True)
-    return [
-        Planned(experiment, run, derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked))
-        for run in runs
+
+    def made(run: Run, last: bool) -> Planned:
+        _keep(run, folder)
+        configuration = derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked)
+        return Planned(experiment, run, configuration, further if last and experiment.go_on else None)
+
+    def further(paths: Sequence[Path]) -> Planned | None:
+        assert experiment.go_on is not None
+        run = experiment.go_on([one for one in take(paths) if one.experiment == experiment.name], options, setting)
+        return None if run is None else made(run, True)
+
+    return [made(run, run is runs[-1]) for run in runs]
+
+
+def _keep(run: Run, folder: Path) -> None:
+    """Write the tables of a run, and have its references read them. Raises OutputError."""
+    for name, samples in run.tables.items():
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            np.save(folder / name, samples)
+        except OSError as error:
+            raise OutputError(f"{folder / name}: {error.strerror}") from None
+    references = run.timeline.references
+    references[:] = [
+        {**one, "file": str((folder / one["file"]).resolve())} if one.get("file") in run.tables else one
+        for one in references
     ]
 
 
@@ -146,9 +176,9 @@ def _record_all(
     paths: list[Path] = []
     problems: list[str] = []
     with Progress(sum(one.run.timeline.ticks for one in planned), sys.stderr) as progress:
-        for one in planned:
-            if interruption.requested:
-                break
+        waiting = list(planned)
+        while waiting and not interruption.requested:
+            one = waiting.pop(0)
             try:
                 result = _record(one, folder, paced, interruption, progress)
             except (RtloopError, DriverError) as error:
@@ -160,6 +190,9 @@ def _record_all(
             if result.error:
                 problems.append(f"{one.label}: {result.error}")
                 break
+            if one.further and (another := one.further(paths)):
+                progress.more(another.run.timeline.ticks)
+                waiting.insert(0, another)
     return paths, problems
 
 

@@ -121,10 +121,15 @@ class LinearModel:
 
     def stable_at(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted."""
-        if self._controller is None:
-            return False
-        shifted = with_resonance_shifted(self.dynamics, shift_percent)
-        return discrete_loop(self._controller, shifted, self._delay_ticks).is_stable
+        shifted = self.with_resonance_shifted(shift_percent)
+        return shifted is not None and shifted.is_stable
+
+    def with_resonance_shifted(self, shift_percent: float) -> Loop | None:
+        """The loop with the plant's resonance shifted; None without a controller. Raises ValueError without one."""
+        if self._controller is None or self.loop is None:
+            return None
+        shifted = with_resonance_shifted(self.dynamics, shift_percent) if shift_percent else self.dynamics
+        return discrete_loop(self._controller, shifted, self._delay_ticks, self.loop.reference)
 
     @cached_property
     def tolerated(self) -> Range | None:

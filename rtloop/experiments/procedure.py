@@ -24,6 +24,10 @@ DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
 """Of 10 V each cycle is 0.1 V smaller, so that the rest differs from a virgin one by about as little."""
 
 
+class Unsuited(Exception):
+    """Why an experiment cannot be done with this loop, whatever its parameters."""
+
+
 class Segment(NamedTuple):
     """A stretch of ticks with one mode and one reference; `values` are what the analysis needs to know of it."""
 
@@ -96,6 +100,8 @@ class Run:
     """Changes to the simulated plant, section by section (`rtloop.hil.options.PlantOptions`)."""
     may_trip: bool = False
     """A trip is a result and not a failure."""
+    tables: Mapping[str, Any] = field(default_factory=dict)
+    """Samples (n, 1 or 2) by the name of the file that its references are to read them from."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,8 @@ class Experiment:
     runs: Callable[[Any, Setting], list[Run]]
     analyse: Callable[[Sequence[Taken], Any], Analysis]
     draw: Callable[[Any, Mapping[str, Any], Any], None]
+    go_on: Callable[[Sequence[Taken], Any, Setting], Run | None] | None = None
+    """A further run, made of what was recorded so far; None when there is nothing more to do."""
     defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
     """Of the options that are None where nobody sets them."""
     largest: Mapping[str, Callable[[Setting], float]] = field(default_factory=dict)

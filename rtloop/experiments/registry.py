@@ -16,13 +16,14 @@ from rtloop.experiments.procedures import (
     disturbance,
     harmonic,
     robustness,
+    scan,
     sines,
     step_response,
     steps,
 )
 from rtloop.hil.options import Options
 
-MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness)
+MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness, scan)
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}
 
 

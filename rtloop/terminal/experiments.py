@@ -31,6 +31,10 @@ class Progress(StatusLine):
         left = f"about {duration(spent_s * (self._total - done) / done)} left" if done else ""
         self.update(f"{label}: {100 * min(ticks, planned) // planned} %   all: {100 * done // self._total} %   {left}")
 
+    def more(self, ticks: int) -> None:
+        """A run follows that nobody knew of before."""
+        self._total += ticks
+
     def finished(self, planned: int) -> None:
         """A run has ended."""
         self._done += planned

@@ -99,7 +99,12 @@ def simulated(found: Verification) -> list[tuple[str, ...]]:
     if found.simulated is None:
         return []
     rows = [
-        ("simulated steps, worst of 4", *(part for name in JUDGED for part in (QUANTITIES[name][0], "")), "peak |u|", "")
+        (
+            "simulated steps, worst of 4",
+            *(part for name in JUDGED for part in (QUANTITIES[name][0], "")),
+            "peak |u|",
+            "",
+        )
     ]
     for step in found.simulated.steps:
         cells = [
@@ -179,7 +184,9 @@ def answer(found: Verification) -> str:
         return "as it will run, the loop is UNSTABLE"
     missed = [row.label for row in found.missed]
     if found.scenarios is not None:
-        missed += [f"{row.label} with {worst.plant}" for row, worst in found.scenarios.missed if row not in found.missed]
+        missed += [
+            f"{row.label} with {worst.plant}" for row, worst in found.scenarios.missed if row not in found.missed
+        ]
     missed += [] if found.simulated is None else [f"simulated, {words}" for words in found.simulated.missed]
     if missed:
         return f"as it will run, the loop misses {', '.join(missed)}"

@@ -162,7 +162,9 @@ def verify(
         for loop in (continuous, running)
     ]
     if asked.resonance_shift_percent is not None:
-        columns[1]["resonance_shift_percent"] = shift_tolerated(lambda moved: subject.running(moved, delay_ticks), sensed)
+        columns[1]["resonance_shift_percent"] = shift_tolerated(
+            lambda moved: subject.running(moved, delay_ticks), sensed
+        )
     if gamma is not None:
         columns[0]["gamma"] = gamma
     required = limits(asked)

@@ -1,0 +1,80 @@
+"""Iterative learning of a periodic reference: a table of two columns, for the reference and for the command.
+
+    x = T r + G w,   T from the reference with its taps,   G from the command      at each harmonic of the period
+    [r, w] ← [r, w] + L (wanted − x),   the error of the next cycle: (1 − T L_r − G L_w) of this one's
+
+Frequency-domain learning (Bristow, Tharayil and Alleyne, IEEE Control Systems 26(3), 2006): L is the regularised
+least-squares inverse of [T, G] over all loops that the plant may make, and a harmonic is learned where it shrinks the
+error in each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtloop.analysis.closed_loop import Loop
+from rtloop.hil.modal import Complex, Real
+
+LARGEST_CONTRACTION = 0.8
+"""Of a harmonic's error from one cycle to the next, in the worst of all loops, that is still learned."""
+LEAST_RESPONSE = 0.1
+"""Of the position to reference and command: where it is smaller, noise would be learned, and large commands for little."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learning:
+    """`gains` (harmonics, 2) from an error to both columns; `contraction` (harmonics,), the worst of all loops."""
+
+    period_ticks: int
+    gains: Complex
+    contraction: Real
+
+    @property
+    def learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Which harmonics, from 0 Hz on."""
+        return self.contraction < LARGEST_CONTRACTION
+
+    def improved(self, table: Real, error_um: Real) -> Real:
+        """The table (period, 2) after a cycle that was wrong by `error_um` (period,), wanted minus measured."""
+        change = (self.gains * self.learned[:, None]).T * np.fft.rfft(error_um)
+        return table + np.fft.irfft(change, self.period_ticks).T
+
+
+def learning(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Learning:
+    """How a table of so many ticks learns in named loops of one rate.
+
+    Raises ValueError, which says why, where the error of the period itself would not shrink in each of them.
+    """
+    period_s = loops[0][1].period_s
+    assert period_s is not None
+    hz = np.arange(period_ticks // 2 + 1) / (period_ticks * period_s)
+    unstable = [name for name, loop in loops if not loop.is_stable]
+    if unstable:
+        raise ValueError(f"{unstable[0]}: the loop is unstable there, and no table can be learned in it")
+    paths = np.array([np.column_stack(_paths(loop, hz)) for _, loop in loops])
+    gains = _inverse(paths)
+    left = np.abs(1 - np.einsum("shc,hc->sh", paths, gains))
+    found = Learning(period_ticks, gains, left.max(axis=0))
+    if not found.learned[:2].all():
+        at = int(np.argmax(~found.learned[:2]))
+        worst = loops[int(np.argmax(left[:, at]))][0]
+        raise ValueError(
+            f"{worst}: a cycle leaves {found.contraction[at]:.2f} of the error at {hz[at]:g} Hz; "
+            f"less than {LARGEST_CONTRACTION} is needed for it to shrink from one cycle to the next"
+        )
+    return found
+
+
+def _paths(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
+    """To the position: from the reference, and from what is added to the command."""
+    return loop.from_reference(hz)[0], loop.from_command(hz)
+
+
+def _inverse(paths: Complex) -> Complex:
+    """L (harmonics, 2) of least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2)."""
+    adjoint = np.conj(paths)
+    normal = np.einsum("shi,shj->hij", adjoint, paths) + len(paths) * LEAST_RESPONSE**2 * np.eye(2)
+    return np.linalg.solve(normal, adjoint.sum(axis=0)[..., None])[..., 0]

@@ -1,0 +1,187 @@
+"""Triangles as a scan has them, whose tables of reference and command are learned from one recording to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rtloop.design.robust.learning import Learning, learning
+from rtloop.errors import ConfigError
+from rtloop.experiments.procedure import Experiment, Run, Unsuited, hold
+from rtloop.experiments.setting import Setting
+from rtloop.experiments.taken import Taken
+from rtloop.experiments.theme import Ink
+from rtloop.experiments.verdict import Analysis, Row, Table
+from rtloop.hil.modal import Real
+from rtloop.hil.options import Numbers, Options
+
+REST_S, SETTLE_S, MEASURED_S = 0.1, 0.1, 0.2
+"""At least so long; whole periods."""
+GROWN = 1.1
+"""An error larger by this factor than the least so far is not learned from: the table goes back."""
+PLACES = 5
+"""Shifts of the resonance between the ends at which learning must converge."""
+
+
+class ScanOptions(Options):
+    """The scan and how it is learned."""
+
+    amplitude_um: float = Field(default=20.0, gt=0)
+    """Half of peak to peak."""
+    frequencies_hz: Numbers = Field(default=(10.0, 50.0, 100.0), min_length=1)
+    cycles: int = Field(default=5, ge=0, le=50)
+    """Of learning, each a recording; the first one has nothing learned."""
+    resonance_percent: float = Field(default=2.0, ge=0, le=30)
+    """Nothing is learned unless the error shrinks with the resonance anywhere within so much of the model's."""
+
+
+def triangle(period_ticks: int, amplitude_um: float) -> Real:
+    """One period (period,), from 0 upwards."""
+    turns = np.arange(period_ticks) / period_ticks
+    return amplitude_um * (4 * np.abs((turns - 0.25) % 1 - 0.5) - 1)
+
+
+def runs(options: ScanOptions, setting: Setting) -> list[Run]:
+    """The first one: the triangles as they are. Raises Unsuited where learning would not converge."""
+    periods = [_period(hz, setting.rate_hz) for hz in options.frequencies_hz]
+    for ticks in periods:
+        _learning(setting, options, ticks)
+    return [_run(0, options, setting, [_untaught(triangle(ticks, options.amplitude_um)) for ticks in periods])]
+
+
+def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> Run | None:
+    """The next one, with the tables that the recordings so far have taught; None after the last."""
+    if len(takings) > options.cycles:
+        return None
+    tables = []
+    for number in range(len(options.frequencies_hz)):
+        errors = [_error(taken, number) for taken in takings]
+        sizes = [_rms(error) for error in errors]
+        best = int(np.argmin(sizes))
+        table = _table(takings[best], number)
+        if sizes[-1] <= GROWN * sizes[best]:
+            table = _learning(setting, options, len(table)).improved(_table(takings[-1], number), errors[-1])
+        tables.append(table)
+    return _run(len(takings), options, setting, tables)
+
+
+def _run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
+    timeline, kept = setting.timeline(), {}
+    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    for hz, table in zip(options.frequencies_hz, tables, strict=True):
+        name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
+        settle, measured = int(np.ceil(SETTLE_S / period_s)), int(np.ceil(MEASURED_S / period_s))
+        kept[name] = table
+        timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, (settle + measured) * period_s,
+                     frequency_hz=hz, period_ticks=len(table), periods=measured)  # fmt: skip
+    return Run(f"cycle {cycle}", timeline, tables=kept)
+
+
+def _period(hz: float, rate_hz: float) -> int:
+    ticks = round(rate_hz / hz)
+    if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
+        faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
+        raise ConfigError("parameters of the experiments", faults)
+    return ticks
+
+
+def _untaught(wanted_um: Real) -> Real:
+    """A table (period, 2) that adds nothing to the command."""
+    return np.column_stack([wanted_um, np.zeros_like(wanted_um)])
+
+
+def _learning(setting: Setting, options: ScanOptions, period_ticks: int) -> Learning:
+    """How the table of one period learns. Raises Unsuited where it would not, and where no model says how."""
+    model, percent = setting.model, options.resonance_percent
+    if model is None or model.loop is None:
+        raise Unsuited(
+            f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
+        )
+    places = [0.0]
+    if model.resonance_hz and percent:
+        places += [float(place) for place in np.linspace(-percent, percent, PLACES) if place]
+    loops = [(f"resonance {place:+g} %", model.with_resonance_shifted(place)) for place in places]
+    try:
+        return learning([(name, loop) for name, loop in loops if loop is not None], period_ticks)
+    except ValueError as error:
+        raise Unsuited(f"axis.{setting.axis.name}.controller: {error}") from None
+
+
+def _measured(taken: Taken, number: int) -> tuple[slice, int]:
+    segment = taken.labelled("scan")[number]
+    ticks = segment.values["period_ticks"]
+    return taken.tail(segment, ticks * segment.values["periods"]), ticks
+
+
+def _table(taken: Taken, number: int) -> Real:
+    """The table (period, 2) that was played."""
+    judged, ticks = _measured(taken, number)
+    reference, feed = taken.read("reference_um", "feed_um")
+    return np.column_stack([reference[judged][:ticks], feed[judged][:ticks]])
+
+
+def _error(taken: Taken, number: int) -> Real:
+    """Wanted minus measured (period,), the mean of all periods that are judged."""
+    judged, ticks = _measured(taken, number)
+    position = taken.signal("position_um")[judged].reshape(-1, ticks).mean(axis=0)
+    return triangle(ticks, float(taken.parameters["amplitude_um"])) - position
+
+
+def _rms(values: Real) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def analyse(recordings: Sequence[Taken], options: ScanOptions) -> Analysis:
+    """Rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
+    rows: list[Row] = []
+    table, traces = [], []
+    extent_um = 2 * options.amplitude_um
+    for number, hz in enumerate(options.frequencies_hz):
+        errors = [_error(taken, number) for taken in recordings]
+        percent = [100 * _rms(error) / extent_um for error in errors]
+        rows += [
+            recordings[0].row("", f"rms error at {hz:g} Hz, {what}", "%", percent[at])
+            for what, at in (("nothing learned", 0), (f"after {len(errors) - 1} cycles", -1))
+        ]
+        table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
+        traces.append((hz, percent, errors[0], errors[-1]))
+    headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error at the end / nm")
+    notes = ["Rms over a period, the mean of those that are judged, as a part of peak to peak; noise that this mean "
+             "takes away is no error of the scan."]  # fmt: skip
+    return Analysis(rows, {"traces": traces}, (Table("Error from cycle to cycle, % of peak to peak", headings, table),),
+                    notes)  # fmt: skip
+
+
+def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+    """Error over a period before and after, and its size from cycle to cycle."""
+    traces = curves["traces"]
+    panels = figure.subplots(1, len(traces) + 1)
+    for panel, (hz, _, first, last) in zip(panels, traces, strict=False):
+        turns = np.arange(first.size) / first.size
+        panel.plot(turns, first, color=ink.faint, label="nothing learned")
+        panel.plot(turns, last, color=ink.error, label="learned")
+        panel.set_yscale("symlog", linthresh=max(1e-3, 2 * float(np.abs(last).max())))
+        ink.label(panel, "period", "error / µm" if panel is panels[0] else "", f"{hz:g} Hz")
+    ink.legend(panels[0])
+    for (hz, percent, *_), colour in zip(traces, (ink.measured, ink.model, ink.error) * len(traces), strict=False):
+        panels[-1].plot(percent, marker="o", markersize=3, color=colour, label=f"{hz:g} Hz")
+    panels[-1].set_yscale("log")
+    ink.label(panels[-1], "cycle", "rms error / % of peak to peak", "From cycle to cycle")
+    ink.legend(panels[-1])
+
+
+EXPERIMENT = Experiment(
+    "scan",
+    "Scans that are learned",
+    "Feedforward and feedback: triangles whose table of reference and command is learned from cycle to cycle.",
+    ScanOptions,
+    runs,
+    analyse,
+    draw,
+    go_on=go_on,
+    largest={"amplitude_um": lambda setting: setting.reach_um},
+    size=(13.0, 4.2),
+)

@@ -1,0 +1,78 @@
+"""Scans that are learned, by real processes: what the recordings say, and that they replay."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.recording.load import load
+from tests.service.test_run import ENVIRONMENT, PAPER
+from tests.soak.aborts import TIMEOUT_S
+
+SLOW = '[axis.controller]\nform = "zpk"\ngain = 60.0\nzeros = []\npoles = [[0.0, 0.0]]\n'
+CYCLES = 2
+
+
+def run(config: Path, folder: Path, *settings: str) -> subprocess.CompletedProcess[str]:
+    sets = [part for one in settings for part in ("--set", f"scan.{one}")]
+    command = [sys.executable, "-m", "rtloop", "experiment", "run", "scan", str(config), *sets, "--json"]
+    command += ["--out", str(folder)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Folder and JSON of a scan that a slow integrator learns."""
+    folder = tmp_path_factory.mktemp("scan")
+    text = PAPER.read_text()
+    begin, end = text.index("[axis.controller]"), text.index("[axis.model]")
+    config = folder / "slow.toml"
+    config.write_text(
+        (text[:begin] + SLOW + text[end:]).replace("paper-spec.toml", str(PAPER.with_name("paper-spec.toml")))
+    )
+    ran = run(config, folder, "frequencies_hz=[50.0]", f"cycles={CYCLES}", "amplitude_um=10.0", "resonance_percent=5.0")
+    assert ran.returncode == 0, ran.stderr
+    return folder, json.loads(ran.stdout)["experiments"][0]
+
+
+def test_a_scan_is_learned_from_recording_to_recording(made):
+    folder, section = made
+    (row,) = section["tables"][0]["rows"]
+    percent = [float(value) for value in row[1 : CYCLES + 2]]
+    assert percent[0] > 10.0
+    assert percent[-1] < percent[0] / 20
+    assert len(section["recordings"]) == CYCLES + 1
+    for cycle, (name, said) in enumerate(zip(section["recordings"], percent, strict=True)):
+        recording = load(folder / name)
+        position = recording["x_position_um"][-2000:].reshape(-1, 200).mean(axis=0)
+        turns = np.arange(200) / 200
+        wanted = 10.0 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * turns))
+        assert 100 * np.sqrt(np.mean((wanted - position) ** 2)) / 20 == pytest.approx(said, abs=1e-3)
+        assert np.any(recording["x_feed_um"]) == (cycle > 0)
+
+
+def test_what_was_learned_replays(made):
+    folder, section = made
+    command = [sys.executable, "-m", "rtloop", "replay", str(folder / section["recordings"][-1])]
+    ran = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_a_loop_that_may_be_unstable_learns_nothing(tmp_path):
+    """The paper's, at a resonance 2 % higher."""
+    ran = run(PAPER, tmp_path)
+    assert ran.returncode == 1
+    assert "resonance +2 %: the loop is unstable there, and no table can be learned in it" in ran.stderr
+    assert not list(tmp_path.glob("*.mcap"))
+
+
+def test_a_frequency_that_the_ticks_do_not_divide(tmp_path):
+    ran = run(PAPER, tmp_path, "frequencies_hz=[30.0]")
+    assert ran.returncode == 78
+    assert "scan.frequencies_hz: 30 Hz is not a whole number of periods of 0.0001 s" in ran.stderr
