@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
-import numpy as np
 
 from rtloop.commands.run import recover_leftovers
 from rtloop.configuration.axis import AxisOptions
@@ -22,7 +21,7 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
-from rtloop.experiments.derive import derived
+from rtloop.experiments.derive import derived, keep_tables
 from rtloop.experiments.page import page
 from rtloop.experiments.procedure import Experiment, Run, Unsuited
 from rtloop.experiments.registry import chosen, parameters
@@ -135,7 +134,7 @@ def _planned(
     values, asked = options.model_dump(mode="json"), setting.asked.model_dump(mode="json", exclude_defaults=True)
 
     def made(run: Run, last: bool) -> Planned:
-        _keep(run, folder)
+        keep_tables(run, folder)
         configuration = derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked)
         return Planned(experiment, run, configuration, further if last and experiment.go_on else None)
 
@@ -145,21 +144,6 @@ def _planned(
         return None if run is None else made(run, True)
 
     return [made(run, run is runs[-1]) for run in runs]
-
-
-def _keep(run: Run, folder: Path) -> None:
-    """Write the tables of a run, and have its references read them. Raises OutputError."""
-    for name, samples in run.tables.items():
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            np.save(folder / name, samples)
-        except OSError as error:
-            raise OutputError(f"{folder / name}: {error.strerror}") from None
-    references = run.timeline.references
-    references[:] = [
-        {**one, "file": str((folder / one["file"]).resolve())} if one.get("file") in run.tables else one
-        for one in references
-    ]
 
 
 def _asked(base: Configuration, axis: AxisOptions) -> SpecificationOptions:

@@ -9,10 +9,14 @@ from __future__ import annotations
 import copy
 import json
 import tomllib
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import section
+from rtloop.errors import OutputError
 from rtloop.experiments.procedure import Run, hold
 
 MARK = "rtloop experiment "
@@ -48,6 +52,21 @@ def derived(
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))
     text = section("", raw, [MARK + json.dumps(about, allow_nan=False), f"derived from {base.name}"])
     return parse(text, name, base.folder, f"{base.name}, experiment {experiment}")
+
+
+def keep_tables(run: Run, folder: Path) -> None:
+    """Write the tables of a run to a folder, and have its references read them there. Raises OutputError."""
+    for name, samples in run.tables.items():
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            np.save(folder / name, samples)
+        except OSError as error:
+            raise OutputError(f"{folder / name}: {error.strerror}") from None
+    references = run.timeline.references
+    references[:] = [
+        {**one, "file": str((folder / one["file"]).resolve())} if one.get("file") in run.tables else one
+        for one in references
+    ]
 
 
 def about(configuration: str) -> dict[str, Any] | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -61,7 +63,7 @@ def test_the_error_shrinks_as_promised_wherever_the_resonance_is(truth_hz):
     learned = found.learned
     assert learned[:10].all()
     assert not learned.all()
-    for before, after in zip(sizes, sizes[1:], strict=False):
+    for before, after in pairwise(sizes):
         assert np.all(after[learned] <= found.contraction[learned] * before[learned] + 1e-6)
         np.testing.assert_allclose(after[~learned], before[~learned], atol=1e-6)
     assert np.linalg.norm(sizes[-1][learned]) < 0.01 * np.linalg.norm(sizes[0][learned])

@@ -21,7 +21,7 @@ from rtloop.hil.modal import Complex, Real
 LARGEST_CONTRACTION = 0.8
 """Of a harmonic's error from one cycle to the next, in the worst of all loops, that is still learned."""
 LEAST_RESPONSE = 0.1
-"""Of the position to reference and command: where it is smaller, noise would be learned, and large commands for little."""
+"""Of the position to reference and command: of less, noise would be learned, and large commands for little."""
 
 
 @dataclass(frozen=True, eq=False)
