@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,19 +68,21 @@ class Measurement:
 
 
 def measurement(
-    signals: dict[str, Real], rate_hz: float, near_hz: float | None = None, model: Loop | None = None
+    signals: Mapping[str, Real], rate_hz: float, near_hz: float | None = None, model: Loop | None = None
 ) -> Measurement:
-    """Of recorded `reference_um`, `error_um`, `command_um` and `position_um`, each (ticks,), one tick a period.
+    """Of recorded `reference_um`, `error_um`, `command_um` and `position_um`, each (ticks,).
 
-    The light mode is looked for near `near_hz`, or else where the plant answers most. Raises ValueError for a
-    reference without a multisine.
+    Periods of the multisine with a tick that has `periods_missed`, where that is given, are left out. The light mode is
+    looked for near `near_hz`, or else where the plant answers most. Raises ValueError for a reference without a
+    multisine, and where fewer than two periods of it are whole.
     """
     reference = signals["reference_um"]
     part = periodic_part(reference)
     if part is None:
         raise ValueError("reference: no part of it repeats itself twice after settling; a multisine is needed")
     grid = part.grid(reference, rate_hz)
-    folded = (part.folded(signals[name]) for name in ("error_um", "command_um", "position_um"))
+    whole = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
+    folded = (part.folded(signals[name])[whole] for name in ("error_um", "command_um", "position_um"))
     found = response(grid, Signals(*folded))
     mode = _mode(found, rate_hz, near_hz)
     loop = measured_loop(found, rate_hz, mode)

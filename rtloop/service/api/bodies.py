@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
 from rtloop.hil.options import LARGEST_INTEGER
+from rtloop.service.measurement import Asked
 
 MAX_BODY_BYTES = 4 << 20
 MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
@@ -77,6 +78,17 @@ class WaveformBody(Body):
     samples: Annotated[list[float], FailFast(), Field(min_length=1)]
     hold_ticks: int = Field(default=1, ge=1, le=MAX_HOLD_TICKS)
     repeat: bool = False
+
+
+class ResponseBody(Body):
+    """What `Asked` says: the added motion at most, in µm, the band, how long, where a light mode is expected."""
+
+    axis: Name
+    amplitude_um: float = Field(default=Asked.amplitude_um, gt=0)
+    from_hz: float | None = Field(default=None, gt=0)
+    to_hz: float | None = Field(default=None, gt=0)
+    duration_s: float = Field(default=Asked.duration_s, ge=1, le=60)
+    near_hz: float | None = Field(default=None, gt=0)
 
 
 class TuneBody(Body):
