@@ -113,6 +113,17 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
     return found
 
 
+def promised_loop(axis: AxisOptions, rate_hz: float) -> Loop | None:
+    """L of an axis with a controller of its own, on its model; None where there is none or nothing linear is known."""
+    law = controller_of(axis, 1 / rate_hz)
+    if axis.model is None or law is None or law.count > 1:
+        return None
+    try:
+        return discrete_loop(linear_part(law), axis.model.transfer(), axis.model.delay_ticks)
+    except ValueError:
+        return None
+
+
 def _check(axis: AxisOptions, period_s: float, findings: Findings) -> AxisCheck:
     """The controller, C(z)'s agreement with C(s), and the loop on the axis's model as far as the law is linear."""
     if axis.controller is None:

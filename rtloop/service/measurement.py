@@ -10,24 +10,21 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from rtloop import signals
-from rtloop.analysis.closed_loop import Loop, discrete_loop
 from rtloop.analysis.measured import excitation
 from rtloop.analysis.measured.measurement import Measurement, measurement
 from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
 from rtloop.analysis.measured.response import Signals
-from rtloop.analysis.perturbation import lightest_pair
-from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.coefficients import controller_of
+from rtloop.analysis.perturbation import resonance_hz
+from rtloop.configuration.checks import promised_loop
 from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
-from rtloop.laws.linearise import linear_part
 from rtloop.service.desk import Refused
 from rtloop.service.live import LiveLaw
 from rtloop.signals import Flag, Mode
@@ -41,6 +38,8 @@ SHORTEST_S, LONGEST_S, LINES_OF_A_MODE = 1.0, 4.0, 2.0
 """Of a period; so long that half the width of the model's lightest mode is so many lines."""
 LOWEST_LINES = 2
 """The lowest frequency, in lines, where none is given."""
+EXCITED = 0.3
+"""Part of a light mode's frequency, to both sides, that is excited for it alone."""
 PATIENCE_S = 2.0
 IN_STEP = "sim"
 """The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
@@ -80,6 +79,8 @@ class Asked:
     to_hz: float | None = None
     duration_s: float = 6.0
     near_hz: float | None = None
+    resonance_only: bool = False
+    """Excite nothing but the band about the light mode."""
 
 
 def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Measurement:
@@ -93,11 +94,15 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
     if len(configuration.together(number)) > 1:
         raise ConfigError("request", [f"axis {axis!r}: shares its controller; a loop of one axis is measured"])
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
-    model = model_loop(options, rate_hz)
-    near_hz, half_width_hz = asked.near_hz, 0.0
-    if options.model is not None and np.any(options.model.transfer().poles.imag > 0):
-        pair = lightest_pair(options.model.transfer())
-        near_hz, half_width_hz = near_hz or abs(pair) / (2 * np.pi), -pair.real / (2 * np.pi)
+    model = promised_loop(options, rate_hz)
+    known = options.model and resonance_hz(options.model.transfer())
+    near_hz, half_width_hz = known or (None, 0.0)
+    near_hz = asked.near_hz or near_hz
+    if asked.resonance_only:
+        if near_hz is None:
+            fault = f"near_hz: missing, and axis {axis!r} has no model with a resonance; it is needed"
+            raise ConfigError("request", [fault])
+        asked = replace(asked, from_hz=(1 - EXCITED) * near_hz, to_hz=(1 + EXCITED) * near_hz)
     lines = _grid(asked, rate_hz, near_hz, half_width_hz)
     periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
     run = _Run(supervisor, live, number, rate_hz)
@@ -110,17 +115,6 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
             return measurement(found, rate_hz, near_hz, model)
         except ValueError as error:
             raise Refused(f"response: {error}") from None
-
-
-def model_loop(axis: AxisOptions, rate_hz: float) -> Loop | None:
-    """L of an axis with a controller of its own as [axis.model] promises it; None where nothing linear is known."""
-    law = controller_of(axis, 1 / rate_hz)
-    if axis.model is None or law is None:
-        return None
-    try:
-        return discrete_loop(linear_part(law), axis.model.transfer(), axis.model.delay_ticks)
-    except ValueError:
-        return None
 
 
 def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> Grid:

@@ -89,6 +89,7 @@ class ResponseBody(Body):
     to_hz: float | None = Field(default=None, gt=0)
     duration_s: float = Field(default=Asked.duration_s, ge=1, le=60)
     near_hz: float | None = Field(default=None, gt=0)
+    resonance_only: bool = False
 
 
 class TuneBody(Body):
