@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ from rtloop.hil.modal import Complex, Real
 class OpenLoop(Protocol):
     """What margins are read off: a loop that was computed, or one that was measured."""
 
-    @property
+    @cached_property
     def frequencies(self) -> Real:
         """A grid in Hz, rising."""
         ...

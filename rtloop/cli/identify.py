@@ -117,7 +117,9 @@ def dynamics(
     return 0
 
 
-NEAR = click.option("--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model].")
+NEAR = click.option(
+    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
+)
 
 
 @identify.command()

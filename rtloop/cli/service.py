@@ -193,7 +193,9 @@ AMPLITUDE = click.option(
 DURATION = click.option(
     "--duration", "duration_s", default=6.0, show_default=True, type=click.FloatRange(1, 60), help="In s, about."
 )
-NEAR = click.option("--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model].")
+NEAR = click.option(
+    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
+)
 
 
 @ctl.command()
@@ -208,7 +210,9 @@ NEAR = click.option("--near-hz", type=click.FloatRange(0, min_open=True), help="
 @JSON
 @click.pass_context
 @fails_clearly
-def response(context: click.Context, axis: str, out: Path | None, plot: Path | None, as_json: bool, **asked: Any) -> int:
+def response(
+    context: click.Context, axis: str, out: Path | None, plot: Path | None, as_json: bool, **asked: Any
+) -> int:
     """Measure the closed loop of AXIS: L, S, margins.
 
     A multisine about the reference that is held, which comes back afterwards, also at Ctrl-C and at any error.

@@ -1,4 +1,4 @@
-"""`rtloop ctl response`, `ctl resonance`, `identify response`, `identify resonance`: a closed loop as it was measured."""
+"""`rtloop ctl response`, `identify response`, and both with `resonance`: a closed loop as it was measured."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from rtloop.experiments.procedures import (
     compensation,
     disturbance,
     harmonic,
+    response,
     robustness,
     sines,
     step_response,
@@ -22,7 +23,7 @@ from rtloop.experiments.procedures import (
 )
 from rtloop.hil.options import Options
 
-MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness)
+MODULES = (characterise, step_response, compensation, steps, sines, harmonic, response, disturbance, robustness)
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}
 
 

@@ -32,6 +32,8 @@ from rtloop.supervision.supervisor import Supervisor
 
 REST_S, FADE_S, POLL_S = 0.2, 0.05, 0.02
 FIRST_PERIODS = 2
+TRIES, LESS = 3, 0.7
+"""How often less is tried, and how much less, where the position went too far."""
 KEPT = 100
 """Measurements of an axis that are remembered."""
 SHORTEST_S, LONGEST_S, LINES_OF_A_MODE = 1.0, 4.0, 2.0
@@ -107,14 +109,11 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
     periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
     run = _Run(supervisor, live, number, rate_hz)
     with run.about_the_reference(asked.amplitude_um):
-        small = excitation.first(lines, asked.amplitude_um)
-        seen = run.signals_of(lines, run.play(small, FIRST_PERIODS))
-        try:
-            large = excitation.second(lines, small, seen, asked.amplitude_um)
-            found = run.play(large, periods)
-            return measurement(found, rate_hz, near_hz, model)
-        except ValueError as error:
-            raise Refused(f"response: {error}") from None
+        found = run.approach(lines, asked.amplitude_um, periods)
+    try:
+        return measurement(found, rate_hz, near_hz, model)
+    except ValueError as error:
+        raise Refused(f"response: {error}") from None
 
 
 def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> Grid:
@@ -125,6 +124,10 @@ def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: fl
         return grid(rate_hz, period_s, from_hz, to_hz, near_hz)
     except ValueError as error:
         raise ConfigError("request", [f"response: {error}"]) from None
+
+
+class _TooFar(Refused):
+    """The position went further than was stated."""
 
 
 class _Run:
@@ -150,7 +153,26 @@ class _Run:
         finally:
             if self._ours:
                 with suppress(RtloopError):
-                    self._live.set_reference(self._axis, {"kind": "hold", "value": self._hold_um})
+                    self._take_back()
+
+    def approach(self, lines: Grid, amplitude_um: float, periods: int) -> dict[str, Real]:
+        """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
+        period = excitation.first(lines, amplitude_um)
+        aims, tries = [*excitation.AIMS], TRIES
+        found = self.play(period, FIRST_PERIODS)
+        while aims:
+            another = excitation.shaped(lines, period, self._whole(lines, found), amplitude_um, aims[0])
+            try:
+                found = self.play(another, FIRST_PERIODS if len(aims) > 1 else periods)
+            except _TooFar:
+                tries -= 1
+                if not tries:
+                    raise
+                self._take_back()
+                aims = [LESS * aim for aim in aims]
+            else:
+                period, aims = another, aims[1:]
+        return found
 
     def play(self, period: Real, periods: int) -> dict[str, Real]:
         """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
@@ -163,10 +185,18 @@ class _Run:
         found = {name: rows[:, column] for name, column in self._columns.items()}
         return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != IN_STEP else {})
 
-    def signals_of(self, lines: Grid, found: dict[str, Real]) -> Signals:
+    def _whole(self, lines: Grid, found: dict[str, Real]) -> Signals:
         """The whole periods behind the one to settle."""
         parts = (found[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
-        return Signals(*(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in parts))
+        return Signals(
+            *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in parts)
+        )
+
+    def _take_back(self) -> None:
+        """Hold what was held, and come to rest."""
+        self._live.set_reference(self._axis, {"kind": "hold", "value": self._hold_um})
+        self._set += 1
+        time.sleep(REST_S)
 
     @property
     def _ours(self) -> bool:
@@ -204,5 +234,5 @@ class _Run:
         position_um = rows[:, self._columns["position_um"]]
         low, high = float(position_um.min()), float(position_um.max())
         if not self._lowest_um <= low <= high <= self._highest_um:
-            raise Refused(f"response: the position went to {low:.4g} … {high:.4g} µm, beyond the stated "
+            raise _TooFar(f"response: the position went to {low:.4g} … {high:.4g} µm, beyond the stated "
                           f"{self._lowest_um:.4g} … {self._highest_um:.4g} µm")  # fmt: skip

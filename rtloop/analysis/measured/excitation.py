@@ -1,7 +1,8 @@
-"""How a loop is excited within a stated motion: a first multisine that is small, and one shaped by what it showed.
+"""How a loop is excited within a stated motion: a first multisine that is small, and others shaped by what was seen.
 
-The second one moves x equally at all lines as far as the command allows that; its phases keep the peak of x low, and
-its size follows from the response of the first.
+Those move x equally at all lines as far as the command allows that; their phases keep the peak of x low, and their size
+follows from the response to the one before. A loop with a dead band answers the more the further it moves: so it is
+approached in steps.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from rtloop.hil.modal import Complex, Real
 
 FIRST_PART = 0.2
 """Of the stated amplitude: the peak of the first reference, so that a loop may amplify it fivefold."""
-AIM = 0.85
-"""Part of the stated amplitude that the second one is to reach."""
+AIMS = (0.35, 0.75)
+"""Parts of the stated amplitude that those behind it are to reach in turn."""
 LARGEST_COMMAND, LARGEST_REFERENCE = 3.0, 10.0
-"""Peaks over the stated amplitude that the second one may ask of the command, and that it may have itself."""
+"""Peaks over the stated amplitude that they may ask of the command, and that they may have themselves."""
 CERTAIN = 3.0
 """A line's response counts as no smaller than so many of its standard deviations."""
 
@@ -28,18 +29,26 @@ def first(grid: Grid, amplitude_um: float) -> Real:
     return wave * (FIRST_PART * amplitude_um / np.abs(wave).max())
 
 
-def second(grid: Grid, played: Real, seen: Signals, amplitude_um: float) -> Real:
-    """A period (samples,) for an added motion of AIM times `amplitude_um`, by what the first one, `played`, showed."""
+def shaped(grid: Grid, played: Real, seen: Signals, amplitude_um: float, aim: float) -> Real:
+    """A period (samples,) for an added motion of `aim` times `amplitude_um`, by what the one `played` before showed."""
     reference = grid.amplitudes(played)
     moved, least = _answer(grid, seen.position, reference)
     asked, _ = _answer(grid, seen.command, reference)
+    return fitting(grid, moved, asked, amplitude_um, aim, least)
+
+
+def fitting(
+    grid: Grid, moved: Complex, asked: Complex, amplitude_um: float, aim: float = AIMS[-1], least: float = 1e-9
+) -> Real:
+    """A period (samples,) for an added motion of `aim` times `amplitude_um`, where a reference gives `moved` of
+    position and `asked` of command at the lines (excited,), and less than `least` of position is not to be told."""
     sizes = 1 / np.maximum(np.abs(moved), least)
     sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(asked), 1e-12))
     sizes = np.minimum(sizes, LARGEST_REFERENCE * np.median(sizes))
-    turned = np.exp(-1j * np.angle(moved))
-    lines = turned * flattened(grid, sizes * np.abs(moved)) / np.abs(moved)
+    flat = flattened(grid, sizes * np.maximum(np.abs(moved), 1e-12))
+    lines = sizes * np.exp(1j * (np.angle(flat) - np.angle(moved)))
     peaks = [_peak(grid, lines * one) for one in (moved, asked, 1.0)]
-    allowed = (AIM, LARGEST_COMMAND, LARGEST_REFERENCE)
+    allowed = (aim, LARGEST_COMMAND, LARGEST_REFERENCE)
     return grid.waveform(lines) * min(amplitude_um * most / peak for most, peak in zip(allowed, peaks, strict=True))
 
 

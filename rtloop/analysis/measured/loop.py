@@ -77,8 +77,8 @@ def measured_loop(found: Response, rate_hz: float, mode: LightMode | None) -> Me
     return MeasuredLoop(found.hz, lifted, std / np.abs(lifted), rate_hz, image)
 
 
-def _lift(hz: Real, rate_hz: float, image: complex | None) -> Complex | float:
-    return 1.0 if image is None else np.exp(2j * np.pi * hz / rate_hz) - image
+def _lift(hz: Real, rate_hz: float, image: complex | None) -> Complex:
+    return np.ones(hz.shape, complex) if image is None else np.exp(2j * np.pi * hz / rate_hz) - image
 
 
 def put_together(place: Real, values: Complex, std: Real) -> tuple[Complex, Real]:

@@ -22,7 +22,7 @@ BAND = 0.2
 BACKGROUND = 3
 LEAST_LINES = 12
 DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
-LARGEST_DAMPING = 0.3
+LEAST_DAMPING, LARGEST_DAMPING = 1e-5, 0.3
 CLEAR = 25.0
 """A mode without which the weighted squares, over their mean, grow by less than this is none."""
 
@@ -56,9 +56,13 @@ def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BA
     fit = _Fit(hz, plant, np.abs(plant) * found.spread[kept], rate_hz)
     start = min(((f, z) for f in hz[1:-1:2] for z in DAMPINGS), key=lambda one: _squares(fit.left(*one)))
     answer = least_squares(
-        lambda values: _parts(fit.left(*values)), start, bounds=([hz[0], 1e-5], [hz[-1], LARGEST_DAMPING]), x_scale=start,
-        xtol=1e-12, ftol=1e-12,
-    )  # fmt: skip
+        lambda values: _parts(fit.left(*values)),
+        start,
+        bounds=([hz[0], LEAST_DAMPING], [hz[-1], LARGEST_DAMPING]),
+        x_scale=start,
+        xtol=1e-12,
+        ftol=1e-12,
+    )
     squares = 2 * answer.cost
     freedom = 2 * lines - 2 * (BACKGROUND + 1) - 2
     scale = max(squares / freedom, 1e-300)
@@ -79,7 +83,8 @@ class _Fit:
         self._points = np.exp(2j * np.pi * hz / rate_hz)
         self._rate_hz, self._std, self._scaled = rate_hz, std, plant / std
         half = 0.5 * (hz[-1] - hz[0])
-        self._smooth = np.vander((hz - hz[0]) / half - 1, BACKGROUND, increasing=True) / std[:, None]
+        powers = np.vander((hz - hz[0]) / half - 1, BACKGROUND, increasing=True)
+        self._smooth = np.asarray(powers / std[:, None], dtype=complex)
 
     def left(self, hz: float, damping: float) -> Complex:
         """With a mode."""
@@ -91,7 +96,7 @@ class _Fit:
         """Without."""
         return self._rest(self._smooth)
 
-    def _rest(self, rows: Complex | Real) -> Complex:
+    def _rest(self, rows: Complex) -> Complex:
         solution, *_ = np.linalg.lstsq(rows, self._scaled, rcond=None)
         return self._scaled - rows @ solution
 

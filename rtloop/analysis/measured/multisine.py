@@ -24,6 +24,8 @@ NEAR = 0.12
 SILENT_OF = 4
 """Of so many candidates in a row, one is left out."""
 FLATTENINGS, CLIPPED = 60, 0.85
+RISING = 0.5
+"""Of the period to settle: so long the reference grows."""
 HIGHEST_PART = 0.45
 """Of the rate: the highest frequency that is excited."""
 
@@ -90,7 +92,7 @@ def _left_out(chosen: Lines, random: np.random.Generator) -> Lines:
 
 def flattened(grid: Grid, sizes: Real, seed: int = 0) -> Complex:
     """Amplitudes of these `sizes` (excited,) with phases that keep the peak of the waveform low."""
-    phases = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
+    phases: Complex = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
     best, lowest = sizes * phases, np.inf
     for _ in range(FLATTENINGS):
         wave = grid.waveform(sizes * phases)
@@ -107,6 +109,6 @@ def played(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
 
     Whatever happens to whoever plays it, the last sample is `hold` and stays.
     """
-    rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / fade_ticks, 1.0))
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / (RISING * period.size), 1.0))
     falling = (0.5 + 0.5 * np.cos(np.pi * np.arange(1, fade_ticks + 1) / fade_ticks)) * np.resize(period, fade_ticks)
     return hold + np.concatenate([rising * period, np.tile(period, periods), falling])

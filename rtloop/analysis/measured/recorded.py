@@ -14,6 +14,8 @@ LEAST_SAMPLES, COMPARED = 64, 32
 STILL = 8
 """So many equal samples in a row end a stretch."""
 LEAST_LINES = 3
+SETTLING = 0.25
+"""Of a period: where less goes before what repeats itself, the first period is left to settle in."""
 EXCITED_PART = 1e-6
 """Of the largest line: above it a line is excited."""
 
@@ -81,6 +83,6 @@ def _repeating(reference: Real, start: int, end: int) -> Periodic | None:
     first = int(differs[differs < middle][-1]) + 1 if np.any(differs < middle) else 0
     last = (int(differs[differs > middle][0]) if np.any(differs > middle) else part.size - samples) + samples
     periods = (last - first) // samples
-    if first == 0:
-        periods -= 1  # nothing before it to settle in
+    if first < SETTLING * samples:
+        periods -= 1
     return Periodic(start + last - periods * samples, samples, periods) if periods >= 2 else None

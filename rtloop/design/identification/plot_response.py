@@ -36,7 +36,9 @@ def plot_response(content: Mapping[str, Any], output: Path) -> None:
     plane.set(xlim=(-SHOWN, SHOWN), ylim=(-SHOWN, SHOWN), aspect="equal")
     magnitude.axhline(1, color="0.6", linewidth=0.6)
     label(magnitude, "frequency / Hz", "|L|", f"loop: gain margin {_told(margins['gain_margin'])}")
-    label(phase, "frequency / Hz", "phase of L / °", f"phase margin {_told(margins['phase_margin_deg'])} °", legend=False)
+    label(
+        phase, "frequency / Hz", "phase of L / °", f"phase margin {_told(margins['phase_margin_deg'])} °", legend=False
+    )
     label(sensitivity, "frequency / Hz", "|S|", f"largest |S| {_told(margins['max_sensitivity'])}")
     label(plane, "Re L", "Im L", f"modulus margin {_told(margins['modulus_margin'])}")
     save(figure, output)

@@ -11,9 +11,10 @@ from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import promised_loop
 from rtloop.design.identification.measured import UnsuitableData, axis_of
+from rtloop.hil.modal import Real
 from rtloop.recording.load import load
 
-SIGNALS = ("reference_um", "error_um", "command_um", "position_um")
+SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
 IN_STEP = "sim"
 """The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 
@@ -26,7 +27,7 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     recording = load(path)
     axis = axis_of(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])
-    signals = dict(zip(SIGNALS, recording.read(*(f"{axis}_{name}" for name in SIGNALS)), strict=True))
+    signals: dict[str, Real] = dict(zip(SIGNALS, recording.read(*(f"{axis}_{name}" for name in SIGNALS)), strict=True))
     if recording.header["driver"]["kind"] != IN_STEP:
         signals["periods_missed"] = recording["periods_missed"]
     described = next(one for one in tomllib.loads(recording.configuration)["axis"] if one["name"] == axis)
