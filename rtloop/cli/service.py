@@ -191,7 +191,15 @@ AMPLITUDE = click.option(
     help="The position is moved by no more than this.",
 )  # fmt: skip
 DURATION = click.option(
-    "--duration", "duration_s", default=6.0, show_default=True, type=click.FloatRange(1, 60), help="In s, about."
+    "--duration",
+    "duration_s",
+    default=6.0,
+    show_default=True,
+    type=click.FloatRange(1, 60),
+    help="Of the largest multisine, in s; smaller ones go before it.",
+)
+PERIOD = click.option(
+    "--period", "period_s", type=click.FloatRange(0.05, 10), help="Of the multisine, in s [by the light mode's width]."
 )
 NEAR = click.option(
     "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
@@ -204,6 +212,7 @@ NEAR = click.option(
 @click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [two lines].")
 @click.option("--to-hz", type=click.FloatRange(0, min_open=True), help="Highest frequency [0.45 of the rate].")
 @DURATION
+@PERIOD
 @NEAR
 @click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
 @click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
@@ -226,6 +235,7 @@ def response(
 @click.argument("axis")
 @AMPLITUDE
 @DURATION
+@PERIOD
 @NEAR
 @JSON
 @click.pass_context

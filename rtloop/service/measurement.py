@@ -36,7 +36,7 @@ TRIES, LESS = 3, 0.7
 """How often less is tried, and how much less, where the position went too far."""
 KEPT = 100
 """Measurements of an axis that are remembered."""
-SHORTEST_S, LONGEST_S, LINES_OF_A_MODE = 1.0, 4.0, 2.0
+SHORTEST_S, SHORTEST_OF_A_MODE_S, LONGEST_S, LINES_OF_A_MODE = 1.0, 0.25, 4.0, 2.0
 """Of a period; so long that half the width of the model's lightest mode is so many lines."""
 LOWEST_LINES = 2
 """The lowest frequency, in lines, where none is given."""
@@ -80,6 +80,8 @@ class Asked:
     from_hz: float | None = None
     to_hz: float | None = None
     duration_s: float = 6.0
+    period_s: float | None = None
+    """Of the multisine: the longer, the denser its lines."""
     near_hz: float | None = None
     resonance_only: bool = False
     """Excite nothing but the band about the light mode."""
@@ -117,8 +119,9 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
 
 
 def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> Grid:
+    shortest_s = SHORTEST_OF_A_MODE_S if asked.resonance_only else SHORTEST_S
     wanted_s = LINES_OF_A_MODE / half_width_hz if half_width_hz else SHORTEST_S
-    period_s = min(max(wanted_s, SHORTEST_S), LONGEST_S, max(asked.duration_s / 3, SHORTEST_S))
+    period_s = asked.period_s or min(max(wanted_s, shortest_s), LONGEST_S, max(asked.duration_s / 3, shortest_s))
     from_hz, to_hz = asked.from_hz or LOWEST_LINES / period_s, asked.to_hz or HIGHEST_PART * rate_hz
     try:
         return grid(rate_hz, period_s, from_hz, to_hz, near_hz)

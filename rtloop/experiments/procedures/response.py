@@ -29,8 +29,8 @@ from rtloop.hil.options import Options
 REST_S = 0.1
 DIGITS = 7
 """Of a reference, behind the point."""
-NEAR, CERTAIN = 0.02, 3.0
-"""How near the model a margin is expected to be: a part of it, or so many of its standard deviations."""
+NEAR, NEAR_MODE, CERTAIN = 0.02, 0.004, 3.0
+"""How near the model a margin, and the resonance, are expected to be: a part of it, or so many standard deviations."""
 ROWS = (("crossover_hz", "crossover", "Hz"), ("gain_margin", "gain margin", "1"),
         ("phase_margin_deg", "phase margin", "°"), ("max_sensitivity", "largest |S|", "1"))  # fmt: skip
 
@@ -89,7 +89,15 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     ]
     if found.mode is not None:
         rows.append(
-            _row(taken, "resonance_hz", "resonance", "Hz", Uncertain(found.mode.hz, found.mode.hz_std), near_hz)
+            _row(
+                taken,
+                "resonance_hz",
+                "resonance",
+                "Hz",
+                Uncertain(found.mode.hz, found.mode.hz_std),
+                near_hz,
+                NEAR_MODE,
+            )
         )
     measured = [
         [label, f"{one.value:.5g}", f"{one.std:.2g}"]
@@ -106,8 +114,10 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     return Analysis(rows, curves, (Table("Standard deviations", ("margin", "measured", "± (1σ)"), measured),), notes)
 
 
-def _row(taken: Taken, name: str, label: str, unit: str, found: Uncertain, model: float | None) -> Row:
-    near = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), NEAR * abs(model or 0.0))
+def _row(
+    taken: Taken, name: str, label: str, unit: str, found: Uncertain, model: float | None, part: float = NEAR
+) -> Row:
+    near = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), part * abs(model or 0.0))
     return taken.row(name, label, unit, found.value, model, near)
 
 

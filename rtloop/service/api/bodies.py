@@ -88,6 +88,7 @@ class ResponseBody(Body):
     from_hz: float | None = Field(default=None, gt=0)
     to_hz: float | None = Field(default=None, gt=0)
     duration_s: float = Field(default=Asked.duration_s, ge=1, le=60)
+    period_s: float | None = Field(default=None, ge=0.05, le=10)
     near_hz: float | None = Field(default=None, gt=0)
     resonance_only: bool = False
 
