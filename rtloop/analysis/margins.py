@@ -4,13 +4,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.search import zero_between
 from rtloop.hil.modal import Complex, Real
+
+
+class OpenLoop(Protocol):
+    """What margins are read off: a loop that was computed, or one that was measured."""
+
+    @cached_property
+    def frequencies(self) -> Real:
+        """A grid in Hz, rising."""
+        ...
+
+    @property
+    def static_gain(self) -> float:
+        """L at 0 Hz; NaN: not known."""
+        ...
+
+    @property
+    def period_s(self) -> float | None:
+        """None in continuous time, or where nothing is known of half the rate."""
+        ...
+
+    def open(self, hz: npt.ArrayLike) -> Complex:
+        """L at frequencies (k,) in Hz."""
+        ...
+
+    def sensitivity(self, hz: npt.ArrayLike) -> Real:
+        """|S| at frequencies (k,) in Hz."""
+        ...
 
 
 class Margins(NamedTuple):
@@ -24,7 +52,7 @@ class Margins(NamedTuple):
     max_sensitivity_hz: float
 
 
-def margins(loop: Loop) -> Margins:
+def margins(loop: OpenLoop) -> Margins:
     """The lowest crossover, the smallest phase margin of all, the smallest factor > 1 that reaches −1, max |S|."""
     hz = loop.frequencies
     response = loop.open(hz)
@@ -36,14 +64,14 @@ def margins(loop: Loop) -> Margins:
     return Margins(crossover, min(phases, default=math.inf), gain, gain_hz, peak, peak_hz)
 
 
-def crossings(loop: Loop) -> list[float]:
+def crossings(loop: OpenLoop) -> list[float]:
     """Frequencies in Hz at which |L| = 1, rising."""
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
     return [zero_between(lambda f: np.abs(loop.open(f)) - 1, *ends) for ends in changes]
 
 
-def _gain_margin(loop: Loop, hz: Real, response: Complex) -> tuple[float, float]:
+def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, float]:
     """Where L is real, negative and above −1: inside the grid and at its ends, where symmetry makes L(z = ±1) real."""
     found = [zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))]
     values = [(complex(loop.open(f)[0]), f) for f in found]
@@ -81,7 +109,7 @@ def _refined(function: Callable[[Real], Real], low: float, high: float) -> tuple
     return best
 
 
-def delay_tolerated(loop: Loop) -> tuple[float, float]:
+def delay_tolerated(loop: OpenLoop) -> tuple[float, float]:
     """The smallest further delay, in s, that takes a stable loop to its limit, and the crossover in Hz where it does.
 
     L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ. inf, NaN: none does.

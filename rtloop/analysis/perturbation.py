@@ -112,3 +112,11 @@ def lightest_pair(plant: Transfer) -> complex:
     if not upper.size:
         raise ValueError("plant: it has no complex poles; at least one resonance is needed")
     return complex(upper[np.argmin(-upper.real / np.abs(upper))])
+
+
+def resonance_hz(plant: Transfer) -> tuple[float, float] | None:
+    """Frequency and half width of the most lightly damped pair of poles; None where all poles are real."""
+    if not np.any(plant.poles.imag > 0):
+        return None
+    pair = lightest_pair(plant)
+    return abs(pair) / (2 * math.pi), -pair.real / (2 * math.pi)

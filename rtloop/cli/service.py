@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
 
 
 @click.command()
@@ -186,6 +186,67 @@ def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repe
         body["command_um"] = columns[1]
     click.echo(json.dumps(_client(context).post("/waveform", body)))
     return 0
+
+
+AMPLITUDE = click.option(
+    "--amplitude-um", default=0.5, show_default=True, type=click.FloatRange(0, min_open=True),
+    help="The position is moved by no more than this.",
+)  # fmt: skip
+DURATION = click.option(
+    "--duration",
+    "duration_s",
+    default=6.0,
+    show_default=True,
+    type=click.FloatRange(1, 60),
+    help="Of the largest multisine, in s; smaller ones go before it.",
+)
+PERIOD = click.option(
+    "--period", "period_s", type=click.FloatRange(0.05, 10), help="Of the multisine, in s [by the light mode's width]."
+)
+NEAR = click.option(
+    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
+)
+
+
+@ctl.command()
+@click.argument("axis")
+@AMPLITUDE
+@click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [two lines].")
+@click.option("--to-hz", type=click.FloatRange(0, min_open=True), help="Highest frequency [0.45 of the rate].")
+@DURATION
+@PERIOD
+@NEAR
+@click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
+@click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
+@JSON
+@click.pass_context
+@fails_clearly
+def response(
+    context: click.Context, axis: str, out: Path | None, plot: Path | None, as_json: bool, **asked: Any
+) -> int:
+    """Measure the closed loop of AXIS: L, S, margins.
+
+    A multisine about the reference that is held, which comes back afterwards, also at Ctrl-C and at any error.
+    """
+    from rtloop.commands.response import show_measured
+
+    return show_measured(_client(context), {"axis": axis, **asked}, out, plot, as_json)
+
+
+@ctl.command()
+@click.argument("axis")
+@AMPLITUDE
+@DURATION
+@PERIOD
+@NEAR
+@JSON
+@click.pass_context
+@fails_clearly
+def resonance(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
+    """Measure the light mode of AXIS in closed loop: frequency and damping."""
+    from rtloop.commands.response import show_measured
+
+    return show_measured(_client(context), {"axis": axis, "resonance_only": True, **asked}, None, None, as_json)
 
 
 @ctl.command()

@@ -15,6 +15,7 @@ from rtloop.experiments.procedures import (
     compensation,
     disturbance,
     harmonic,
+    response,
     robustness,
     scan,
     sines,
@@ -23,7 +24,7 @@ from rtloop.experiments.procedures import (
 )
 from rtloop.hil.options import Options
 
-MODULES = (characterise, step_response, compensation, steps, sines, harmonic, disturbance, robustness, scan)
+MODULES = (characterise, step_response, compensation, steps, sines, harmonic, response, disturbance, robustness, scan)
 EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT for module in MODULES}
 
 

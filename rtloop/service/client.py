@@ -20,13 +20,14 @@ _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 
 
 class _UnixConnection(http.client.HTTPConnection):
-    def __init__(self, path: Path) -> None:
-        super().__init__("localhost", timeout=TIMEOUT_S)
+    def __init__(self, path: Path, timeout_s: float) -> None:
+        super().__init__("localhost", timeout=timeout_s)
         self._path = path
 
     def connect(self) -> None:
         """To the socket's path."""
         self.sock = _connected(self._path)
+        self.sock.settimeout(self.timeout)
 
 
 def _connected(path: Path) -> socket.socket:
@@ -63,9 +64,9 @@ class Client:
         """JSON, or text where it is none. Raises UnavailableError, RtloopError."""
         return self._request("GET", resource, None)
 
-    def post(self, resource: str, body: Mapping[str, Any] | None = None) -> Any:
+    def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
         """The answer. Raises UnavailableError, or RtloopError with what the service says against it."""
-        return self._request("POST", resource, json.dumps(body or {}))
+        return self._request("POST", resource, json.dumps(body or {}), timeout_s)
 
     def watch(self) -> Iterator[dict[str, Any]]:
         """Newest signals, about 20 times a second. Raises UnavailableError."""
@@ -79,8 +80,8 @@ class Client:
         except (OSError, WebSocketException) as error:
             raise UnavailableError(f"{self.path}: {error}") from None
 
-    def _request(self, method: str, resource: str, body: str | None) -> Any:
-        connection = _UnixConnection(self.path)
+    def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
+        connection = _UnixConnection(self.path, timeout_s)
         try:
             connection.request(method, resource, body, {"Content-Type": "application/json"})
             response = connection.getresponse()

@@ -48,6 +48,9 @@ class LiveLaw:
         self._first_spare = prepared.plan.table.size
         self._places = [0] * len(prepared.plan.axes)
         self._unsettled_tick: int | None = None
+        self._playing = [(int(one["kind"]), float(one["parameters"][0])) for one in prepared.plan.generators]
+        self.references_set = [0] * len(prepared.plan.axes)
+        """How often each axis was given another reference."""
 
     def axis_number(self, name: str) -> int:
         """Raises ConfigError for a name that is no axis."""
@@ -111,8 +114,15 @@ class LiveLaw:
     def restore_reference(self, number: int) -> int:
         """The reference that the configuration gives; returns the tick."""
         generator = self.prepared.plan.generators[number]
-        values = [float(generator["kind"]), *generator["parameters"].tolist()]
-        return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=values)
+        return self._submit_reference(number, [float(generator["kind"]), *generator["parameters"].tolist()])
+
+    def held(self, number: int) -> float:
+        """The constant that is the reference of an axis. Raises Refused where it is none."""
+        kind, value = self._playing[number]
+        if kind != Generator.HOLD:
+            name, is_one = self.prepared.plan.axes[number], Generator(kind).name.lower()
+            raise Refused(f"reference of axis {name}: a {is_one}; a hold is needed: `rtloop ctl setpoint {name} VALUE`")
+        return value
 
     def tare(self, number: int, offset_v: float) -> int:
         """Make `offset_v` the reading at position 0; returns the tick."""
@@ -253,7 +263,17 @@ class LiveLaw:
             raise _unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
         if samples.size:
             return self._submit_table(number, values, samples)
-        return self._desk.submit(Kind.SET_REFERENCE, axis=number, values=[float(value) for value in values])
+        return self._submit_reference(number, [float(value) for value in values])
+
+    def _submit_reference(self, number: int, values: list[float], *, table: bool = False) -> int:
+        """Have a generator take over, and note which one it is."""
+        self.references_set[number] += 1
+        if table:
+            tick = self._settling(Kind.SET_REFERENCE, number, values)
+        else:
+            tick = self._desk.submit(Kind.SET_REFERENCE, axis=number, values=values)
+        self._playing[number] = int(values[0]), values[1]
+        return tick
 
     def _in_raw_mode(self) -> bool:
         ring = self._block.ring("ticks")
@@ -271,7 +291,7 @@ class LiveLaw:
         place = 1 - self._places[number]
         values[1] = fixed + (2 * number + place) * room
         table[values[1] : values[1] + samples.size] = samples
-        tick = self._settling(Kind.SET_REFERENCE, number, [float(value) for value in values])
+        tick = self._submit_reference(number, [float(value) for value in values], table=True)
         self._places[number] = place
         return tick
 

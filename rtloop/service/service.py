@@ -32,6 +32,7 @@ from rtloop.recording.file.recover import leftovers, recover
 from rtloop.service.building import expect_changes, prepare_limited
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
+from rtloop.service.measurement import Results
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
@@ -75,6 +76,7 @@ class Service:
         self.results: list[RunResult] = []
         self.supervisor: Supervisor | None = None
         self.live: LiveLaw | None = None
+        self.measured: dict[str, Results] = {}
         self._desk: Desk | None = None
         self._ending, self._reload = threading.Event(), threading.Event()
         self._reloading = threading.Lock()

@@ -29,6 +29,8 @@ def status(service: Service) -> dict[str, Any]:
         "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
         "restarts": len(service.results),
     }
+    if service.measured:
+        report["measured"] = {axis: results.for_json() for axis, results in service.measured.items()}
     return report | timing(service) | newest_signals(service)
 
 

@@ -18,7 +18,7 @@ from rtloop.design.identification.markov import ARX_ORDER, lagged
 from rtloop.design.identification.prediction_error import WORTH, Excitation, model_at_gap
 from rtloop.hil.modal import Real
 
-MOST_TICKS = 3
+MOST_TICKS = 5
 LEAST_SHARE = 0.25
 """Of all changes of the input, squared, that each part of a recording must hold to fit by, or to judge by."""
 NEEDED = 30.0

@@ -49,7 +49,7 @@ class Measured:
 def measured(path: Path, axis: str | None = None) -> Measured:
     """One recording's axis (the only one, if there is one). Raises RecordingError, UnsuitableData."""
     recording = load(path)
-    axis = _axis(recording, axis, path)
+    axis = axis_of(recording, axis, path)
     wanted = ("drive_v", "position_um", "command_um", "adc_v")
     drive, position, command, adc = recording.read(*(f"{axis}_{name}" for name in wanted))
     deadlines, missed, flags = recording.read("deadline_ns", "periods_missed", "flags")
@@ -120,7 +120,8 @@ def _refuse_trip(path: Path, flags: Real) -> None:
     )
 
 
-def _axis(recording: Recording, axis: str | None, path: Path) -> str:
+def axis_of(recording: Recording, axis: str | None, path: Path) -> str:
+    """The one that is meant, the only one by default. Raises RecordingError."""
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:
         return str(axes[0])

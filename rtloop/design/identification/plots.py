@@ -22,28 +22,28 @@ POINTS = 20_000
 
 def plot_hysteresis(fit: HysteresisFit, run: Measured, output: Path) -> None:
     """Measured and modelled loop (Fig 4 of the paper), and the error in time. Raises OutputError, MissingExtra."""
-    figure, (loop, error) = _figure(1, 2)
+    figure, (loop, error) = figure_of(1, 2)
     kept = slice(None, None, max(1, run.drive_v.size // POINTS))
     drive, position = run.drive_v[:-1], run.position_um[1:] - fit.offsets_um[0]
     model = model_output(fit.model, drive)
     loop.plot(drive[kept], position[kept], color="tab:blue", linewidth=2, label="measured")
     loop.plot(drive[kept], model[kept], color="0.15", linewidth=0.8, label="model")
-    _label(loop, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
+    label(loop, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
     error.plot(np.arange(drive.size)[kept] * run.period_s, (position - model)[kept], color="tab:red", linewidth=0.8)
-    _label(error, "time / s", "measured − model / µm", f"{fit.rms_error_um:.3g} µm rms", legend=False)
-    _save(figure, output)
+    label(error, "time / s", "measured − model / µm", f"{fit.rms_error_um:.3g} µm rms", legend=False)
+    save(figure, output)
 
 
 def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, output: Path) -> None:
     """Response and model in time (Fig 5 of the paper) and over frequency. Raises OutputError, MissingExtra."""
-    figure, (time, frequency) = _figure(1, 2)
+    figure, (time, frequency) = figure_of(1, 2)
     offset = run.position_um[0]
     count = min(run.input.size, POINTS)
     time_s = np.arange(count) * run.period_s
     time.plot(time_s, run.position_um[:count], color="tab:blue", linewidth=2, label="measured")
     time.plot(time_s, (fit.model.output(run.input) + offset)[:count], color="0.15", linewidth=0.8, label="model")
-    _label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
+    label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
     if measured is not None:
         kept = measured.trusted
         shown = np.abs(measured.response[kept])
@@ -52,37 +52,39 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     response = fit.model.discrete().response(np.exp(2j * np.pi * hz * run.period_s))[0]
     frequency.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
     modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
-    _label(frequency, "frequency / Hz", "position per input", modes)
-    _save(figure, output)
+    label(frequency, "frequency / Hz", "position per input", modes)
+    save(figure, output)
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
     """y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
-    figure, (whole, rest) = _figure(1, 2)
+    figure, (whole, rest) = figure_of(1, 2)
     command: Real = residual.command_um * np.sin(np.linspace(0, 5 * np.pi, 4000))
     y = compensated(actuator, inverse, command)
     whole.plot(command, y, color="tab:blue", linewidth=1)
-    _label(whole, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
+    label(whole, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
     bound = residual.bound_um(residual.gain)
     rest.plot(command, y - residual.gain * command, color="tab:red", linewidth=1, label="Ω of a sine")
     for sign in (-1, 1):
         rest.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
-    _label(rest, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
-    _save(figure, output)
+    label(rest, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
+    save(figure, output)
 
 
-def _figure(rows: int, columns: int) -> tuple[Any, Any]:
+def figure_of(rows: int, columns: int, size: tuple[float, float] = (12, 5)) -> tuple[Any, Any]:
+    """A figure with its panels. Raises MissingExtra."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
-    figure = Figure(figsize=(12, 5), layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns)
 
 
-def _label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
+def label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
+    """Axes, title, grid."""
     panel.set_xlabel(x)
     panel.set_ylabel(y)
     panel.set_title(title, fontsize=10)
@@ -91,7 +93,8 @@ def _label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> No
         panel.legend(fontsize=8)
 
 
-def _save(figure: Any, output: Path) -> None:
+def save(figure: Any, output: Path) -> None:
+    """Write the PNG. Raises OutputError."""
     try:
         figure.savefig(output, format="png", dpi=110)
     except OSError as error:

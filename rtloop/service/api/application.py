@@ -32,6 +32,7 @@ from rtloop.service.api.bodies import (
     ControllerBody,
     ModeBody,
     ReferenceBody,
+    ResponseBody,
     SetpointBody,
     TuneBody,
     WaveformBody,
@@ -39,7 +40,8 @@ from rtloop.service.api.bodies import (
 from rtloop.service.api.lanes import Busy, Lane, Lanes
 from rtloop.service.api.metrics import metrics_text
 from rtloop.service.desk import Refused, Taken
-from rtloop.service.service import Service
+from rtloop.service.measurement import Asked, Results, measure
+from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, status
 
 WATCH_HZ = 20.0
@@ -78,13 +80,15 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
     "/waveform": (WaveformBody, "Play samples on an axis.",
                   lambda service, body: _tick(_live(service).set_waveform(body.axis, body.columns, body.hold_ticks,
                                                                           body.repeat))),
+    "/response": (ResponseBody, "Measure the response of the closed loop about the reference that is held.",
+                  lambda service, body: _response(service, body)),
     "/tune": (TuneBody, "Change keys of controller, limits, interlocks, prefilter or model.",
               lambda service, body: _tick(_live(service).tune(body.axis, body.section, body.values))),
     "/controller": (ControllerBody, "Verify another controller and swap it in bumplessly.",
                     lambda service, body: _tick(_live(service).load_controller(body.axis, body.controller))),
 }  # fmt: skip
 """Path → body, what it does, how. All are POST; a command's answer is the tick at which it took effect."""
-LANES = {"/stop": Lane.SAFETY, "/reset": Lane.SAFETY,
+LANES = {"/response": Lane.MEASUREMENT, "/stop": Lane.SAFETY, "/reset": Lane.SAFETY,
          "/tune": Lane.BUILD, "/controller": Lane.BUILD, "/reload": Lane.BUILD}  # fmt: skip
 """The rest is ordinary."""
 
@@ -102,6 +106,16 @@ def _reference(service: Service, body: ReferenceBody) -> int:
     except ValueError as error:
         raise ConfigError("reference", [f"reference.{error}"]) from None
     return live.set_waveform(body.axis, samples, table.hold_ticks, table.repeat)
+
+
+def _response(service: Service, body: ResponseBody) -> dict[str, Any]:
+    """Figures and lines; the figures stay with the service."""
+    live, supervisor = _live(service), service.supervisor
+    if supervisor is None or service.state is not State.RUNNING:
+        raise Refused(f"response: the service is {service.state}; a loop that runs is needed")
+    found = measure(supervisor, live, body.axis, Asked(**body.model_dump(exclude={"axis"})))
+    service.measured.setdefault(body.axis, Results()).note(found)
+    return found.for_json()
 
 
 def _setpoint(service: Service, body: SetpointBody) -> int:

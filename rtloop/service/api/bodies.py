@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, mod
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
 from rtloop.hil.options import LARGEST_INTEGER
+from rtloop.service.measurement import Asked
 
 MAX_BODY_BYTES = 4 << 20
 MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
@@ -93,6 +94,19 @@ class WaveformBody(Body):
     def columns(self) -> npt.NDArray[np.float64]:
         """Samples (n, 1), or (n, 2) with what is added to the command."""
         return np.array([self.samples, self.command_um] if self.command_um else [self.samples], float).T
+
+
+class ResponseBody(Body):
+    """What `Asked` says: the added motion at most, in µm, the band, how long, where a light mode is expected."""
+
+    axis: Name
+    amplitude_um: float = Field(default=Asked.amplitude_um, gt=0)
+    from_hz: float | None = Field(default=None, gt=0)
+    to_hz: float | None = Field(default=None, gt=0)
+    duration_s: float = Field(default=Asked.duration_s, ge=1, le=60)
+    period_s: float | None = Field(default=None, ge=0.05, le=10)
+    near_hz: float | None = Field(default=None, gt=0)
+    resonance_only: bool = False
 
 
 class TuneBody(Body):

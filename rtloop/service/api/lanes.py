@@ -9,6 +9,8 @@ from typing import Any
 import anyio.to_thread
 from anyio import CapacityLimiter
 
+from rtloop.values import counted
+
 RETRY = "try again"
 
 
@@ -23,6 +25,8 @@ class Lane(Enum):
     """Stop and reset: bounded by the number of connections alone."""
     BUILD = (1, 8)
     """What builds a law."""
+    MEASUREMENT = (1, 1)
+    """What moves a loop to measure it."""
     ORDINARY = (4, 32)
 
 
@@ -37,7 +41,7 @@ class Lanes:
         """`action` in a thread, when it is its turn. Raises Busy, and what the action raises."""
         limit = lane.value[1]
         if self._there[lane] >= limit:
-            raise Busy(f"{limit} requests of this kind wait already; {RETRY}")
+            raise Busy(f"{counted(limit, 'request')} of this kind wait already; {RETRY}")
         self._there[lane] += 1
         try:
             return await anyio.to_thread.run_sync(action, *arguments, limiter=self._limiters[lane])

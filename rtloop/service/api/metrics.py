@@ -35,6 +35,7 @@ def metrics_text(service: Service) -> str:
         lateness = Gauge("rtloop_lateness_us", "Lateness over the last ticks", ["quantile"], registry=registry)
         for quantile, value in measured["lateness_us"].items():
             lateness.labels(quantile).set(value)
+    _measured(service, registry)
     newest = newest_signals(service)
     trip = Gauge("rtloop_trip", "1 for each cause of the trip in force", ["cause"], registry=registry)
     for cause in newest.get("trip", ()):
@@ -46,3 +47,24 @@ def metrics_text(service: Service) -> str:
             if value is not None:
                 signal.labels(axis, name).set(value)
     return generate_latest(registry).decode()
+
+
+def _measured(service: Service, registry: CollectorRegistry) -> None:
+    """Margins and resonance as they were last measured, with standard deviations."""
+    if not service.measured:
+        return
+    at = Gauge("rtloop_measured_unixtime_seconds", "When the loop was last measured", ["axis"], registry=registry)
+    margin = Gauge("rtloop_margin", "Margin of the loop as last measured", ["axis", "margin"], registry=registry)
+    margin_std = Gauge("rtloop_margin_std", "Its standard deviation", ["axis", "margin"], registry=registry)
+    mode = Gauge("rtloop_resonance", "Light mode as last measured: hz, damping", ["axis", "of"], registry=registry)
+    mode_std = Gauge("rtloop_resonance_std", "Its standard deviation", ["axis", "of"], registry=registry)
+    for axis, results in service.measured.items():
+        newest = results.newest
+        at.labels(axis).set(newest["unix_time_s"])
+        for name, found in newest["margins"].items():
+            if found["value"] is not None:
+                margin.labels(axis, name).set(found["value"])
+                margin_std.labels(axis, name).set(found["std"])
+        for name in ("hz", "damping") if newest["resonance"] else ():
+            mode.labels(axis, name).set(newest["resonance"][name])
+            mode_std.labels(axis, name).set(newest["resonance"][f"{name}_std"])

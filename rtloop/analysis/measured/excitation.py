@@ -1,0 +1,65 @@
+"""How a loop is excited within a stated motion: a first multisine that is small, and others shaped by what was seen.
+
+Those have larger lines where x answers less, as far as the command allows that; their phases keep the peak of x low,
+and their size follows from the response to the one before. A loop with a dead band answers the more the further it
+moves: so it is approached in steps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.analysis.measured.multisine import Grid, flattened
+from rtloop.analysis.measured.response import Signals
+from rtloop.hil.modal import Complex, Real
+
+FIRST_PART = 0.2
+"""Of the stated amplitude: the peak of the first reference, so that a loop may amplify it fivefold."""
+AIMS = (0.35, 0.75)
+"""Parts of the stated amplitude that those behind it are to reach in turn."""
+LARGEST_COMMAND, LARGEST_REFERENCE = 3.0, 10.0
+"""Peaks over the stated amplitude that they may ask of the command, and that they may have themselves."""
+COMPROMISE = 0.5
+"""Between references that are equal at all lines (0) and motions that are (1): most is wanted where |L| is near 1."""
+CERTAIN = 3.0
+"""A line's response counts as no smaller than so many of its standard deviations."""
+
+
+def first(grid: Grid, amplitude_um: float) -> Real:
+    """A period (samples,) of equal lines, small."""
+    wave = grid.waveform(flattened(grid, np.ones(grid.excited.size)))
+    return wave * (FIRST_PART * amplitude_um / np.abs(wave).max())
+
+
+def shaped(grid: Grid, played: Real, seen: Signals, amplitude_um: float, aim: float) -> Real:
+    """A period (samples,) for an added motion of `aim` times `amplitude_um`, by what the one `played` before showed."""
+    reference = grid.amplitudes(played)
+    moved, least = _answer(grid, seen.position, reference)
+    asked, _ = _answer(grid, seen.command, reference)
+    return fitting(grid, moved, asked, amplitude_um, aim, least)
+
+
+def fitting(
+    grid: Grid, moved: Complex, asked: Complex, amplitude_um: float, aim: float = AIMS[-1], least: float | Real = 1e-9
+) -> Real:
+    """A period (samples,) for an added motion of `aim` times `amplitude_um`, where a reference gives `moved` of
+    position and `asked` of command at the lines (excited,), and less than `least` of position is not to be told."""
+    sizes = np.maximum(np.abs(moved), least) ** -COMPROMISE
+    sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(asked), 1e-12))
+    sizes = np.minimum(sizes, LARGEST_REFERENCE * np.median(sizes))
+    flat = flattened(grid, sizes * np.maximum(np.abs(moved), 1e-12))
+    lines = sizes * np.exp(1j * (np.angle(flat) - np.angle(moved)))
+    peaks = [_peak(grid, lines * one) for one in (moved, asked, np.ones_like(moved))]
+    allowed = (aim, LARGEST_COMMAND, LARGEST_REFERENCE)
+    return grid.waveform(lines) * min(amplitude_um * most / peak for most, peak in zip(allowed, peaks, strict=True))
+
+
+def _answer(grid: Grid, signal: Real, reference: Complex) -> tuple[Complex, Real]:
+    """Of a signal (periods, samples) per reference, and the least that stands out of noise, (excited,)."""
+    period = signal.mean(axis=0)
+    noise = np.sqrt(np.mean(np.abs(np.fft.rfft(period)[grid.silent] * 2 / grid.samples) ** 2))
+    return grid.amplitudes(period) / reference, CERTAIN * noise / np.abs(reference)
+
+
+def _peak(grid: Grid, lines: Complex) -> float:
+    return float(np.abs(grid.waveform(lines)).max())

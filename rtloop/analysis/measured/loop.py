@@ -1,0 +1,105 @@
+"""A measured loop as a curve: every line with its neighbours' help, and what lies between the lines.
+
+Neighbours are put together, and values between lines found, of L·(z − λ) where a light mode λ was found: L itself
+turns by half a circle from one line to the next there, and this does not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from rtloop.analysis.measured.mode import LightMode
+from rtloop.analysis.measured.response import Response
+from rtloop.hil.modal import Complex, Real
+
+HALF_WIDTHS = (2, 4, 8, 16)
+"""Of the windows in which neighbouring lines are put together, in lines."""
+CHANCE = 3.0
+"""Standard deviations by which a window's residuals may exceed what the uncertainty explains."""
+POINTS = 8
+"""Between two measured lines."""
+
+
+@dataclass(frozen=True)
+class MeasuredLoop:
+    """L·(z − λ), `lifted` (k,), at `hz` (k,), and the standard deviation of L relative to its magnitude, `spread`."""
+
+    hz: Real
+    lifted: Complex
+    spread: Real
+    rate_hz: float
+    image: complex | None
+    static_gain: float = math.nan
+    period_s: None = None
+    """Nothing is measured at 0 Hz, nor at half the rate."""
+
+    @cached_property
+    def frequencies(self) -> Real:
+        """The lines, and POINTS between each two."""
+        lines = np.arange(self.hz.size)
+        return np.exp(np.interp(np.arange(lines[-1] * POINTS + 1) / POINTS, lines, np.log(self.hz)))
+
+    @property
+    def loop(self) -> Complex:
+        """L at the lines (k,)."""
+        return self.lifted / _lift(self.hz, self.rate_hz, self.image)
+
+    def open(self, hz: npt.ArrayLike) -> Complex:
+        """L."""
+        at = np.atleast_1d(np.asarray(hz, dtype=float))
+        return np.asarray(self._spline(np.log(at)), dtype=complex) / _lift(at, self.rate_hz, self.image)
+
+    def sensitivity(self, hz: npt.ArrayLike) -> Real:
+        """|S|."""
+        return 1 / np.abs(1 + self.open(hz))
+
+    def moved(self, part: complex) -> MeasuredLoop:
+        """With L larger everywhere by `part` of its standard deviation."""
+        lifted = self.lifted * (1 + part * self.spread)
+        return MeasuredLoop(self.hz, lifted, self.spread, self.rate_hz, self.image)
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        return CubicSpline(np.log(self.hz), self.lifted)
+
+
+def measured_loop(found: Response, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
+    """Of a measured response."""
+    image = None if mode is None else mode.image(rate_hz)
+    raw = found.plant * found.controller * _lift(found.hz, rate_hz, image)
+    lifted, std = put_together(np.log(found.hz), raw, found.spread * np.abs(raw))
+    return MeasuredLoop(found.hz, lifted, std / np.abs(lifted), rate_hz, image)
+
+
+def _lift(hz: Real, rate_hz: float, image: complex | None) -> Complex:
+    return np.ones(hz.shape, complex) if image is None else np.exp(2j * np.pi * hz / rate_hz) - image
+
+
+def put_together(place: Real, values: Complex, std: Real) -> tuple[Complex, Real]:
+    """Values (k,) with their neighbours' help, and what is left of their standard deviation.
+
+    About each one a parabola over the widest of HALF_WIDTHS whose residuals are no larger than `std` explains; the
+    value itself where none is.
+    """
+    found, left = values.copy(), std.copy()
+    for i in range(values.size):
+        for half in HALF_WIDTHS:
+            near = slice(max(i - half, 0), i + half + 1)
+            x = place[near] - place[i]
+            if x.size < half + 3:
+                break
+            rows = np.vander(x / np.abs(x).max(), 3, increasing=True) / std[near, None]
+            scaled = values[near] / std[near]
+            inverse = np.linalg.pinv(rows)
+            solution = inverse @ scaled
+            freedom = x.size - 3
+            if np.sum(np.abs(scaled - rows @ solution) ** 2) / freedom > 1 + CHANCE / np.sqrt(freedom):
+                break
+            found[i], left[i] = solution[0], float(np.linalg.norm(inverse[0]))
+    return found, left

@@ -1,0 +1,50 @@
+"""Margins of a measured loop with their standard deviations.
+
+The definitions are those of a computed loop (`rtloop.analysis.margins`), as far as the measured band goes. Uncertainty
+is carried over by what a change of L by one standard deviation does, in magnitude and in phase.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from rtloop.analysis.margins import Margins, margins
+from rtloop.analysis.measured.loop import MeasuredLoop
+
+
+class Uncertain(NamedTuple):
+    """A value with its standard deviation; NaN: not in the measured band."""
+
+    value: float
+    std: float
+
+
+@dataclass(frozen=True)
+class MeasuredMargins:
+    """Frequencies in Hz, phase in degrees, gain as a factor, the modulus margin min |1 + L|."""
+
+    crossover_hz: Uncertain
+    phase_margin_deg: Uncertain
+    gain_margin: Uncertain
+    gain_margin_hz: Uncertain
+    modulus_margin: Uncertain
+    max_sensitivity: Uncertain
+    max_sensitivity_hz: Uncertain
+
+
+def measured_margins(loop: MeasuredLoop) -> MeasuredMargins:
+    """Of a measured loop."""
+    half = math.sqrt(0.5)  # of each part of a complex number
+    here, *moved = (margins(loop.moved(part)) for part in (0, half, 1j * half))
+
+    def uncertain(name: str) -> Uncertain:
+        value = getattr(here, name)
+        if not math.isfinite(value):
+            return Uncertain(math.nan, math.nan)
+        return Uncertain(value, math.hypot(*(getattr(one, name) - value for one in moved)))
+
+    fields = {name: uncertain(name) for name in Margins._fields}
+    peak = fields["max_sensitivity"]
+    return MeasuredMargins(modulus_margin=Uncertain(1 / peak.value, peak.std / peak.value**2), **fields)

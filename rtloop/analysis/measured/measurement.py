@@ -1,0 +1,98 @@
+"""All that a measured run of a closed loop says of it, and how that is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.margins import margins
+from rtloop.analysis.measured.loop import MeasuredLoop, measured_loop
+from rtloop.analysis.measured.margins import MeasuredMargins, measured_margins
+from rtloop.analysis.measured.mode import BAND, LEAST_LINES, LightMode, light_mode
+from rtloop.analysis.measured.recorded import periodic_part
+from rtloop.analysis.measured.response import Response, Signals, response
+from rtloop.hil.modal import Real
+from rtloop.values import fields_of, plain
+
+CERTAIN = 0.1
+"""Relative uncertainty up to which a line is compared with the model's."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A response with its margins, the light mode where one stands out, and the loop that the model promises."""
+
+    response: Response
+    loop: MeasuredLoop
+    margins: MeasuredMargins
+    mode: LightMode | None
+    model: Loop | None
+
+    def figures(self) -> dict[str, Any]:
+        """What status and metrics tell: no curves."""
+        found = self.response
+        return plain(
+            {
+                "periods": found.periods,
+                "lines": found.hz.size,
+                "from_hz": found.hz[0],
+                "to_hz": found.hz[-1],
+                "moved_um": found.moved_um,
+                "margins": self.margins,
+                "resonance": self.mode,
+                "model": self._model_figures(),
+            }
+        )
+
+    def for_json(self) -> dict[str, Any]:
+        """Figures, and every line."""
+        found, loop = self.response, self.loop.loop
+        curves = fields_of(found) | {"loop": loop, "loop_spread": self.loop.spread}
+        curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
+        if self.model is not None:
+            curves["model_loop"] = self.model.open(found.hz)
+        return plain(self.figures() | {"response": curves})
+
+    def _model_figures(self) -> dict[str, Any] | None:
+        """Margins that the model has, and how much larger the measured loop's gain is, in the median."""
+        if self.model is None:
+            return None
+        certain = self.loop.spread < CERTAIN
+        ratio = np.abs(self.loop.loop / self.model.open(self.loop.hz))[certain]
+        return {"margins": margins(self.model), "gain_ratio": np.median(ratio) if ratio.size else math.nan}
+
+
+def measurement(
+    signals: Mapping[str, Real], rate_hz: float, near_hz: float | None = None, model: Loop | None = None
+) -> Measurement:
+    """Of recorded `reference_um`, `error_um`, `command_um` and `position_um`, each (ticks,).
+
+    Periods of the multisine with a tick that has `periods_missed`, where that is given, are left out. The light mode is
+    looked for near `near_hz`, or else where the plant answers most. Raises ValueError for a reference without a
+    multisine, and where fewer than two periods of it are whole.
+    """
+    reference = signals["reference_um"]
+    part = periodic_part(reference)
+    if part is None:
+        raise ValueError("reference: no part of it repeats itself twice after settling; a multisine is needed")
+    grid = part.grid(reference, rate_hz)
+    whole = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
+    folded = (part.folded(signals[name])[whole] for name in ("error_um", "command_um", "position_um"))
+    found = response(grid, Signals(*folded))
+    mode = _mode(found, rate_hz, near_hz)
+    loop = measured_loop(found, rate_hz, mode)
+    return Measurement(found, loop, measured_margins(loop), mode, model)
+
+
+def _mode(found: Response, rate_hz: float, near_hz: float | None) -> LightMode | None:
+    if near_hz is None:
+        certain = np.where(found.spread < CERTAIN, np.abs(found.plant), 0.0)
+        near_hz = float(found.hz[np.argmax(certain)])
+    if np.count_nonzero(np.abs(found.hz / near_hz - 1) <= BAND) < LEAST_LINES:
+        return None
+    return light_mode(found, rate_hz, near_hz)

@@ -1,0 +1,113 @@
+"""A light mode in a measured plant response: its frequency and damping with their standard deviations.
+
+    D(z) ≈ ρ/(z − λ) + c_0 + c_1 x + c_2 x²,     λ = exp((−ζ + j√(1 − ζ²)) ω_0 T),   x = (f − f_c)/(half the band)
+
+over a band about it: all else in D, delays and the mode's own conjugate included, is smooth there (local rational
+method; McKelvey & Guérin 2012). ρ and c are complex and linear; ω_0 and ζ minimise the residuals weighted by the
+measurement's own uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rtloop.analysis.measured.response import Response
+from rtloop.hil.modal import Complex, Real
+
+BAND = 0.2
+"""Part of the frequency, to both sides of the mode, that is fitted."""
+BACKGROUND = 3
+LEAST_LINES = 12
+DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
+LEAST_DAMPING, LARGEST_DAMPING = 1e-5, 0.3
+CLEAR = 25.0
+"""A mode without which the weighted squares, over their mean, grow by less than this is none."""
+
+
+@dataclass(frozen=True)
+class LightMode:
+    """Frequency in Hz and damping ratio of a pair of poles, with standard deviations; the band that was fitted.
+
+    `misfit` is the residuals' rms over what the measurement's uncertainty explains.
+    """
+
+    hz: float
+    hz_std: float
+    damping: float
+    damping_std: float
+    from_hz: float
+    to_hz: float
+    misfit: float
+
+    def image(self, rate_hz: float) -> complex:
+        """λ, of positive imaginary part."""
+        return _image(self.hz, self.damping, rate_hz)
+
+
+def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
+    """The mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines there."""
+    kept = np.abs(found.hz / near_hz - 1) <= band
+    if (lines := int(kept.sum())) < LEAST_LINES:
+        raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; {LEAST_LINES} are needed")
+    hz, plant = found.hz[kept], found.plant[kept]
+    fit = _Fit(hz, plant, np.abs(plant) * found.spread[kept], rate_hz)
+    start = min(((f, z) for f in hz[1:-1:2] for z in DAMPINGS), key=lambda one: _squares(fit.left(*one)))
+    answer = least_squares(
+        lambda values: _parts(fit.left(*values)),
+        start,
+        bounds=([hz[0], LEAST_DAMPING], [hz[-1], LARGEST_DAMPING]),
+        x_scale=start,
+        xtol=1e-12,
+        ftol=1e-12,
+    )
+    squares = 2 * answer.cost
+    freedom = 2 * lines - 2 * (BACKGROUND + 1) - 2
+    scale = max(squares / freedom, 1e-300)
+    if (_squares(fit.smooth_left()) - squares) / scale < CLEAR:
+        return None
+    # a complex residual of standard deviation 1 has parts of variance ½
+    std = np.sqrt(np.diag(np.linalg.inv(answer.jac.T @ answer.jac)) * max(0.5, scale))
+    f, z = answer.x
+    return LightMode(
+        float(f), float(std[0]), float(z), float(std[1]), float(hz[0]), float(hz[-1]), float(np.sqrt(2 * scale))
+    )
+
+
+class _Fit:
+    """Residuals of D at `hz` (k,), in standard deviations."""
+
+    def __init__(self, hz: Real, plant: Complex, std: Real, rate_hz: float) -> None:
+        self._points = np.exp(2j * np.pi * hz / rate_hz)
+        self._rate_hz, self._std, self._scaled = rate_hz, std, plant / std
+        half = 0.5 * (hz[-1] - hz[0])
+        powers = np.vander((hz - hz[0]) / half - 1, BACKGROUND, increasing=True)
+        self._smooth = np.asarray(powers / std[:, None], dtype=complex)
+
+    def left(self, hz: float, damping: float) -> Complex:
+        """With a mode."""
+        pole = _image(hz, damping, self._rate_hz)
+        mode = (abs(1 - abs(pole)) / (self._points - pole) / self._std)[:, None]
+        return self._rest(np.hstack([mode, self._smooth]))
+
+    def smooth_left(self) -> Complex:
+        """Without."""
+        return self._rest(self._smooth)
+
+    def _rest(self, rows: Complex) -> Complex:
+        solution, *_ = np.linalg.lstsq(rows, self._scaled, rcond=None)
+        return self._scaled - rows @ solution
+
+
+def _image(hz: float, damping: float, rate_hz: float) -> complex:
+    return complex(np.exp(complex(-damping, np.sqrt(1 - damping**2)) * 2 * np.pi * hz / rate_hz))
+
+
+def _parts(values: Complex) -> Real:
+    return np.concatenate([values.real, values.imag])
+
+
+def _squares(values: Complex) -> float:
+    return float(np.sum(np.abs(values) ** 2))

@@ -1,0 +1,114 @@
+"""Multisines of odd harmonics: periodic, of low crest factor, and silent at lines that show what is not linear.
+
+    r_k = Σ A_l cos(2π l k/N + φ_l)        l odd, some of them left out
+
+A static nonlinearity answers at lines that are not excited as well; noise is there too. What is found at the silent
+lines nearby is therefore the uncertainty of what is found at an excited one (Pintelon & Schoukens, System
+Identification, 2012, chapter 4). The crest factor is lowered by clipping in time and keeping the amplitudes in
+frequency (Van der Ouderaa, Schoukens & Renneboog 1988).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.hil.modal import Complex, Real
+
+Lines = npt.NDArray[np.int64]
+PER_DECADE = 100
+NEAR = 0.12
+"""Part of a resonance's frequency, to both sides, within which every odd line is a candidate."""
+SILENT_OF = 4
+"""Of so many candidates in a row, one is left out."""
+FLATTENINGS, CLIPPED = 60, 0.85
+RISING = 0.5
+"""Of the period to settle: so long the reference grows."""
+HIGHEST_PART = 0.45
+"""Of the rate: the highest frequency that is excited."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A period of `samples` at `rate_hz`; `excited` and `silent` are numbers of harmonics, each rising."""
+
+    samples: int
+    rate_hz: float
+    excited: Lines
+    silent: Lines
+
+    @property
+    def hz(self) -> Real:
+        """Of the excited lines."""
+        return self.excited * self.rate_hz / self.samples
+
+    def waveform(self, amplitudes: Complex) -> Real:
+        """One period (samples,) of complex `amplitudes` at the excited lines."""
+        spectrum = np.zeros(self.samples // 2 + 1, complex)
+        spectrum[self.excited] = amplitudes * self.samples / 2
+        return np.fft.irfft(spectrum, self.samples)
+
+    def amplitudes(self, period: Real) -> Complex:
+        """Of a period, or several, (…, samples), at the excited lines: (…, excited)."""
+        return np.fft.rfft(period)[..., self.excited] * (2 / self.samples)
+
+
+def grid(
+    rate_hz: float, period_s: float, from_hz: float, to_hz: float, near_hz: float | None = None, seed: int = 0
+) -> Grid:
+    """Odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
+
+    Raises ValueError where fewer than three lines lie there, or the band reaches beyond HIGHEST_PART of the rate.
+    """
+    samples = round(period_s * rate_hz)
+    if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:
+        raise ValueError(
+            f"{from_hz:g} … {to_hz:g} Hz: rising frequencies, up to {HIGHEST_PART * rate_hz:g} Hz, are allowed"
+        )
+    first, last = (hz * samples / rate_hz for hz in (from_hz, to_hz))
+    odd = np.arange(2 * int(np.ceil((first - 1) / 2)) + 1, np.floor(last) + 1, 2, dtype=np.int64)
+    if odd.size < 3:
+        raise ValueError(f"{from_hz:g} … {to_hz:g} Hz: {odd.size} odd lines of {rate_hz / samples:g} Hz; 3 are needed")
+    decades = np.log10(odd[-1] / odd[0])
+    targets = np.geomspace(odd[0], odd[-1], max(2, round(PER_DECADE * decades)))
+    chosen = np.unique(odd[np.abs(odd[:, None] - targets[None, :]).argmin(axis=0)])
+    if near_hz is not None:
+        line = near_hz * samples / rate_hz
+        chosen = np.union1d(chosen, odd[np.abs(odd - line) <= NEAR * line])
+    left_out = _left_out(chosen, np.random.default_rng(seed))
+    excited = np.setdiff1d(chosen, left_out)
+    silent = np.setdiff1d(np.arange(max(1, odd[0] - 1), odd[-1] + 2), excited)
+    return Grid(samples, rate_hz, excited, silent)
+
+
+def _left_out(chosen: Lines, random: np.random.Generator) -> Lines:
+    """One of each SILENT_OF neighbours that would leave no odd line silent between them; never an end."""
+    runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 2) + 1)
+    groups = [run[i : i + SILENT_OF] for run in runs for i in range(1, run.size - SILENT_OF, SILENT_OF)]
+    return np.array([random.choice(group) for group in groups], dtype=np.int64)
+
+
+def flattened(grid: Grid, sizes: Real, seed: int = 0) -> Complex:
+    """Amplitudes of these `sizes` (excited,) with phases that keep the peak of the waveform low."""
+    phases: Complex = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
+    best, lowest = sizes * phases, np.inf
+    for _ in range(FLATTENINGS):
+        wave = grid.waveform(sizes * phases)
+        peak = float(np.abs(wave).max())
+        if peak < lowest:
+            best, lowest = sizes * phases, peak
+        clipped = grid.amplitudes(np.clip(wave, -CLIPPED * peak, CLIPPED * peak))
+        phases = np.exp(1j * np.angle(clipped))
+    return best
+
+
+def played(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
+    """About `hold`: one period to settle that begins gently, `periods` of them, and back to `hold` within a fade.
+
+    Whatever happens to whoever plays it, the last sample is `hold` and stays.
+    """
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / (RISING * period.size), 1.0))
+    falling = (0.5 + 0.5 * np.cos(np.pi * np.arange(1, fade_ticks + 1) / fade_ticks)) * np.resize(period, fade_ticks)
+    return hold + np.concatenate([rising * period, np.tile(period, periods), falling])

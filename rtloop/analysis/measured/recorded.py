@@ -1,0 +1,88 @@
+"""A multisine found in a recorded reference, from the record alone: where it repeats itself to the last bit."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.measured.multisine import Grid
+from rtloop.hil.modal import Real
+
+LEAST_SAMPLES, COMPARED = 64, 32
+"""Of a period, and those by which a repetition is first looked for."""
+STILL = 8
+"""So many equal samples in a row end a stretch."""
+LEAST_LINES = 3
+SETTLING = 0.25
+"""Of a period: where less goes before what repeats itself, the first period is left to settle in."""
+EXCITED_PART = 1e-6
+"""Of the largest line: above it a line is excited."""
+
+
+class Periodic(NamedTuple):
+    """Whole periods of a reference after one to settle: ticks `start` … `start + periods·samples`."""
+
+    start: int
+    samples: int
+    periods: int
+
+    @property
+    def ticks(self) -> slice:
+        """All of them."""
+        return slice(self.start, self.start + self.samples * self.periods)
+
+    def folded(self, signal: Real) -> Real:
+        """Of a signal (ticks,): (periods, samples)."""
+        return signal[self.ticks].reshape(self.periods, self.samples)
+
+    def grid(self, reference: Real, rate_hz: float) -> Grid:
+        """The lines that are excited, and the silent ones between them. Raises ValueError for fewer than three."""
+        sizes = np.abs(np.fft.rfft(reference[self.start : self.start + self.samples]))
+        sizes[0] = 0.0
+        excited = np.flatnonzero(sizes > EXCITED_PART * sizes.max())
+        if excited.size < LEAST_LINES:
+            raise ValueError(f"{excited.size} lines are excited; at least {LEAST_LINES} are needed")
+        silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
+        if not silent.size:
+            raise ValueError("every line is excited; some must be silent, to tell noise and nonlinearity by")
+        return Grid(self.samples, rate_hz, excited, silent)
+
+
+def periodic_part(reference: Real) -> Periodic | None:
+    """The longest part of a reference (ticks,) that repeats itself at least twice after settling; None without one.
+
+    Of equally long ones it is the last.
+    """
+    found = [part for start, end in _stretches(reference) if (part := _repeating(reference, start, end))]
+    return max(reversed(found), key=lambda part: part.samples * part.periods, default=None)
+
+
+def _stretches(reference: Real) -> list[tuple[int, int]]:
+    """Where it moves: first and last tick + 1 of each, standing still for less than STILL ticks in between."""
+    moving = np.flatnonzero(np.diff(reference) != 0)
+    if not moving.size:
+        return []
+    gaps = np.flatnonzero(np.diff(moving) > STILL)
+    starts, ends = moving[np.concatenate([[0], gaps + 1])], moving[np.concatenate([gaps, [moving.size - 1]])] + 2
+    return [(int(a), int(b)) for a, b in zip(starts, ends, strict=True) if b - a >= 3 * LEAST_SAMPLES]
+
+
+def _repeating(reference: Real, start: int, end: int) -> Periodic | None:
+    part = reference[start:end]
+    middle = part.size // 2
+    again = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES
+    for samples in again.tolist():
+        if middle + samples + COMPARED > part.size:
+            return None
+        if np.array_equal(part[middle : middle + COMPARED], part[middle + samples : middle + samples + COMPARED]):
+            break
+    else:
+        return None
+    differs = np.flatnonzero(part[:-samples] != part[samples:])
+    first = int(differs[differs < middle][-1]) + 1 if np.any(differs < middle) else 0
+    last = (int(differs[differs > middle][0]) if np.any(differs > middle) else part.size - samples) + samples
+    periods = (last - first) // samples
+    if first < SETTLING * samples:
+        periods -= 1
+    return Periodic(start + last - periods * samples, samples, periods) if periods >= 2 else None

@@ -1,0 +1,102 @@
+"""The response of a closed loop to a periodic reference: plant, controller, loop and sensitivity, with uncertainty.
+
+    x = D v + n,   v = C (w − x) + v_r,   w = e + x        D̂ = X/V,   Ĉ = (V − V_r)/E,   L̂ = Ĉ D̂,   S = 1/(1 + L)
+
+X, V, E are means over the periods. All answer to the same reference, which owes nothing to the noise n: unlike a
+spectral estimate of v and x alone, which tends to −1/C, this finds D whatever the noise (joint input-output
+identification; Ljung 1999, section 13.5; Pintelon & Schoukens 2012, section 2.6.4). Of the plant the loop turns n into
+S n at x, so that
+
+    σ(D̂)/|D| = σ(L̂)/|L| = σ(X)/(|S| |X|)
+
+σ(X) is what is found at silent lines nearby: noise, and what is not linear. That of the noise alone follows from the
+differences between the periods.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtloop.analysis.measured.multisine import Grid
+from rtloop.hil.modal import Complex, Real
+
+SILENT_NEARBY = 10
+"""Silent lines, the nearest ones, whose mean power is the uncertainty of an excited one."""
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Whole periods at the same reference, each (periods, samples): error, command and position, µm.
+
+    `direct` is the part of the command that comes from the reference past the controller, (samples,).
+    """
+
+    error: Real
+    command: Real
+    position: Real
+    direct: Real | None = None
+
+
+@dataclass(frozen=True)
+class Response:
+    """At `hz` (k,): plant D and controller C as measured, with their uncertainty.
+
+    `spread` is the standard deviation of D̂, and of C D̂, relative to its magnitude, of noise and nonlinearity together;
+    `spread_of_noise` that of noise alone. `coherence` is the part of the position's power at a line that repeats from
+    period to period. `moved_um` is how far the position went from its mean.
+    """
+
+    hz: Real
+    plant: Complex
+    controller: Complex
+    spread: Real
+    spread_of_noise: Real
+    coherence: Real
+    periods: int
+    moved_um: float
+
+
+def response(grid: Grid, signals: Signals) -> Response:
+    """Of at least two periods. Raises ValueError for fewer, and for a loop that did not answer."""
+    periods = len(signals.position)
+    if periods < 2:
+        raise ValueError(f"{periods} periods; at least 2 are needed")
+    x, v, e = (grid.amplitudes(one) for one in (signals.position, signals.command, signals.error))
+    past = 0.0 if signals.direct is None else grid.amplitudes(signals.direct)
+    mean_x, mean_v, mean_e = (one.mean(axis=0) for one in (x, v, e))
+    if not (np.all(mean_v) and np.all(mean_e) and np.all(mean_x)):
+        raise ValueError("the loop does not answer: command, error or position stands still")
+    variance = (np.abs(x - mean_x) ** 2).sum(axis=0) / (periods - 1)
+    noise = _smooth(variance / periods)
+    total = np.maximum(_at_silent_lines(grid, signals.position.mean(axis=0)), noise)
+    plant, controller = mean_x / mean_v, (mean_v - past) / mean_e
+    factor = np.abs(1 + plant * controller) / np.abs(mean_x)
+    power = np.abs(mean_x) ** 2
+    about = signals.position - signals.position.mean()
+    return Response(
+        grid.hz,
+        plant,
+        controller,
+        factor * np.sqrt(total),
+        factor * np.sqrt(noise),
+        power / (power + _smooth(variance)),
+        periods,
+        float(np.abs(about).max()),
+    )
+
+
+def _smooth(power: Real) -> Real:
+    """Mean over neighbouring lines: of few periods, that of one line says little."""
+    kernel = np.ones(min(9, power.size))
+    return np.convolve(power, kernel, "same") / np.convolve(np.ones_like(power), kernel, "same")
+
+
+def _at_silent_lines(grid: Grid, period: Real) -> Real:
+    """Mean power of the silent lines that are nearest to each excited one, (excited,)."""
+    power = np.abs(np.fft.rfft(period)[grid.silent] * (2 / grid.samples)) ** 2
+    summed = np.concatenate([[0.0], np.cumsum(power)])
+    width = min(SILENT_NEARBY, power.size)
+    first = np.clip(np.searchsorted(grid.silent, grid.excited) - width // 2, 0, power.size - width)
+    return (summed[first + width] - summed[first]) / width

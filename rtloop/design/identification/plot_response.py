@@ -1,0 +1,58 @@
+"""A picture of a measured loop over the model's: L in magnitude and phase, |S|, and L near −1."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.design.identification.plots import figure_of, label, save
+from rtloop.hil.modal import Complex, Real
+
+MEASURED, PROMISED = "tab:blue", "0.15"
+SHOWN = 2.0
+"""Of the plane of L, to each side."""
+
+
+def plot_response(content: Mapping[str, Any], output: Path) -> None:
+    """Of a `Measurement` as it is told in JSON. Raises OutputError, MissingExtra."""
+    curves = content["response"]
+    hz, loop, spread = np.array(curves["hz"]), _complex(curves["loop"]), np.array(curves["loop_spread"], float)
+    model = _complex(curves["model_loop"]) if "model_loop" in curves else None
+    figure, ((magnitude, plane), (phase, sensitivity)) = figure_of(2, 2, (12, 8))
+    margins = content["margins"]
+    _with_spread(magnitude, hz, np.abs(loop), np.abs(loop) * spread)
+    _with_spread(sensitivity, hz, 1 / np.abs(1 + loop), np.abs(loop) * spread / np.abs(1 + loop) ** 2)
+    phase.semilogx(hz, np.degrees(np.unwrap(np.angle(loop))), ".-", color=MEASURED, markersize=3, linewidth=0.8)
+    plane.plot(loop.real, loop.imag, ".-", color=MEASURED, markersize=3, linewidth=0.8, label="measured")
+    if model is not None:
+        magnitude.loglog(hz, np.abs(model), color=PROMISED, linewidth=0.8, label="model")
+        sensitivity.loglog(hz, 1 / np.abs(1 + model), color=PROMISED, linewidth=0.8, label="model")
+        phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=PROMISED, linewidth=0.8)
+        plane.plot(model.real, model.imag, color=PROMISED, linewidth=0.8, label="model")
+    plane.plot([-1], [0], "+", color="tab:red", markersize=10)
+    plane.set(xlim=(-SHOWN, SHOWN), ylim=(-SHOWN, SHOWN), aspect="equal")
+    magnitude.axhline(1, color="0.6", linewidth=0.6)
+    label(magnitude, "frequency / Hz", "|L|", f"loop: gain margin {_told(margins['gain_margin'])}")
+    label(
+        phase, "frequency / Hz", "phase of L / °", f"phase margin {_told(margins['phase_margin_deg'])} °", legend=False
+    )
+    label(sensitivity, "frequency / Hz", "|S|", f"largest |S| {_told(margins['max_sensitivity'])}")
+    label(plane, "Re L", "Im L", f"modulus margin {_told(margins['modulus_margin'])}")
+    save(figure, output)
+
+
+def _with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
+    panel.loglog(hz, size, ".-", color=MEASURED, markersize=3, linewidth=0.8, label="measured")
+    panel.fill_between(hz, np.maximum(size - 2 * std, 1e-9), size + 2 * std, color=MEASURED, alpha=0.2, label="±2σ")
+
+
+def _complex(pairs: Any) -> Complex:
+    found = np.array(pairs, dtype=float)
+    return found[:, 0] + 1j * found[:, 1]
+
+
+def _told(found: Mapping[str, float | None]) -> str:
+    return "–" if found["value"] is None else f"{found['value']:.4g} ± {found['std']:.2g}"

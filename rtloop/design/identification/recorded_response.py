@@ -1,0 +1,42 @@
+"""The response of a closed loop from a recording of it, as it is measured on a loop that runs."""
+
+from __future__ import annotations
+
+import tomllib
+from contextlib import suppress
+from pathlib import Path
+
+from rtloop.analysis.measured.measurement import Measurement, measurement
+from rtloop.analysis.perturbation import resonance_hz
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import promised_loop
+from rtloop.design.identification.measured import UnsuitableData, axis_of
+from rtloop.hil.modal import Real
+from rtloop.recording.load import load
+
+SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
+IN_STEP = "sim"
+"""The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
+
+
+def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> Measurement:
+    """From the longest multisine in the reference of an axis (the only one, if there is one).
+
+    The model is that of the recorded configuration. Raises RecordingError, UnsuitableData.
+    """
+    recording = load(path)
+    axis = axis_of(recording, axis, path)
+    rate_hz = float(recording.header["rate_hz"])
+    signals: dict[str, Real] = dict(zip(SIGNALS, recording.read(*(f"{axis}_{name}" for name in SIGNALS)), strict=True))
+    if recording.header["driver"]["kind"] != IN_STEP:
+        signals["periods_missed"] = recording["periods_missed"]
+    described = next(one for one in tomllib.loads(recording.configuration)["axis"] if one["name"] == axis)
+    model, known = None, None
+    with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
+        options = AxisOptions.model_validate(described)
+        model, known = promised_loop(options, rate_hz), options.model and resonance_hz(options.model.transfer())
+    near_hz = near_hz or (known[0] if known else None)
+    try:
+        return measurement(signals, rate_hz, near_hz, model)
+    except ValueError as fault:
+        raise UnsuitableData(f"{path}: {fault}") from None

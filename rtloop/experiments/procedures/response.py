@@ -1,0 +1,157 @@
+"""The loop and its margins, from a small multisine in closed loop; as `rtloop ctl response` on a loop that runs.
+
+The excitation is of the model's making where there is one: it moves the position equally at all frequencies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from rtloop.analysis.margins import margins
+from rtloop.analysis.measured.excitation import first, fitting
+from rtloop.analysis.measured.margins import Uncertain
+from rtloop.analysis.measured.measurement import measurement
+from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid
+from rtloop.design.identification.measured import UnsuitableData
+from rtloop.experiments.procedure import Experiment, Run, hold
+from rtloop.experiments.setting import Setting
+from rtloop.experiments.taken import Taken
+from rtloop.experiments.theme import Ink
+from rtloop.experiments.verdict import Analysis, Row, Table
+from rtloop.hil.modal import Real
+from rtloop.hil.options import Options
+
+REST_S = 0.1
+DIGITS = 7
+"""Of a reference, behind the point."""
+NEAR, NEAR_MODE, CERTAIN = 0.02, 0.004, 3.0
+"""How near the model a margin, and the resonance, are expected to be: a part of it, or so many standard deviations."""
+ROWS = (("crossover_hz", "crossover", "Hz"), ("gain_margin", "gain margin", "1"),
+        ("phase_margin_deg", "phase margin", "°"), ("max_sensitivity", "largest |S|", "1"))  # fmt: skip
+
+
+class ResponseOptions(Options):
+    """The multisine: how far it is to move the position, its band, a period, and how many are measured."""
+
+    amplitude_um: float = Field(default=0.5, gt=0)
+    from_hz: float = Field(default=2.0, gt=0)
+    to_hz: float | None = Field(default=None, gt=0)
+    """By default 0.45 of the rate."""
+    period_s: float = Field(default=1.0, gt=0, le=10)
+    periods: int = Field(default=5, ge=2)
+
+
+def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
+    """One period to settle, and those that are measured."""
+    period = _period(options, setting)
+    timeline = setting.timeline()
+    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    levels = {"kind": "steps", "levels": period.tolist(), "dwell_s": 1 / setting.rate_hz}
+    timeline.add("multisine", "closed_loop", levels, (options.periods + 1) * options.period_s)
+    timeline.add("rest", "closed_loop", hold(0.0), REST_S)
+    return [Run("", timeline)]
+
+
+def _period(options: ResponseOptions, setting: Setting) -> Real:
+    """Of the reference, beginning where it is nearest to 0."""
+    lines = _grid(options, setting)
+    model = setting.model
+    moved = None if model is None else model.tracking(lines.hz)
+    if model is None or moved is None:
+        wave = first(lines, options.amplitude_um)
+    else:
+        wave = fitting(lines, moved, moved / model.plant(lines.hz), options.amplitude_um)
+    return np.round(np.roll(wave, -int(np.argmin(np.abs(wave)))), DIGITS)
+
+
+def _grid(options: ResponseOptions, setting: Setting) -> Grid:
+    to_hz = options.to_hz or HIGHEST_PART * setting.rate_hz
+    near_hz = setting.model and setting.model.resonance_hz
+    return grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
+
+
+def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
+    """Margins, the resonance, and every line."""
+    (taken,) = recordings
+    names = ("reference_um", "error_um", "command_um", "position_um")
+    near_hz, loop = (taken.model.resonance_hz, taken.model.loop) if taken.model else (None, None)
+    found = measurement(dict(zip(names, taken.read(*names), strict=True)), taken.rate_hz, near_hz, loop)
+    if (moved_um := found.response.moved_um) > options.amplitude_um:
+        raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")
+    promised = margins(loop)._asdict() if loop else {}
+    rows = [
+        _row(taken, name, label, unit, getattr(found.margins, name), promised.get(name)) for name, label, unit in ROWS
+    ]
+    if found.mode is not None:
+        rows.append(
+            _row(
+                taken,
+                "resonance_hz",
+                "resonance",
+                "Hz",
+                Uncertain(found.mode.hz, found.mode.hz_std),
+                near_hz,
+                NEAR_MODE,
+            )
+        )
+    measured = [
+        [label, f"{one.value:.5g}", f"{one.std:.2g}"]
+        for name, label, _ in ROWS
+        if math.isfinite((one := getattr(found.margins, name)).value)
+    ]
+    notes = [
+        f"The position was moved by {moved_um:.3g} µm. What is measured is the loop of so small a motion: a hysteresis "
+        "that is left makes its gain another than the linear model's, and adds to the uncertainty, which is that of "
+        "noise and of all that is not linear."
+    ]
+    curves = {"hz": found.loop.hz, "loop": found.loop.loop, "spread": found.loop.spread,
+              "model": None if loop is None else loop.open(found.loop.hz)}  # fmt: skip
+    return Analysis(rows, curves, (Table("Standard deviations", ("margin", "measured", "± (1σ)"), measured),), notes)
+
+
+def _row(
+    taken: Taken, name: str, label: str, unit: str, found: Uncertain, model: float | None, part: float = NEAR
+) -> Row:
+    near = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), part * abs(model or 0.0))
+    return taken.row(name, label, unit, found.value, model, near)
+
+
+def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
+    """L in magnitude and phase, and |S|, over the model's."""
+    hz, loop, model = curves["hz"], curves["loop"], curves["model"]
+    size, phase, sensitivity = figure.subplots(3, 1, sharex=True)
+    std = np.abs(loop) * curves["spread"]
+    for panel, value, width in (
+        (size, np.abs(loop), std),
+        (sensitivity, 1 / np.abs(1 + loop), std / np.abs(1 + loop) ** 2),
+    ):
+        panel.fill_between(hz, np.maximum(value - 2 * width, 1e-9), value + 2 * width, color=ink.measured, alpha=0.25)
+        panel.loglog(hz, value, ".-", color=ink.measured, markersize=3, linewidth=0.8, label="measured, ±2σ")
+    phase.semilogx(hz, np.degrees(np.unwrap(np.angle(loop))), ".-", color=ink.measured, markersize=3, linewidth=0.8)
+    if model is not None:
+        size.loglog(hz, np.abs(model), color=ink.model, linewidth=0.8, label="model")
+        phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=ink.model, linewidth=0.8)
+        sensitivity.loglog(hz, 1 / np.abs(1 + model), color=ink.model, linewidth=0.8)
+    size.set_ylim(bottom=0.3 * float(np.abs(loop).min()))
+    ink.label(size, "", "|L|", "loop, measured in closed loop")
+    ink.label(phase, "", "phase of L / °")
+    ink.label(sensitivity, "frequency / Hz", "|S|")
+    ink.legend(size, loc="lower left")
+
+
+EXPERIMENT = Experiment(
+    "response",
+    "Loop and margins, measured",
+    "Feedforward and feedback: a small multisine; L, S and their margins with standard deviations.",
+    ResponseOptions,
+    runs,
+    analyse,
+    draw,
+    largest={"amplitude_um": lambda setting: setting.largest_swept_um},
+    size=(11.0, 8.0),
+)

@@ -1,0 +1,241 @@
+"""The response of a loop that runs: multisines about the reference that it holds, played, watched, taken back.
+
+What is played ends at the value that was held, so that the loop comes back to it whatever becomes of who asked, and of
+the service. What is measured is read off the ring that the recorder reads, and is in the recording.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rtloop import signals
+from rtloop.analysis.measured import excitation
+from rtloop.analysis.measured.measurement import Measurement, measurement
+from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
+from rtloop.analysis.measured.response import Signals
+from rtloop.analysis.perturbation import resonance_hz
+from rtloop.configuration.checks import promised_loop
+from rtloop.engine.ring import drain
+from rtloop.errors import ConfigError, RtloopError
+from rtloop.hil.modal import Real
+from rtloop.service.desk import Refused
+from rtloop.service.live import LiveLaw
+from rtloop.signals import Flag, Mode
+from rtloop.supervision.supervisor import Supervisor
+
+REST_S, FADE_S, POLL_S = 0.2, 0.05, 0.02
+FIRST_PERIODS = 2
+TRIES, LESS = 3, 0.7
+"""How often less is tried, and how much less, where the position went too far."""
+KEPT = 100
+"""Measurements of an axis that are remembered."""
+SHORTEST_S, SHORTEST_OF_A_MODE_S, LONGEST_S, LINES_OF_A_MODE = 1.0, 0.25, 4.0, 2.0
+"""Of a period; so long that half the width of the model's lightest mode is so many lines."""
+LOWEST_LINES = 2
+"""The lowest frequency, in lines, where none is given."""
+EXCITED = 0.3
+"""Part of a light mode's frequency, to both sides, that is excited for it alone."""
+PATIENCE_S = 2.0
+IN_STEP = "sim"
+"""The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
+REST_MARGIN = 1.2
+"""Of what the position moves by at rest: so much is allowed on top of the stated amplitude."""
+NAMES = {"reference_um": signals.REFERENCE, "error_um": signals.ERROR, "command_um": signals.COMMAND,
+         "position_um": signals.POSITION}  # fmt: skip
+
+
+class Results:
+    """Figures of what was measured of an axis, the newest last."""
+
+    def __init__(self) -> None:
+        self._figures: deque[dict[str, Any]] = deque(maxlen=KEPT)
+
+    def note(self, found: Measurement) -> None:
+        """Another one."""
+        self._figures.append({"unix_time_s": round(time.time(), 3)} | found.figures())
+
+    @property
+    def newest(self) -> dict[str, Any]:
+        """Of the last measurement."""
+        return self._figures[-1]
+
+    def for_json(self) -> dict[str, Any]:
+        """The newest, and how the resonance went: time, frequency and its standard deviation of each."""
+        found = [(one["unix_time_s"], one["resonance"]) for one in self._figures if one["resonance"]]
+        return self.newest | {"resonance_trend": [[at, mode["hz"], mode["hz_std"]] for at, mode in found]}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The added motion of the position at most, the band, how long (s), and where a light mode is expected."""
+
+    amplitude_um: float = 0.5
+    from_hz: float | None = None
+    to_hz: float | None = None
+    duration_s: float = 6.0
+    period_s: float | None = None
+    """Of the multisine: the longer, the denser its lines."""
+    near_hz: float | None = None
+    resonance_only: bool = False
+    """Excite nothing but the band about the light mode."""
+
+
+def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Measurement:
+    """Measure the loop of an axis about the reference that it holds.
+
+    Raises ConfigError for what can be granted in no state, Refused for what this one does not allow, and where the
+    measurement was given up: the reference is then what it was, or what somebody else has set.
+    """
+    number = live.axis_number(axis)
+    configuration = live.prepared.configuration
+    if len(configuration.together(number)) > 1:
+        raise ConfigError("request", [f"axis {axis!r}: shares its controller; a loop of one axis is measured"])
+    options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
+    model = promised_loop(options, rate_hz)
+    known = options.model and resonance_hz(options.model.transfer())
+    near_hz, half_width_hz = known or (None, 0.0)
+    near_hz = asked.near_hz or near_hz
+    if asked.resonance_only:
+        if near_hz is None:
+            fault = f"near_hz: missing, and axis {axis!r} has no model with a resonance; it is needed"
+            raise ConfigError("request", [fault])
+        asked = replace(asked, from_hz=(1 - EXCITED) * near_hz, to_hz=(1 + EXCITED) * near_hz)
+    lines = _grid(asked, rate_hz, near_hz, half_width_hz)
+    periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
+    run = _Run(supervisor, live, number, rate_hz)
+    with run.about_the_reference(asked.amplitude_um):
+        found = run.approach(lines, asked.amplitude_um, periods)
+    try:
+        return measurement(found, rate_hz, near_hz, model)
+    except ValueError as error:
+        raise Refused(f"response: {error}") from None
+
+
+def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> Grid:
+    shortest_s = SHORTEST_OF_A_MODE_S if asked.resonance_only else SHORTEST_S
+    wanted_s = LINES_OF_A_MODE / half_width_hz if half_width_hz else SHORTEST_S
+    period_s = asked.period_s or min(max(wanted_s, shortest_s), LONGEST_S, max(asked.duration_s / 3, shortest_s))
+    from_hz, to_hz = asked.from_hz or LOWEST_LINES / period_s, asked.to_hz or HIGHEST_PART * rate_hz
+    try:
+        return grid(rate_hz, period_s, from_hz, to_hz, near_hz)
+    except ValueError as error:
+        raise ConfigError("request", [f"response: {error}"]) from None
+
+
+class _TooFar(Refused):
+    """The position went further than was stated."""
+
+
+class _Run:
+    """Plays periods on one axis, and reads what the loop did."""
+
+    def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, rate_hz: float) -> None:
+        self._supervisor, self._live, self._number, self._rate_hz = supervisor, live, number, rate_hz
+        self._axis, self._driver = live.prepared.plan.axes[number], live.prepared.plan.driver_kind
+        self._columns = {name: signals.axis_column(number, one) for name, one in NAMES.items()}
+        self._hold_um = live.held(number)
+        self._set = live.references_set[number]
+        self._lowest_um, self._highest_um = -np.inf, np.inf
+
+    @contextmanager
+    def about_the_reference(self, amplitude_um: float) -> Iterator[None]:
+        """Rest first, to know what is allowed; at the end hold what was held, unless somebody else set a reference."""
+        ticks = round(REST_S * self._rate_hz)
+        rest = self._read(self._supervisor.ticks, ticks)[:, self._columns["position_um"]]
+        slack_um = REST_MARGIN * np.abs(rest - rest.mean()).max()
+        self._lowest_um, self._highest_um = rest.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
+        try:
+            yield
+        finally:
+            if self._ours:
+                with suppress(RtloopError):
+                    self._take_back()
+
+    def approach(self, lines: Grid, amplitude_um: float, periods: int) -> dict[str, Real]:
+        """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
+        period = excitation.first(lines, amplitude_um)
+        aims, tries = [*excitation.AIMS], TRIES
+        found = self.play(period, FIRST_PERIODS)
+        while aims:
+            another = excitation.shaped(lines, period, self._whole(lines, found), amplitude_um, aims[0])
+            try:
+                found = self.play(another, FIRST_PERIODS if len(aims) > 1 else periods)
+            except _TooFar:
+                tries -= 1
+                if not tries:
+                    raise
+                self._take_back()
+                aims = [LESS * aim for aim in aims]
+            else:
+                period, aims = another, aims[1:]
+        return found
+
+    def play(self, period: Real, periods: int) -> dict[str, Real]:
+        """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
+        samples = played(period, periods, self._hold_um, round(FADE_S * self._rate_hz))
+        tick = self._live.set_waveform(self._axis, samples.tolist(), 1, repeat=False)
+        self._set += 1
+        rows = self._read(tick, samples.size)
+        if not np.array_equal(rows[:, self._columns["reference_um"]], samples):
+            raise Refused("response: the reference was changed meanwhile")
+        found = {name: rows[:, column] for name, column in self._columns.items()}
+        return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != IN_STEP else {})
+
+    def _whole(self, lines: Grid, found: dict[str, Real]) -> Signals:
+        """The whole periods behind the one to settle."""
+        parts = (found[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
+        return Signals(
+            *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in parts)
+        )
+
+    def _take_back(self) -> None:
+        """Hold what was held, and come to rest."""
+        self._live.set_reference(self._axis, {"kind": "hold", "value": self._hold_um})
+        self._set += 1
+        time.sleep(REST_S)
+
+    @property
+    def _ours(self) -> bool:
+        """Whether nobody else has set a reference since."""
+        return self._live.references_set[self._number] == self._set
+
+    def _read(self, first: int, count: int) -> Real:
+        """Records of `count` ticks from `first` on, as they come. Raises Refused as soon as one is not fit."""
+        ring = self._supervisor.block.ring("ticks")
+        rows = np.empty((count, ring.slots.shape[1]))
+        there, deadline_s = 0, time.monotonic() + count / self._rate_hz + PATIENCE_S
+        while there < count:
+            copied, _, lost = drain(ring, first + there, rows[there:])
+            if lost:
+                raise Refused("response: ticks were lost before they could be read")
+            self._judge(rows[there : there + copied])
+            there += copied
+            if time.monotonic() > deadline_s:
+                raise Refused("response: the loop's ticks do not come")
+            time.sleep(POLL_S)
+        return rows
+
+    def _judge(self, rows: Real) -> None:
+        if not self._ours:
+            raise Refused("response: somebody else has set a reference")
+        if not len(rows):
+            return
+        flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
+        if causes := signals.trip_causes(flags):
+            raise Refused(f"response: tripped: {', '.join(causes)}")
+        if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
+            raise Refused("response: not in closed loop")
+        if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
+            raise Refused("response: command or drive is clipped: another setpoint, or a smaller amplitude, is needed")
+        position_um = rows[:, self._columns["position_um"]]
+        low, high = float(position_um.min()), float(position_um.max())
+        if not self._lowest_um <= low <= high <= self._highest_um:
+            raise _TooFar(f"response: the position went to {low:.4g} … {high:.4g} µm, beyond the stated "
+                          f"{self._lowest_um:.4g} … {self._highest_um:.4g} µm")  # fmt: skip

@@ -1,0 +1,93 @@
+"""Closed loops by scipy alone: a light mode behind a hold and a delay, an integrator, noise, a nonlinearity.
+
+D(z) = (1 − z⁻¹) Z{ω²/(s² + 2ζωs + ω²)/s} z⁻ᵈ,    C(z) = k_p + k_i T/(z − 1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+RATE_HZ = 10_000.0
+
+
+@dataclass(frozen=True)
+class TrueLoop:
+    """One mode, its delay beyond the hold's sample, and the controller's gains."""
+
+    hz: float
+    damping: float
+    delay_ticks: int
+    ki_per_s: float
+    kp: float = 0.0
+    noise_um: float = 0.010
+
+    @property
+    def polynomials(self) -> tuple[np.ndarray, np.ndarray]:
+        """L as polynomials in 1/z, of equal length."""
+        omega = 2 * np.pi * self.hz
+        b, a, _ = signal.cont2discrete(([omega**2], [1, 2 * self.damping * omega, omega**2]), 1 / RATE_HZ, "zoh")
+        plant = np.concatenate([np.zeros(self.delay_ticks), b.ravel()])
+        top = np.convolve(plant, [self.kp, self.ki_per_s / RATE_HZ - self.kp])
+        bottom = np.convolve(a, [1.0, -1.0])
+        size = max(top.size, bottom.size)
+        return np.pad(top, (0, size - top.size)), np.pad(bottom, (0, size - bottom.size))
+
+    def open(self, hz: np.ndarray) -> np.ndarray:
+        """L."""
+        top, bottom = self.polynomials
+        back = np.exp(-2j * np.pi * hz / RATE_HZ)
+        return np.polyval(top[::-1], back) / np.polyval(bottom[::-1], back)
+
+    def margins(self, from_hz: float = 1.0, to_hz: float = 0.45 * RATE_HZ) -> dict[str, float]:
+        """On a grid so fine that nothing lies between its points."""
+        return margins_of(self.open, from_hz, to_hz)
+
+    def run(
+        self, reference: np.ndarray, seed: int = 0, bend: Callable[[float], float] = lambda v: v
+    ) -> dict[str, np.ndarray]:
+        """Recorded signals for a reference, sample by sample; `bend` is what the actuator makes of the command."""
+        if bend(0.25) == 0.25:
+            return self._linear(reference, seed)
+        omega = 2 * np.pi * self.hz
+        b, a, _ = signal.cont2discrete(([omega**2], [1, 2 * self.damping * omega, omega**2]), 1 / RATE_HZ, "zoh")
+        b1, b2 = b.ravel()[1:]
+        noise = np.random.default_rng(seed).normal(0, self.noise_um, reference.size)
+        e, v, x, y = np.zeros((4, reference.size))
+        integral, u = 0.0, np.zeros(reference.size + self.delay_ticks + 2)
+        for k in range(reference.size):
+            y[k] = b1 * u[k + 1] + b2 * u[k] - a[1] * y[k - 1] - a[2] * y[k - 2] if k > 1 else 0.0
+            x[k] = y[k] + noise[k]
+            e[k] = reference[k] - x[k]
+            v[k] = self.kp * e[k] + integral
+            integral += self.ki_per_s / RATE_HZ * e[k]
+            u[k + 2 + self.delay_ticks] = bend(v[k])
+        return {"reference_um": reference, "error_um": e, "command_um": v, "position_um": x, "true_um": y}
+
+    def _linear(self, reference: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+        top, bottom = self.polynomials
+        closed = top + bottom
+        assert np.all(np.abs(np.roots(closed)) < 1), "the loop of the test is unstable"
+        noise = np.random.default_rng(seed).normal(0, self.noise_um, reference.size)
+        true = signal.lfilter(top, closed, reference - noise)
+        e = reference - true - noise
+        v = signal.lfilter([self.kp, self.ki_per_s / RATE_HZ - self.kp], [1.0, -1.0], e)
+        return {"reference_um": reference, "error_um": e, "command_um": v, "position_um": true + noise, "true_um": true}
+
+
+def margins_of(
+    open_loop: Callable[[np.ndarray], np.ndarray], from_hz: float = 1.0, to_hz: float = 4500.0
+) -> dict[str, float]:
+    """Gain, phase and modulus margin of L, by their definitions."""
+    hz = np.geomspace(from_hz, to_hz, 1_000_000)
+    loop = open_loop(hz)
+    real = loop.real[:-1][np.diff(np.signbit(loop.imag))]
+    crossed = loop[:-1][np.diff(np.signbit(np.abs(loop) - 1))]
+    return {
+        "gain_margin": float(min((-1 / one for one in real if -1 < one < 0), default=np.inf)),
+        "phase_margin_deg": float(min((180 - abs(np.degrees(np.angle(one))) for one in crossed), default=np.inf)),
+        "modulus_margin": float(np.abs(1 + loop).min()),
+    }

@@ -1,0 +1,214 @@
+"""A running service measures its own loop: what it finds, what it refuses, and that it always comes back."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from prometheus_client.parser import text_string_to_metric_families
+
+import rtloop
+from rtloop.cli import main
+from tests.design.measured_loops import RATE_HZ, TrueLoop, margins_of
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.service.http import answer
+
+LOOP = TrueLoop(800.0, 0.02, 1, 100.0, kp=0.01)
+OMEGA = 2 * np.pi * LOOP.hz
+HELD_UM = 5.0
+QUICK = {"axis": "x", "duration_s": 1.0, "period_s": 0.25, "near_hz": 800.0}
+CONFIGURATION = f"""
+[loop]
+rate_hz = {RATE_HZ:g}
+[driver]
+kind = "sim"
+seed = 3
+latency_ticks = {LOOP.delay_ticks}
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[driver.plant.hysteresis]
+truth = "custom"
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[driver.plant.dynamics]
+form = "factors"
+gain = {OMEGA**2!r}
+denominator = [[1.0, {2 * LOOP.damping * OMEGA!r}, {OMEGA**2!r}]]
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.controller]
+kind = "pid"
+kp = {LOOP.kp}
+ki_per_s = {LOOP.ki_per_s}
+[axis.interlocks]
+position_um = 30.0
+[axis.reference]
+kind = "hold"
+value = {HELD_UM}
+[recording]
+folder = "FOLDER/recordings"
+"""
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    folder = tmp_path_factory.mktemp("response")
+    with Bench(folder, board=False, text=CONFIGURATION.replace("FOLDER", str(folder))) as bench:
+        bench.await_state("running")
+        yield bench
+
+
+def reference_um(bench: Bench) -> float:
+    return bench.status()["axes"]["x"]["reference_um"]
+
+
+def recording(bench: Bench) -> Path:
+    return next((bench.folder / "recordings").glob("*.mcap.part"))
+
+
+def written(bench: Bench, tick: int) -> rtloop.Recording:
+    """The recording, once it holds this tick."""
+    return wait_for(lambda: [one for one in [rtloop.load(recording(bench))] if one["tick"][-1] >= tick], "the ticks")[0]
+
+
+class Shown(NamedTuple):
+    text: str
+    found: dict[str, Any]
+    picture: bytes
+
+
+def command(bench: Bench, *arguments: str | Path) -> str:
+    """What a command says that ends well."""
+    ran = CliRunner().invoke(main, [*map(str, arguments)])
+    assert ran.exit_code == 0, ran.output
+    return ran.output
+
+
+@pytest.fixture(scope="module")
+def shown(bench: Bench) -> Shown:
+    """Of `rtloop ctl response`."""
+    file, picture = bench.folder / "response.json", bench.folder / "response.png"
+    quick = ("--duration", "1", "--period", "0.25", "--near-hz", "800", "--amplitude-um", "0.6")
+    files = ("--plot", picture, "--out", file)
+    text = command(bench, "ctl", "--socket", bench.client.path, "response", "x", *quick, *files)
+    return Shown(text, json.loads(file.read_text()), picture.read_bytes())
+
+
+def test_margins_and_motion_are_those_of_the_rig(bench: Bench, shown: Shown) -> None:
+    found = shown.found
+    true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
+    assert found["margins"]["gain_margin"]["value"] == pytest.approx(true["gain_margin"], rel=0.02)
+    assert found["margins"]["phase_margin_deg"]["value"] == pytest.approx(true["phase_margin_deg"], abs=2.0)
+    assert found["margins"]["modulus_margin"]["value"] == pytest.approx(true["modulus_margin"], rel=0.02)
+    assert found["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.002)
+    assert found["model"] is None
+    assert reference_um(bench) == HELD_UM
+    position_um = written(bench, bench.status()["tick"])["x_true_position_um"]
+    assert 0.1 < np.abs(position_um[round(0.5 * RATE_HZ) :] - HELD_UM).max() <= 0.6
+
+
+def test_figures_are_told_and_the_recording_gives_the_same(bench: Bench, shown: Shown) -> None:
+    found, told = shown.found, bench.status()["measured"]["x"]
+    assert told["margins"] == found["margins"]
+    mode = found["resonance"]
+    assert told["resonance_trend"][-1] == [told["unix_time_s"], mode["hz"], mode["hz_std"]]
+    samples = {
+        (sample.name, *sample.labels.values()): sample.value
+        for family in text_string_to_metric_families(bench.client.get("/metrics"))
+        for sample in family.samples
+    }
+    assert samples["rtloop_margin", "x", "gain_margin"] == found["margins"]["gain_margin"]["value"]
+    assert samples["rtloop_resonance_std", "x", "hz"] == mode["hz_std"]
+    written(bench, bench.status()["tick"])
+    again = command(bench, "identify", "response", recording(bench), "--near-hz", "800", "--json")
+    assert json.loads(again) == found
+
+
+def test_it_is_shown(shown: Shown) -> None:
+    for word in ("gain margin", "phase margin", "modulus margin", "resonance", "moved by"):
+        assert word in shown.text
+    assert shown.picture.startswith(b"\x89PNG")
+
+
+def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
+    quick = ("--duration", "1", "--near-hz", "780", "--json")
+    found = json.loads(command(bench, "ctl", "--socket", bench.client.path, "resonance", "x", *quick))
+    assert found["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.0006)
+    assert found["resonance"]["damping"] == pytest.approx(LOOP.damping, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "said"),
+    [
+        ({"axis": "z"}, 422, "there are x"),
+        ({"amplitude_um": 0.0}, 422, "amplitude_um"),
+        ({"amplitude_um": float("nan")}, 422, "amplitude_um"),
+        ({"from_hz": 300.0, "to_hz": 200.0}, 422, "rising frequencies"),
+        ({"to_hz": 4999.0}, 422, "up to 4500 Hz"),
+        ({"duration_s": 1000.0}, 422, "duration_s"),
+        ({"near_hz": None, "resonance_only": True}, 422, "near_hz: missing"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(bench: Bench, change: dict[str, Any], code: int, said: str) -> None:
+    found, text = answer(bench, "POST", "/response", {**QUICK, **change})
+    assert (found, said in text["error"]) == (code, True), text
+    assert reference_um(bench) == HELD_UM
+
+
+def test_only_a_held_reference_in_closed_loop_is_measured(bench: Bench) -> None:
+    wave = {"kind": "sine", "amplitude": 1.0, "frequency_hz": 1.0}
+    bench.client.post("/reference", {"axis": "x", "reference": wave})
+    code, text = answer(bench, "POST", "/response", QUICK)
+    assert (code, "a sine; a hold is needed" in text["error"]) == (409, True), text
+    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+    bench.client.post("/mode", {"mode": "feedforward"})
+    code, text = answer(bench, "POST", "/response", QUICK)
+    assert (code, "not in closed loop" in text["error"]) == (409, True), text
+    bench.client.post("/mode", {"mode": "closed_loop"})
+    bench.client.post("/stop")
+    code, text = answer(bench, "POST", "/response", QUICK)
+    assert (code, "a loop that runs is needed" in text["error"]) == (409, True), text
+    bench.client.post("/start")
+    bench.await_state("running")
+
+
+def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: Bench) -> None:
+    """As Ctrl-C does, with what was held."""
+    answers: list[tuple[int, Any]] = []
+    asking = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK)))
+    asking.start()
+    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    assert answer(bench, "POST", "/response", QUICK)[0] == 503
+    bench.client.post("/setpoint", {"axis": "x", "value": 4.0})
+    asking.join()
+    ((code, text),) = answers
+    assert (code, "somebody else has set a reference" in text["error"]) == (409, True), text
+    assert reference_um(bench) == 4.0
+    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+
+
+def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:
+    asking: list[tuple[int, Any]] = []
+    thread = threading.Thread(target=lambda: asking.append(answer(bench, "POST", "/response", QUICK)))
+    thread.start()
+    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
+    thread.join()
+    ((code, text),) = asking
+    assert (code, "tripped: position" in text["error"]) == (409, True), text
+    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 30.0}})
+    bench.client.post("/reset")
+    bench.client.post("/start")
+    bench.await_state("running")
