@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.design.robust.learning import Learning, learning
+from rtloop.analysis.learning import Learning, learning
 from rtloop.errors import ConfigError
 from rtloop.experiments.procedure import Experiment, Run, Unsuited, hold
 from rtloop.experiments.setting import Setting
