@@ -103,7 +103,7 @@ def _continuous(loop: Loop, interval_s: float) -> StepResponse:
 
 
 def _sampled(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
-    """From rest: what a step of the error's reference and one of the command do, each behind what the reference passes."""
+    """From rest: what a step toward the error and one toward the command do, each behind what the reference passes."""
     a, b, c, d = loop.matrices
     reference, (rows, direct), added = loop.reference, loop.positions, loop.injection
     duration_s = duration_s or _duration(loop) + reference.ticks * period_s

@@ -157,12 +157,14 @@ ReferenceOptions = Annotated[
 
 
 class MarginOptions(Options):
-    """Below, or above, these `rtloop check` warns."""
+    """Below, or above, these `rtloop check` warns; what is required refuses to run."""
 
     gain: float = Field(default=1.5, ge=1)
     phase_deg: float = Field(default=30.0, ge=0, le=180)
     sensitivity: float = Field(default=3.0, gt=1)
     """Largest |S|."""
+    require_margin: bool = False
+    """Refuse to start where the delay that was measured of this host takes the loop's delay margin, or none was."""
 
 
 class AxisOptions(Options):

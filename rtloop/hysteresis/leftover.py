@@ -1,7 +1,7 @@
 """An actuator that differs from its model by as much hysteresis as an inverse is known to leave.
 
-What is put in is a play of half the drive's range against the first one, δ·(2 F_{U/2} − F_{r_0}): full drives reach what
-they reached, and in between a loop is left.
+What is put in is a play of half the drive's range against the first one, δ·(2 F_{U/2} − F_{r_0}): full drives reach
+what they reached, and in between a loop is left.
 """
 
 from __future__ import annotations

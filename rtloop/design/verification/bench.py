@@ -20,7 +20,6 @@ from rtloop.configuration.checks import delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import prepare
 from rtloop.configuration.references import TableOfSamples, generator_values
-from rtloop.hysteresis.leftover import with_hysteresis_left
 from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
@@ -34,6 +33,7 @@ from rtloop.hil.options import (
     RigOptions,
     SensorOptions,
 )
+from rtloop.hysteresis.leftover import with_hysteresis_left
 from rtloop.signals import Mode
 
 SMALLEST_RING_HZ = 1.0
@@ -57,7 +57,9 @@ class Bench:
     ConfigError for what cannot run at all."""
 
     def __init__(self, configuration: Configuration, stands: Mapping[str, Stand]) -> None:
-        self.is_configured = configuration.driver_kind == "sim" or isinstance(configuration.driver_options, BoardOptions)
+        self.is_configured = configuration.driver_kind == "sim" or isinstance(
+            configuration.driver_options, BoardOptions
+        )
         on_rig = _on_rig(configuration, stands, self.is_configured)
         plan = prepare(on_rig, paced=False).plan
         self._plan = replace(plan, mode=Mode.CLOSED_LOOP)

@@ -84,7 +84,7 @@ def robustness(found: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(found: Verification) -> list[tuple[str, ...]]:
-    """Headings, then the worst of each quantity with its verdict and its plant; nothing where no scenario is asked for."""
+    """Headings, then the worst of each quantity, its verdict and its plant; nothing where no scenario is asked for."""
     if found.scenarios is None:
         return []
     rows = [(f"worst of {found.scenarios.count} scenarios, linear", "required", "as it runs", "", "on the plant with")]
@@ -99,7 +99,12 @@ def simulated(found: Verification) -> list[tuple[str, ...]]:
     if found.simulated is None:
         return []
     rows = [
-        ("simulated steps, worst of 4", *(part for name in JUDGED for part in (QUANTITIES[name][0], "")), "peak |u|", "")
+        (
+            "simulated steps, worst of 4",
+            *(part for name in JUDGED for part in (QUANTITIES[name][0], "")),
+            "peak |u|",
+            "",
+        )
     ]
     for step in found.simulated.steps:
         cells = [
@@ -177,9 +182,13 @@ def answer(found: Verification) -> str:
     """The sentence at the end."""
     if not found.running.is_stable:
         return "as it will run, the loop is UNSTABLE"
+    if found.host is not None and found.host.is_spent:
+        return "the delay of this host takes all that the loop bears"
     missed = [row.label for row in found.missed]
     if found.scenarios is not None:
-        missed += [f"{row.label} with {worst.plant}" for row, worst in found.scenarios.missed if row not in found.missed]
+        missed += [
+            f"{row.label} with {worst.plant}" for row, worst in found.scenarios.missed if row not in found.missed
+        ]
     missed += [] if found.simulated is None else [f"simulated, {words}" for words in found.simulated.missed]
     if missed:
         return f"as it will run, the loop misses {', '.join(missed)}"
