@@ -55,7 +55,7 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
     """Of a stable loop; NaN throughout for an unstable one. Between ticks as well as at them."""
     if not loop.is_stable:
-        return StepMetrics(*[math.nan] * 4, tuple(math.nan for _ in times_s))
+        return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
     final, command = loop.final
     overshoot = 100 * max(0.0, float(np.max(response.position / final)) - 1) if final else math.nan

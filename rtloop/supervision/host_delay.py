@@ -79,7 +79,7 @@ def note_host_delay(configuration: Configuration, **measured: Any) -> None:
 
 def measured_delay(configuration: Configuration) -> HostDelay | None:
     """What was measured at the configuration's rate; None where nothing was, or nothing that can be believed."""
-    for folder in client_folders():
+    for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
             with os.fdopen(open_file(folder / _name(configuration), os.O_RDONLY), "rb") as file:
                 found = HostDelay.model_validate_json(file.read(MOST_BYTES))
