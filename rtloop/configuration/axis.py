@@ -49,6 +49,7 @@ class PrefilterOptions(Options):
         """What the reference passes."""
         return ReferencePath(
             taps=np.array(self.taps or (1.0,)),
+            command_taps=np.array(self.command_taps),
             sections=np.array(self.sections, float).reshape(-1, 5),
         )
 

@@ -10,6 +10,7 @@ import pytest
 from scipy import linalg
 
 from rtloop.analysis.held_plant import POINTS
+from rtloop.analysis.step_response import step_response
 from rtloop.configuration.axis import LimitsOptions
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
@@ -136,6 +137,29 @@ def test_a_linear_rig_is_simulated_as_it_is_predicted() -> None:
     assert (largest.limited, largest.trips) == ((), ())
     assert found.left_out_um == (40.0,)
     assert found.truth == "the configured rig"
+
+
+@pytest.mark.parametrize("latency_ticks", [0, 2])
+def test_both_rows_of_taps_sections_and_latency_are_predicted_as_they_run(latency_ticks: int) -> None:
+    """A rig without noise runs what the linear analysis says of the same configuration, at ticks and between."""
+    quiet = LINEAR.replace("noise_um = 0.02", "noise_um = 0.0").replace(
+        "seed = 3", f"seed = 3\nlatency_ticks = {latency_ticks}"
+    )
+    prefilter = """
+[axis.prefilter]
+taps = [0.25, 0.0, 0.5, 0.15]
+command_taps = [0.6, -0.3, 0.2]
+sections = [[0.2, 0.1, 0.05, -0.9, 0.25]]
+"""
+    configuration = parse(quiet + prefilter, "linear", Path(), "linear")
+    check = prepare(configuration).checks[0]
+    assert check.plant is not None
+    assert check.delay_ticks == latency_ticks
+    bench = Bench(configuration, {})
+    run = bench.run("x", (0.0, 10.0), 0.1)
+    answer = step_response(check.loop(check.plant, check.delay_ticks), 0.0999)
+    np.testing.assert_allclose(10.0 * answer.position, between_ticks(bench.rig, run, "x", RATE_HZ)[8000:], atol=1e-8)
+    np.testing.assert_allclose(10.0 * answer.command[::POINTS], run["x_command_um"][1000:], atol=1e-8)
 
 
 @pytest.fixture(scope="module")
