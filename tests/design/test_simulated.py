@@ -80,7 +80,7 @@ def linear(more: str = "") -> Configuration:
 
 def test_a_simulation_is_the_run_itself() -> None:
     """The paper's loop, steps of 20 µm, recorded and simulated: every column of every tick, to the last bit."""
-    text = changed(('levels = [20.0, 0.0, -20.0, 0.0]\ndwell_s = 0.2', 'levels = [0.0, 20.0, -20.0]\ndwell_s = 0.05'))
+    text = changed(("levels = [20.0, 0.0, -20.0, 0.0]\ndwell_s = 0.2", "levels = [0.0, 20.0, -20.0]\ndwell_s = 0.05"))
     recorded = RealLoop(text)
     recorded.run(1500)
     rows = recorded.block.ring("ticks").slots[:1500]
