@@ -7,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from rtloop.cli import main
 from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, HostRefused
@@ -91,3 +93,11 @@ def test_a_margin_that_is_required() -> None:
     unknown = replace(asking, checks=(replace(asking.checks[0], plant=None),))
     with pytest.raises(ConfigError, match="the axis's margin is not known"):
         require_margins(unknown)
+
+
+def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
+    (tmp_path / "asking.toml").write_text(changed(REQUIRED, ('specification = "paper-spec.toml"', "")))
+    done = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
+    assert done.exit_code == 78
+    assert "axis.x.margins.require_margin: the delay of this host is not known" in done.stderr
+    assert not list(tmp_path.glob("*.mcap*"))
