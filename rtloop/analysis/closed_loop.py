@@ -28,7 +28,7 @@ from rtloop.linear.transfer import Transfer
 
 
 class Injection(NamedTuple):
-    """What is added to the command moves: the states by `b` (n,), the position between samples by `between` (POINTS,)."""
+    """What is added to the command: it moves states by `b` (n,), positions within a period by `between` (POINTS,)."""
 
     b: Real
     between: Real

@@ -151,7 +151,8 @@ class CoupledLoop:
         behind = self._plant.a.shape[0] - before - rows.shape[1]
         of_commands = np.outer(direct, self._coupling[number])
         plants = np.pad(rows, ((0, 0), (before, behind))) - of_commands @ dc @ closed @ self._plant.c
-        return Between(np.hstack([plants, of_commands @ cc]), of_commands @ dc[:, number])
+        whole = np.hstack([plants, of_commands @ cc])
+        return Between(np.asarray(whole, np.float64), np.asarray(of_commands @ dc[:, number], np.float64))
 
     @cached_property
     def poles(self) -> Complex:

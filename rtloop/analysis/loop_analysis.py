@@ -25,8 +25,8 @@ class LoopAnalysis:
     """What there is to know about one loop. Percentages and |S| refer to the reference; NaN: undefined or unstable.
 
     `max_re_pole` (rad/s) is NaN in discrete time, `max_abs_pole` in continuous time. `static_error_percent` is
-    what a step leaves, relative to its height. The settling time is that to ±5 % of the final value, and overshoot counts
-    from it.
+    what a step leaves, relative to its height. The settling time is that to ±5 % of the final value, and overshoot
+    counts from it.
     """
 
     period_s: float | None

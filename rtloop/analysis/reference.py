@@ -19,7 +19,7 @@ FORGOTTEN = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class ReferencePath:
-    """`taps` are f_x, `command_taps` f_v, `sections` (k, 5) rows b0, b1, b2, a1, a2; by default the reference as it is."""
+    """`taps` are f_x, `command_taps` f_v, `sections` (k, 5) rows b0, b1, b2, a1, a2; by default the reference alone."""
 
     taps: Real = field(default_factory=lambda: np.ones(1))
     command_taps: Real = field(default_factory=lambda: np.empty(0))

@@ -55,7 +55,7 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
     """Of a stable loop; NaN throughout for an unstable one. Between ticks as well as at them."""
     if not loop.is_stable:
-        return StepMetrics(*[math.nan] * 4, tuple(math.nan for _ in times_s))
+        return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
     final, command = loop.final
     overshoot = 100 * max(0.0, float(np.max(response.position / final)) - 1) if final else math.nan
@@ -103,7 +103,7 @@ def _continuous(loop: Loop, interval_s: float) -> StepResponse:
 
 
 def _sampled(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
-    """From rest: what a step of the error's reference and one of the command do, each behind what the reference passes."""
+    """From rest: what a step toward the error and one toward the command do, each behind what the reference passes."""
     a, b, c, d = loop.matrices
     reference, (rows, direct), added = loop.reference, loop.positions, loop.injection
     duration_s = duration_s or _duration(loop) + reference.ticks * period_s

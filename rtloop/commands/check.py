@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.verification.text import answer, span, together
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
+from rtloop.supervision.host_delay import SpentMargin, measured_delay, spent_margin
 from rtloop.terminal.table import console as _console
 from rtloop.values import counted
 
@@ -45,8 +47,10 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
         raise ConfigError(str(config), warnings)
     shifts = {check.name: _shifts(check) for check in prepared.checks}
     judged = {check.name: _judged(prepared, check) for check in prepared.checks}
+    host = measured_delay(prepared.configuration)
+    spent = {} if host is None else {check.name: spent_margin(check, host) for check in prepared.checks}
     if as_json:
-        click.echo(json.dumps(_report(prepared, warnings, shifts, judged)))
+        click.echo(json.dumps(_report(prepared, warnings, shifts, judged, spent)))
         return 0
     console = _console()
     plan, facts = prepared.plan, prepared.facts
@@ -66,6 +70,8 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
             f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
         )
         _print_axis(console, check, shifts[check.name])
+        if (one := spent.get(check.name)) is not None:
+            console.print(one.words)
         found = judged[axis.name]
         if found is not None:
             console.print(f"{escape(str(axis.specification))}: {answer(found)}; `rtloop design verify` shows it all")
@@ -145,6 +151,7 @@ def _report(
     warnings: list[str],
     shifts: dict[str, dict[str, Range]],
     judged: dict[str, Verification | None],
+    spent: dict[str, SpentMargin | None],
 ) -> dict[str, Any]:
     plan = prepared.plan
     return {
@@ -157,6 +164,7 @@ def _report(
         "axes": [
             {
                 "name": check.name,
+                "host_delay": None if (one := spent.get(check.name)) is None else asdict(one),
                 "comparison": check.comparison and check.comparison.as_dict(),
                 "continuous": _analysis(check.continuous),
                 "running": _analysis(check.running),

@@ -28,6 +28,7 @@ from rtloop.design.verification.simulated import simulate
 from rtloop.design.verification.verify import Subject, Verification, as_dict, verify
 from rtloop.errors import ConfigError, NoDesign, OutputError, RtloopError
 from rtloop.linear.transfer import Transfer
+from rtloop.supervision.host_delay import measured_delay, spent_margin
 from rtloop.terminal.design import print_synthesis, print_verification
 
 
@@ -136,7 +137,8 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
         subject = Subject(check.loop, check.controller, check.discrete)
         plant, delay = model.transfer(), max(model.delay_ticks, check.delay_ticks)
         plants = _scenarios(design, plant, delay, 1 / configuration.loop.rate_hz)
-        return verify(subject, plant, design, delay, margins, plants), design
+        found, host = verify(subject, plant, design, delay, margins, plants), measured_delay(configuration)
+        return replace(found, host=None if host is None else spent_margin(check, host)), design
     except ValueError as error:
         raise ConfigError(configuration.source, [f"{where}: {error}"]) from None
 

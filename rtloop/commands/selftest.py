@@ -27,6 +27,7 @@ from rtloop.drivers.base import Channel, index_of
 from rtloop.errors import LoopFault
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
+from rtloop.supervision.host_delay import note_host_delay
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.progress import StatusLine
@@ -65,6 +66,10 @@ def selftest_configuration(config: Path, amplitude_v: float, tolerances: Toleran
         top_hz = min(facts.max_rate_hz, TOP_RATE_HZ)
         rates = list(_rates(configuration, top_hz, status))
     report = _report(configuration, axes, pairs, rates, tolerances) | {"realtime": realtime, "real": facts.real}
+    if report["passed"]:  # only then is it known that nothing but a wire lies between output and input
+        note_host_delay(
+            configuration, wire_ticks={name: pair.delay_ticks for name, pair in pairs.items() if pair.delay_ticks}
+        )
     if as_json:
         click.echo(json.dumps(report))
     else:

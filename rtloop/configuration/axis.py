@@ -49,6 +49,7 @@ class PrefilterOptions(Options):
         """What the reference passes."""
         return ReferencePath(
             taps=np.array(self.taps or (1.0,)),
+            command_taps=np.array(self.command_taps),
             sections=np.array(self.sections, float).reshape(-1, 5),
         )
 
@@ -162,12 +163,14 @@ ReferenceOptions = Annotated[
 
 
 class MarginOptions(Options):
-    """Below, or above, these `rtloop check` warns."""
+    """Below, or above, these `rtloop check` warns; what is required refuses to run."""
 
     gain: float = Field(default=1.5, ge=1)
     phase_deg: float = Field(default=30.0, ge=0, le=180)
     sensitivity: float = Field(default=3.0, gt=1)
     """Largest |S|."""
+    require_margin: bool = False
+    """Refuse to start where the delay that was measured of this host takes the loop's delay margin, or none was."""
 
 
 class AxisOptions(Options):

@@ -33,7 +33,7 @@ def cautions(prepared: Prepared) -> list[str]:
             *_reach(axis, channel),
         )
         found += [f"axis.{axis.name}.{line}" for line in lines]
-        found += _sensor(configuration, axis, channel)
+        found += [*_sensor(configuration, axis, channel), *_latency(configuration, axis, check)]
     return found
 
 
@@ -84,6 +84,15 @@ def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     seen_um = float(np.max(np.abs((ends_v - channel.offset) * channel.um_per_v)))
     if interlocks.position_um > seen_um:
         yield f"interlocks.position_um: {interlocks.position_um:g} µm; the sensor's range ends at {seen_um:.4g} µm"
+
+
+def _latency(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
+    """A model that knows less delay than the simulated rig has."""
+    if axis.model is not None and check.delay_ticks > axis.model.delay_ticks:
+        yield (
+            f"axis.{axis.name}.model.delay_ticks: {axis.model.delay_ticks}, but the simulated rig has "
+            f"driver.latency_ticks = {check.delay_ticks}; the loop is judged with that"
+        )
 
 
 def _sensor(configuration: Configuration, axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:

@@ -1,13 +1,13 @@
 """An actuator that differs from its model by as much hysteresis as an inverse is known to leave.
 
-What is put in is a play of half the drive's range against the first one, δ·(2 F_{U/2} − F_{r_0}): full drives reach what
-they reached, and in between a loop is left.
+What is put in is a play of half the drive's range against the first one, δ·(2 F_{U/2} − F_{r_0}): full drives reach
+what they reached, and in between a loop is left.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import loading_curve, model_output
@@ -35,7 +35,8 @@ def with_hysteresis_left(model: PlayModel, percent: float, drive_v: float) -> Pl
     least, most = left(0.0), left(LARGEST_SHARE)
     if not least < percent < most:
         raise ValueError(f"residual_percent: {percent:g}; above {least:.3g} and below {most:.3g} are allowed here")
-    return _changed(model, float(brentq(lambda share: left(share) - percent, 0.0, LARGEST_SHARE, xtol=1e-5)), drive_v)
+    share = root_scalar(lambda share: left(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
+    return _changed(model, share, drive_v)
 
 
 def _changed(model: PlayModel, share: float, drive_v: float) -> PlayModel:

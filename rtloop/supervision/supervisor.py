@@ -26,6 +26,7 @@ from rtloop.errors import LoopFault, RtloopError, UnavailableError
 from rtloop.recording.file.events import trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
+from rtloop.supervision.host_delay import require_margins
 from rtloop.supervision.parking import park
 from rtloop.supervision.paths import new_block
 from rtloop.supervision.recorder_keeper import RecorderKeeper
@@ -92,6 +93,7 @@ class Supervisor:
     def __init__(
         self, processes: Processes, prepared: Prepared, recording: Path, stall_s: float = ATTENDED_STALL_S
     ) -> None:
+        require_margins(prepared)
         self.prepared = prepared
         self.block = SharedBlock.create(prepared.plan.sizes, processes.fd)
         self.realtime: dict[str, Any] = {}

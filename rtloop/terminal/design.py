@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import click
+from rich.markup import escape
 from rich.table import Table
 
 from rtloop.design.synthesis.synthesise import Synthesis
@@ -50,7 +51,7 @@ def print_verification(name: str, found: Verification) -> None:
             out.print()
             out.print(_table(lines_[0], lines_[1:]))
     for note in simulation_notes(found):
-        out.print(note)
+        out.print(escape(note))
     if found.together is not None:
         out.print("\nAll axes of its controller together, as they run")
         out.print(_table(("", ""), together(found.together)))
@@ -61,7 +62,9 @@ def print_verification(name: str, found: Verification) -> None:
     headings, *rows = robustness(found)
     out.print(_table(headings, rows))
     out.print(NOTE)
-    out.print(f"\n[bold]{answer(found)}[/]")
+    if found.host is not None:
+        out.print(found.host.words)
+    out.print(f"\n[bold]{escape(answer(found))}[/]")
     for warning in found.warnings:
         click.echo(f"warning: {warning}", err=True)
 

@@ -15,7 +15,8 @@ from rtloop.design.synthesis.specification import (
     SensorOptions,
     SpecificationOptions,
 )
-from rtloop.design.verification.judgement import described, limits
+from rtloop.design.verification.judgement import described, limits, specified
+from rtloop.design.verification.robustness import shift_tolerated, worst_of
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 
@@ -31,6 +32,9 @@ PROPORTIONAL = Transfer.from_zpk([], [], GAIN)
         (SpecificationOptions(static_error_percent=0.1), "static_error_percent", 0.05, 0.2),
         (SpecificationOptions(settling_ms=3.0), "settling_ms", 2.0, 4.0),
         (SpecificationOptions(bandwidth_hz=50.0), "bandwidth_hz", 60.0, 40.0),
+        (SpecificationOptions(modulus_margin=0.5), "modulus_margin", 0.6, 0.4),
+        (SpecificationOptions(resonance_decay_ms=1.5), "resonance_decay_ms", 1.0, 2.0),
+        (SpecificationOptions(resonance_shift_percent=5.0), "resonance_shift_percent", 6.0, 4.0),
         (SpecificationOptions(command=CommandOptions(reference_um=20.0, command_um=22.0)), "peak_command", 1.0, 1.2),
         (SpecificationOptions(disturbance=DisturbanceOptions(largest_um=1.0, error_um=0.1, up_to_hz=5.0)),
          "disturbance_hz", 6.0, 4.0),
@@ -45,6 +49,51 @@ def test_a_limit_has_a_direction(asked: SpecificationOptions, name: str, good: f
     assert found[1].met(found[1].value)
     assert not found[1].met(bad)
     assert not found[1].met(math.nan)
+
+
+OMEGA, ZETA = 2 * math.pi * 90.0, 0.02
+RESONANT = Transfer.from_factors(OMEGA**2, [], [[1.0, 2 * ZETA * OMEGA, OMEGA**2]])
+
+
+def test_the_slowest_mode_near_the_resonance_in_closed_form() -> None:
+    """P-control K of ω²/(s² + 2ζωs + ω²) leaves −ζω and moves the frequency to ω√(1 + K): near up to 1.85 ω."""
+    for gain, found in ((0.5, 1e3 / (ZETA * OMEGA)), (2.3, 1e3 / (ZETA * OMEGA)), (2.6, 0.0)):
+        loop = continuous_loop(Transfer.from_zpk([], [], gain), RESONANT)
+        values = specified(loop, SpecificationOptions(), OMEGA)
+        assert values["resonance_decay_ms"] == pytest.approx(found)
+    assert "resonance_decay_ms" not in specified(loop, SpecificationOptions())
+
+
+def test_the_modulus_margin_is_the_least_distance_from_minus_one() -> None:
+    """K/(s(τs + 1)), by a dense grid."""
+    loop = continuous_loop(Transfer.from_factors(80.0, [], [[1, 0]]), Transfer.from_factors(1, [], [[0.01, 1]]))
+    s = 1j * np.geomspace(1, 1e4, 200_001)
+    distance = np.abs(1 + 80.0 / (s * (0.01 * s + 1))).min()
+    assert specified(loop, SpecificationOptions(modulus_margin=0.5))["modulus_margin"] == pytest.approx(distance)
+
+
+def test_the_worst_of_several_plants_is_named() -> None:
+    """A lag under integral control: twice the gain overshoots most and has the most bandwidth, half is the slowest."""
+    controller = discretise(Transfer.from_factors(60.0, [], [[1, 0]]), PERIOD_S)
+    plants = [(name, Transfer(PLANT.zeros, PLANT.poles, factor * PLANT.gain), 0)
+              for name, factor in (("as it is", 1.0), ("twice", 2.0), ("half", 0.5))]  # fmt: skip
+    found = worst_of(lambda plant, ticks: discrete_loop(controller, plant, ticks), plants, SpecificationOptions(), None)
+    assert found["overshoot_percent"].plant == "twice"
+    assert found["bandwidth_hz"].plant == "half"
+    assert found["settling_ms"].plant == "half"
+    assert found["settling_ms"].value == pytest.approx(1e3 * 3 / 30, rel=0.2)
+    lost = [*plants, ("wild", Transfer(PLANT.zeros, PLANT.poles, 100 * PLANT.gain), 0)]
+    found = worst_of(lambda plant, ticks: discrete_loop(controller, plant, ticks), lost, SpecificationOptions(), None)
+    assert {one.plant for one in found.values()} == {"wild"}
+    assert all(math.isnan(one.value) for one in found.values())
+
+
+def test_the_smaller_end_of_the_shift_counts() -> None:
+    """Integral control K/s of a resonance is stable while K < 2ζω′: a shift of p % with ζ kept moves that by p %."""
+    gain = 0.93 * 2 * ZETA * OMEGA
+    controller = Transfer.from_factors(gain, [], [[1, 0]])
+    assert shift_tolerated(lambda plant: continuous_loop(controller, plant), RESONANT) == pytest.approx(7.0, abs=1e-3)
+    assert shift_tolerated(lambda plant: continuous_loop(controller, plant), PLANT) == math.inf
 
 
 def test_noise_of_the_sensor_in_position_and_command() -> None:

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,20 +15,36 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.perturbation import changes as robust_changes
 from rtloop.analysis.perturbation import maker, until_unstable, with_damping_changed, with_gain_changed
 from rtloop.cli import main
+from rtloop.commands.design import verified, with_simulation
+from rtloop.configuration.cautions import cautions
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
+from rtloop.design.verification import text
 from rtloop.design.verification.judgement import Limit, described, held_up_to, specified
 from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
+from rtloop.design.verification.text import answer
+from rtloop.design.verification.verify import Robustness, as_dict
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PAPER_LOOP = continuous_loop(PAPER_C, PAPER_D)
 RUNNING = discretise(PAPER_C, 1e-4, "tustin", 595.5)
+MODEST = "[specification]\nsettling_ms = 5.0\novershoot_percent = 3.0\nstatic_error_percent = 0.2\n"
 
 
 def run(*arguments: str):
     return CliRunner().invoke(main, ["design", "verify", *arguments])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def unmeasured_host(tmp_path_factory):
+    """Nothing is known of this host's delay."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RUNTIME_DIRECTORY", str(tmp_path_factory.mktemp("run")))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +106,8 @@ def test_the_report_is_complete_and_stands_alone(report) -> None:
     assert html.count("data:image/png;base64,") == 3
     assert not re.search(r'(src|href)="(?!data:)', html)
     assert "MISSED" in html
+    assert "simulated steps" in html
+    assert [step["height_um"] for step in found["axes"][0]["simulated"]["steps"]] == [1.0, 5.0, 20.0, 40.0]
     assert json.loads((out / "verify.json").read_text(encoding="utf-8"))["axes"][0]["name"] == "x"
 
 
@@ -105,13 +124,111 @@ def test_the_terminal_shows_required_achieved_verdict_and_claim() -> None:
 
 def test_a_specification_that_is_met(tmp_path) -> None:
     spec = tmp_path / "modest.toml"
-    spec.write_text("[specification]\nsettling_ms = 5.0\novershoot_percent = 3.0\nstatic_error_percent = 0.2\n")
+    spec.write_text(f"{MODEST}resonance_shift_percent = 1.0\n")
     result = run(str(DEPLOY / "paper.toml"), "--spec", str(spec), "--json")
     assert result.exit_code == 0, result.stderr
     axis = json.loads(result.stdout)["axes"][0]
     assert axis["meets"]
     limits = axis["robustness_percent"]["resonance"]
     assert limits["running"][0] <= limits["running_missed"][0] < 0 < limits["running_missed"][1] <= limits["running"][1]
+
+
+def judged(tmp_path, spec: str, config: str = "", simulated: bool = False):
+    """Axis x of the paper's configuration, or another, against a specification."""
+    (tmp_path / "spec.toml").write_text(spec)
+    config = config or (DEPLOY / "paper.toml").read_text()
+    configuration = parse(config.replace('"paper-spec.toml"', '"spec.toml"'), "paper", tmp_path, "paper.toml")
+    found = {"x": verified(configuration, prepare(configuration).checks[0], None)}
+    return (with_simulation(configuration, found) if simulated else found)["x"][0]
+
+
+def test_robustness_that_is_asked_for(tmp_path) -> None:
+    """The paper's resonance may rise by 1.82 % at 10 kHz, and rings for 31 ms; max |S| is 1.654."""
+    held = MODEST + "modulus_margin = 0.6\nresonance_decay_ms = 32.0\nresonance_shift_percent = 1.8\n"
+    found = judged(tmp_path, held)
+    assert found.meets
+    rows = {row.name: row for row in found.rows}
+    assert rows["resonance_shift_percent"].running == pytest.approx(1.82, abs=0.005)
+    assert rows["modulus_margin"].running == pytest.approx(1 / 1.65383, abs=1e-4)
+    missed = MODEST + "modulus_margin = 0.61\nresonance_decay_ms = 30.0\nresonance_shift_percent = 1.9\n"
+    found = judged(tmp_path, missed)
+    assert [row.name for row in found.missed] == ["resonance_decay_ms", "resonance_shift_percent", "modulus_margin"]
+
+
+def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
+    scenarios = "[scenarios]\nresonance_percent = {}\ndamping = [1.0]\ngain_percent = 0.0\n"
+    found = judged(tmp_path, MODEST + scenarios.format(1.0))
+    assert found.meets
+    assert found.scenarios is not None
+    worst = {row.name: (row, one) for row, one in found.scenarios.rows}
+    row, one = worst["overshoot_percent"]
+    assert one.value >= (row.running or math.nan)
+    assert "resonance +1 %" in worst["resonance_decay_ms"][1].plant
+    found = judged(tmp_path, MODEST + scenarios.format(3.0))
+    assert found.scenarios is not None
+    assert not found.missed
+    assert not found.meets
+    assert "settling (5 %) with resonance +3 %" in answer(found)
+    assert text.scenarios(found)[0][0] == f"worst of {found.scenarios.count} scenarios, linear"
+    assert as_dict(replace(found, examine=nothing_moved))["scenarios"]["rows"][0]["met"] is False
+
+
+def nothing_moved() -> Robustness:
+    return Robustness({}, {}, 0.0, 0)
+
+
+def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path) -> None:
+    shown = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
+    assert shown.meets
+    assert shown.simulated is not None
+    assert shown.simulated.met(shown.simulated.steps[0], "overshoot_percent") is False
+    assert shown.simulated.left_out_um == (60.0,)
+    assert any("Left out: steps of 60 µm" in note for note in text.simulation_notes(shown))
+    found = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
+    assert not found.meets
+    assert "simulated, settling (5 %) of 2 µm steps" in answer(found)
+
+
+def test_what_trips_is_said(tmp_path) -> None:
+    """An interlock at 6 µm ends a step of 10 µm."""
+    config = (DEPLOY / "paper.toml").read_text().replace("position_um = 60.0", "position_um = 6.0")
+    found = judged(tmp_path, "[simulation]\nsteps_um = [10.0]\njudged = true\n", config, simulated=True)
+    assert found.simulated is not None
+    assert found.simulated.steps[0].trips == ("position",)
+    assert "steps of 10 µm, which trip" in answer(found)
+
+
+def test_what_cannot_be_simulated_is_said(tmp_path) -> None:
+    """A second axis without a controller keeps the loop from closing."""
+    config = (DEPLOY / "paper.toml").read_text()
+    for old, new in (('# mode = "closed_loop"', 'mode = "off"'), ("[[axis]]\n", CHANNEL), ("[recording]", SECOND)):
+        config = config.replace(old, new + ("" if old.startswith("#") else old), 1)
+    found = judged(tmp_path, MODEST, config, simulated=True)
+    assert found.simulated is None
+    assert any("steps are not simulated" in warning for warning in found.warnings)
+
+
+CHANNEL = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n'
+SECOND = '[[axis]]\nname = "y"\n[axis.feedforward]\nthresholds_v = [0.0]\nweights_um_per_v = [4.0]\n'
+
+
+def test_delay_and_prefilter_are_in_the_loop_as_it_runs(tmp_path) -> None:
+    """The rig's latency counts although the model knows of none; half the reference leaves half of it."""
+    config = (DEPLOY / "paper.toml").read_text().replace("latency_ticks = 0", "latency_ticks = 2")
+    config = config.replace("# [axis.prefilter]", "[axis.prefilter]\ntaps = [0.25, 0.25]")
+    found = judged(tmp_path, MODEST, config)
+    assert found.delay_ticks == 2
+    rows = {row.name: row for row in found.rows}
+    assert rows["static_error_percent"].running == pytest.approx(50.0, abs=0.1)
+    assert rows["static_error_percent"].continuous == pytest.approx(0.166384, abs=1e-5)
+    prepared = prepare(parse(config, "paper", DEPLOY, "paper.toml"))
+    running = prepared.checks[0].running
+    assert running is not None
+    assert running.delay_ticks == 2
+    assert running.static_error_percent == pytest.approx(rows["static_error_percent"].running)
+    assert running.overshoot_percent == pytest.approx(rows["overshoot_percent"].running)
+    (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
+    assert late.startswith("axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 2")
 
 
 def test_faults_of_the_user(tmp_path, monkeypatch) -> None:

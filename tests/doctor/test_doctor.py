@@ -27,6 +27,12 @@ from tests.recording.real_loop import ROOT, changed
 CAP_IPC_LOCK, CAP_SYS_NICE, PR_CAPBSET_DROP = 14, 23, 24
 
 
+@pytest.fixture(autouse=True)
+def run_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    return tmp_path / "run"
+
+
 def doctor(*arguments: str, before=None) -> tuple[int, dict, str]:
     ran = subprocess.run(
         [sys.executable, "-m", "rtloop", "doctor", "--json", *arguments],
@@ -44,7 +50,7 @@ def without_privileges() -> None:
     resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
 
 
-def test_this_host(tmp_path):
+def test_this_host(tmp_path, run_folder):
     code, report, messages = doctor("deploy/paper.toml", "--seconds", "0.3", "--png", str(tmp_path / "late.png"))
     assert code == (0 if report["suitable"] else 1)
     assert report["suitable"] == (not report["reasons"])
@@ -54,6 +60,8 @@ def test_this_host(tmp_path):
     assert [axis["axis"] for axis in report["axes"]] == ["x"]
     assert not report["applied"]
     assert not messages
+    kept = json.loads((run_folder / "paper.host.json").read_text())
+    assert (kept["rate_hz"], kept["lateness_us"]) == (10_000, pytest.approx(report["lateness_us"]["p99"]))
     assert (tmp_path / "late.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -78,6 +78,7 @@ def test_a_drive_that_stands_still_shows_nothing():
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The command on a board of its own, with one rate; its result and the board."""
     monkeypatch.setattr("rtloop.commands.selftest.RUNGS", 1)
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
 
     def command(*arguments: str, drive_v: float = 10.0) -> tuple[Result, Path]:
         device, config = new_board(tmp_path / "comedi0"), tmp_path / "bench.toml"
@@ -88,7 +89,7 @@ def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     return command
 
 
-def test_a_wire_passes_and_the_output_is_parked(selftest):
+def test_a_wire_passes_and_the_output_is_parked(selftest, tmp_path):
     limits = ("--gain-tolerance", "0.001", "--offset-tolerance", str(2 * LSB_V))
     done, device = selftest("--loopback", *limits, "--json")
     report = json.loads(done.stdout)
@@ -97,6 +98,7 @@ def test_a_wire_passes_and_the_output_is_parked(selftest):
     assert abs(pair["gain"] - 1.0) < 0.001
     assert abs(pair["offset_v"]) < 2 * LSB_V
     assert pair["delay_ticks"] == 1
+    assert json.loads((tmp_path / "run" / "bench.host.json").read_text())["wire_ticks"] == {"x": 1}
     assert "ao0 from -1 V to 1 V, at most 1000 V/s" in done.stderr
     assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)
     reached = [rate["rate_hz"] for rate in report["rates"] if rate["missed_share"] <= 0.01]
@@ -108,6 +110,7 @@ def test_a_verdict_of_no_is_exit_1_and_the_limits_of_axis_and_range_hold(selftes
     """At most 0.5 V: nothing is wrong with the wire but a tolerance that no code can keep."""
     done, device = selftest("--loopback", "--gain-tolerance", "1e-9", drive_v=0.5)
     assert done.exit_code == 1, done.output
+    assert not (device.parent / "run").exists()  # what is no wire says nothing of the host
     assert "no loopback" in done.stdout
     assert "ao0 from -0.5 V to 0.5 V" in done.stderr
     assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)

@@ -84,7 +84,7 @@ def robustness(found: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(found: Verification) -> list[tuple[str, ...]]:
-    """Headings, then the worst of each quantity with its verdict and its plant; nothing where no scenario is asked for."""
+    """Headings, then the worst of each quantity, its verdict and its plant; nothing where no scenario is asked for."""
     if found.scenarios is None:
         return []
     rows = [(f"worst of {found.scenarios.count} scenarios, linear", "required", "as it runs", "", "on the plant with")]
@@ -182,6 +182,8 @@ def answer(found: Verification) -> str:
     """The sentence at the end."""
     if not found.running.is_stable:
         return "as it will run, the loop is UNSTABLE"
+    if found.host is not None and found.host.is_spent:
+        return "the delay of this host takes all that the loop bears"
     missed = [row.label for row in found.missed]
     if found.scenarios is not None:
         missed += [

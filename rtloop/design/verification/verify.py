@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -35,6 +35,7 @@ from rtloop.design.verification.robustness import (
 from rtloop.design.verification.simulated import Simulated
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
+from rtloop.supervision.host_delay import SpentMargin
 
 DELAYS = (0, 1, 2)
 """Samples of delay for which the tolerated shift of the resonance is always shown."""
@@ -112,6 +113,7 @@ class Verification:
     together: TogetherMargins | None = None
     scenarios: Scenarios | None = None
     simulated: Simulated | None = None
+    host: SpentMargin | None = None
 
     @cached_property
     def robustness(self) -> Robustness:
@@ -130,10 +132,12 @@ class Verification:
 
     @property
     def meets(self) -> bool:
-        """Stable as it will run, with every requirement met, in every scenario and simulation that is judged, too."""
+        """Stable as it will run, and on this host as far as it was measured, with every requirement met, in every
+        scenario and simulation that is judged, too."""
         in_scenarios = self.scenarios is None or not self.scenarios.missed
         simulated = self.simulated is None or not self.simulated.missed
-        return self.running.is_stable and not self.missed and in_scenarios and simulated
+        here = self.host is None or not self.host.is_spent
+        return self.running.is_stable and not self.missed and in_scenarios and simulated and here
 
 
 def verify(
@@ -250,6 +254,7 @@ def as_dict(found: Verification) -> dict[str, Any]:
         "more_delay_ticks": robust.delay_ticks,
         "together": None if found.together is None else found.together.as_dict(),
         "scenarios": None if found.scenarios is None else _scenarios(found.scenarios),
+        "host_delay": None if found.host is None else asdict(found.host),
         "simulated": None if found.simulated is None else found.simulated.as_dict(),
         "warnings": list(found.warnings),
     }

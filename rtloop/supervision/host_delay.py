@@ -1,0 +1,129 @@
+"""What was measured of this host's delay, kept beside the files of a service, and what it takes of a loop's margin.
+
+`rtloop doctor CONFIG` notes how late the loop's clock wakes, `rtloop drivers --selftest --loopback` how many ticks a
+value takes from an output through a wire to an input: one where nothing but the held output delays it. NAME.host.json
+in the runtime folder is gone with the next restart of the machine, as the settings of its kernel may be.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from rtloop.analysis.margins import delay_tolerated
+from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.prepare import Prepared
+from rtloop.errors import ConfigError, OutputError
+from rtloop.hil.options import Options
+from rtloop.hil.trusted import Untrusted, open_file, open_folder
+from rtloop.supervision.paths import FOLDER_MODE, client_folders, refusal, runtime_folder
+
+MOST_BYTES = 1 << 16
+US_PER_S = 1e6
+
+
+class HostDelay(Options):
+    """Of one configuration here, at one rate: p99 of the clock's lateness, ticks through a wire of each axis."""
+
+    rate_hz: float = Field(gt=0)
+    lateness_us: float = Field(default=0.0, ge=0)
+    wire_ticks: dict[str, int] = {}  # noqa: RUF012
+
+
+@dataclass(frozen=True)
+class SpentMargin:
+    """Delay that this host adds to what an axis was judged with, and the delay that its loop bears, in µs."""
+
+    lateness_us: float
+    wire_ticks: int
+    more_us: float
+    more_ticks: float
+    margin_us: float
+
+    @property
+    def is_spent(self) -> bool:
+        """Nothing is left: the loop is unstable here, one tick in a hundred at least."""
+        return self.more_us >= self.margin_us
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        part = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
+        wire = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
+        return (
+            f"measured on this host: {self.lateness_us:.4g} µs late (p99){wire}, {self.more_us:.4g} µs = "
+            f"{self.more_ticks:.3g} ticks of delay more, {part:.3g} % of the {self.margin_us:.4g} µs that it bears"
+        )
+
+
+def note_host_delay(configuration: Configuration, **measured: Any) -> None:
+    """Keep what was measured at the configuration's rate. Raises OutputError, HostRefused for a folder of others."""
+    rate_hz = configuration.loop.rate_hz
+    before = measured_delay(configuration)
+    kept = (before or HostDelay(rate_hz=rate_hz)).model_copy(update=measured)
+    path = runtime_folder() / _name(configuration)
+    try:
+        os.close(open_folder(path.parent, FOLDER_MODE))
+        fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o640)
+        with os.fdopen(fd, "w") as file:
+            file.write(kept.model_dump_json())
+    except Untrusted as error:
+        raise refusal(error) from None
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror}") from None
+
+
+def measured_delay(configuration: Configuration) -> HostDelay | None:
+    """What was measured at the configuration's rate; None where nothing was, or nothing that can be believed."""
+    for folder in dict.fromkeys((runtime_folder(), *client_folders())):
+        try:
+            with os.fdopen(open_file(folder / _name(configuration), os.O_RDONLY), "rb") as file:
+                found = HostDelay.model_validate_json(file.read(MOST_BYTES))
+        except (OSError, ValidationError):
+            continue
+        if found.rate_hz == configuration.loop.rate_hz:
+            return found
+    return None
+
+
+def _name(configuration: Configuration) -> str:
+    return f"{configuration.name}.host.json"
+
+
+def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
+    """What a host takes of an axis's margin; None of an axis whose loop is not known, or not stable."""
+    if check.plant is None or check.running is None or not check.running.stable:
+        return None
+    margin_s, _ = delay_tolerated(check.loop(check.plant, check.delay_ticks))
+    wire = max(host.wire_ticks.get(check.name, 1) - 1 - check.delay_ticks, 0)
+    period_us = US_PER_S / host.rate_hz
+    more_us = host.lateness_us + wire * period_us
+    return SpentMargin(host.lateness_us, wire, more_us, more_us / period_us, US_PER_S * margin_s)
+
+
+def require_margins(prepared: Prepared) -> None:
+    """Raise ConfigError where an axis requires a margin that this host spends, or whose delay nobody has measured."""
+    configuration, faults = prepared.configuration, list[str]()
+    asking = [axis.name for axis in configuration.axes if axis.margins.require_margin]
+    if not asking or not prepared.plan.pacing.paced:
+        return
+    host = measured_delay(configuration)
+    for check in prepared.checks:
+        if check.name not in asking:
+            continue
+        where = f"axis.{check.name}.margins.require_margin"
+        spent = None if host is None else spent_margin(check, host)
+        if host is None:
+            faults.append(f"{where}: the delay of this host is not known; `rtloop doctor CONFIG` measures it")
+        elif spent is None:
+            faults.append(
+                f"{where}: the axis's margin is not known; a controller that is linear and a model are needed"
+            )
+        elif spent.is_spent:
+            faults.append(f"{where}: {spent.words}; nothing is left")
+    if faults:
+        raise ConfigError(configuration.source, faults)

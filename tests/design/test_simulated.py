@@ -1,0 +1,246 @@
+"""Simulated steps and rest: against recorded runs of the same rig, against scipy, and against what is linear."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from rtloop.analysis.held_plant import POINTS
+from rtloop.analysis.step_response import step_response
+from rtloop.configuration.axis import LimitsOptions
+from rtloop.configuration.file import Configuration, load, parse
+from rtloop.configuration.prepare import prepare
+from rtloop.design.synthesis.specification import DesignOptions, SensorOptions
+from rtloop.design.verification.bench import Bench, Stand
+from rtloop.design.verification.judgement import described
+from rtloop.design.verification.simulated import between_ticks, simulate
+from rtloop.errors import ConfigError
+from rtloop.hil.options import Options
+from rtloop.hysteresis.leftover import with_hysteresis_left
+from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.signals import axis_column, columns
+from tests.recording.real_loop import ROOT, RealLoop, changed
+
+PAPER = load(ROOT / "deploy" / "paper.toml")
+OMEGA, ZETA, KI, RATE_HZ = 2 * np.pi * 400.0, 0.1, 200.0, 10_000.0
+LINEAR = f"""
+[loop]
+rate_hz = {RATE_HZ}
+[driver]
+kind = "sim"
+seed = 3
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 5.0
+[driver.plant.hysteresis]
+truth = "custom"
+thresholds_v = [0.0]
+weights_um_per_v = [4.0]
+[driver.plant.dynamics]
+form = "factors"
+gain = {OMEGA**2}
+numerator = []
+denominator = [[1.0, {2 * ZETA * OMEGA}, {OMEGA**2}]]
+[driver.plant.sensor]
+um_per_v = 5.0
+noise_um = 0.02
+resolution_um = 0.0
+[driver.plant.adc]
+bits = 0
+[driver.plant.dac]
+bits = 0
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.0]
+[axis.controller]
+form = "transfer_function"
+numerator = [{KI}]
+denominator = [1.0, 0.0]
+method = "tustin"
+[axis.model]
+form = "factors"
+gain = {OMEGA**2}
+numerator = []
+denominator = [[1.0, {2 * ZETA * OMEGA}, {OMEGA**2}]]
+[axis.limits]
+command_um = 30.0
+"""
+
+
+def linear(more: str = "") -> Configuration:
+    return parse(LINEAR + more, "linear", Path(), "linear")
+
+
+def test_a_simulation_is_the_run_itself() -> None:
+    """The paper's loop, steps of 20 µm, recorded and simulated: every column of every tick, to the last bit."""
+    text = changed(("levels = [20.0, 0.0, -20.0, 0.0]\ndwell_s = 0.2", "levels = [0.0, 20.0, -20.0]\ndwell_s = 0.05"))
+    recorded = RealLoop(text)
+    recorded.run(1500)
+    rows = recorded.block.ring("ticks").slots[:1500]
+    names = columns(["x"], ["x_true_position_um", "x_hysteresis_um"])
+    run = Bench(PAPER, {}).run("x", (0.0, 20.0, -20.0), 0.05)
+    assert tuple(run) == names
+    for name, column in zip(names, rows.T, strict=True):
+        np.testing.assert_array_equal(run[name], column, err_msg=name)
+    assert np.ptp(run["x_true_position_um"]) > 39
+    assert rows[:, axis_column(0, 0)].any()
+
+
+def test_positions_between_ticks_are_those_of_the_held_displacement() -> None:
+    bench = Bench(linear(), {})
+    run = bench.run("x", (0.0, 10.0), 0.02)
+    found = between_ticks(bench.rig, run, "x", RATE_HZ)
+    a = np.array([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]])
+    grown = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) / RATE_HZ / POINTS)
+    state, positions = np.zeros(2), []
+    for displacement in run["x_hysteresis_um"][1:]:
+        for _ in range(POINTS):
+            positions.append(state[0])
+            state = grown[:2, :2] @ state + grown[:2, 2] * displacement
+    np.testing.assert_allclose(found[: len(positions)], positions, atol=1e-9)
+    np.testing.assert_allclose(found[::POINTS], run["x_true_position_um"], atol=1e-12)
+    assert found.max() > run["x_true_position_um"].max()
+
+
+def test_what_moves_it_besides_is_straight_between_ticks() -> None:
+    text = LINEAR.replace("[driver.plant.sensor]", "[driver.plant.disturbance]\nstep_um = 2.0\n[driver.plant.sensor]")
+    bench = Bench(parse(text, "linear", Path(), "linear"), {})
+    run = bench.run("x", (0.0,), 0.02)
+    found = between_ticks(bench.rig, run, "x", RATE_HZ)
+    np.testing.assert_allclose(found[::POINTS], run["x_true_position_um"], atol=1e-12)
+    assert found.max() > 1.0
+
+
+def test_a_linear_rig_is_simulated_as_it_is_predicted() -> None:
+    """No dead band, no rounding: noise at rest and the figures of a large step are those of the linear loop."""
+    configuration = linear()
+    check = prepare(configuration).checks[0]
+    assert check.plant is not None
+    assert check.running is not None
+    found = simulate(Bench(configuration, {}), configuration.axes[0], 1 / KI, DesignOptions())
+    noise = described(check.loop(check.plant, 0), SensorOptions(noise_um=0.02))
+    assert found.noise_x_nm == pytest.approx(noise["noise_x_nm"], rel=0.1)
+    assert found.noise_v_nm == pytest.approx(noise["noise_v_nm"], rel=0.1)
+    largest = found.steps[-1]
+    assert largest.height_um == 20.0
+    assert largest.settling_ms == pytest.approx(1e3 * check.running.settling_time_s, abs=0.1)
+    assert largest.overshoot_percent == pytest.approx(check.running.overshoot_percent, abs=0.1)
+    assert largest.static_error_percent == pytest.approx(0.0, abs=0.02)
+    assert largest.peak_drive_v == pytest.approx(20.0 * check.running.peak_command / 4.0, rel=0.01)
+    assert (largest.limited, largest.trips) == ((), ())
+    assert found.left_out_um == (40.0,)
+    assert found.truth == "the configured rig"
+
+
+@pytest.mark.parametrize("latency_ticks", [0, 2])
+def test_both_rows_of_taps_sections_and_latency_are_predicted_as_they_run(latency_ticks: int) -> None:
+    """A rig without noise runs what the linear analysis says of the same configuration, at ticks and between."""
+    quiet = LINEAR.replace("noise_um = 0.02", "noise_um = 0.0").replace(
+        "seed = 3", f"seed = 3\nlatency_ticks = {latency_ticks}"
+    )
+    prefilter = """
+[axis.prefilter]
+taps = [0.25, 0.0, 0.5, 0.15]
+command_taps = [0.6, -0.3, 0.2]
+sections = [[0.2, 0.1, 0.05, -0.9, 0.25]]
+"""
+    configuration = parse(quiet + prefilter, "linear", Path(), "linear")
+    check = prepare(configuration).checks[0]
+    assert check.plant is not None
+    assert check.delay_ticks == latency_ticks
+    bench = Bench(configuration, {})
+    run = bench.run("x", (0.0, 10.0), 0.1)
+    answer = step_response(check.loop(check.plant, check.delay_ticks), 0.0999)
+    np.testing.assert_allclose(10.0 * answer.position, between_ticks(bench.rig, run, "x", RATE_HZ)[8000:], atol=1e-8)
+    np.testing.assert_allclose(10.0 * answer.command[::POINTS], run["x_command_um"][1000:], atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return simulate(Bench(PAPER, {}), PAPER.axes[0], 0.031, DesignOptions())
+
+
+def test_what_is_not_linear_is_seen(paper) -> None:
+    """Hysteresis that the inverse leaves makes small steps slow, a dead band makes the loop hunt, a limit is named."""
+    assert [step.height_um for step in paper.steps] == [1.0, 5.0, 20.0, 40.0]
+    small, *_, large = paper.steps
+    assert small.overshoot_percent > 5 * 1.5
+    assert small.settling_ms > 3 * 4.1
+    assert large.limited == ("command",)
+    assert small.limited == ()
+    assert large.peak_drive_v <= 10.0
+
+
+def test_noise_at_rest_is_that_of_a_run(paper) -> None:
+    """Of the recorded loop at rest at 5 µm, in another second, under another seed."""
+    text = changed(("seed = 1 ", "seed = 8 "), ("levels = [20.0, 0.0, -20.0, 0.0]", "levels = [5.0]"))
+    recorded = RealLoop(text)
+    recorded.run(15_000)
+    rows = recorded.block.ring("ticks").slots[5_000:15_000]
+    assert len(rows) == 10_000
+    names = columns(["x"], ["x_true_position_um", "x_hysteresis_um"])
+    rms = {name: 1e3 * rows[:, names.index(name)].std() for name in ("x_command_um", "x_true_position_um")}
+    assert paper.noise_v_nm == pytest.approx(rms["x_command_um"], rel=0.35)
+    assert paper.noise_x_nm == pytest.approx(rms["x_true_position_um"], rel=0.6)
+    assert paper.noise_v_nm > 5 * 12.95  # what is linear says 13 nm
+
+
+def test_an_amplifier_with_one_side_steps_to_that_side() -> None:
+    configuration = linear()
+    axis = configuration.axes[0].model_copy(update={"limits": LimitsOptions(drive_min_v=0.0, command_um=30.0)})
+    configuration = replace(configuration, axes=(axis,))
+    design = DesignOptions.model_validate({"simulation": {"steps_um": [20.0]}})
+    (step,) = simulate(Bench(configuration, {}), axis, 1 / KI, design).steps
+    assert step.settling_ms < 20
+
+
+def test_a_model_stands_for_hardware() -> None:
+    """With the hysteresis that a compensation experiment found, and without."""
+    card = replace(PAPER, driver_kind="card", driver_options=Options())
+    stand = Stand(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
+    design = DesignOptions.model_validate({"simulation": {"steps_um": [5.0]}})
+    found = [
+        simulate(Bench(card, {"x": one}), card.axes[0], 0.031, design)
+        for one in (stand, stand._replace(residual_percent=3.75))
+    ]
+    assert {one.truth for one in found} == {"a rig after the axis's models"}
+    assert found[1].steps[0].overshoot_percent > found[0].steps[0].overshoot_percent
+    with pytest.raises(ValueError, match=r"axis.x.model: missing; nothing can stand"):
+        Bench(card, {"x": stand._replace(model=None)})
+    with pytest.raises(ValueError, match=r"residual_percent: 90; above .* and below .* are allowed here"):
+        Bench(card, {"x": stand._replace(residual_percent=90.0)})
+
+
+def test_what_cannot_run_is_not_simulated() -> None:
+    without = replace(PAPER, axes=(PAPER.axes[0].model_copy(update={"controller": None}),))
+    with pytest.raises(ConfigError, match="mode closed_loop needs it"):
+        Bench(without, {})
+
+
+@pytest.mark.parametrize("percent", [2.0, 3.75, 10.0])
+def test_hysteresis_that_is_left_is_as_much_as_was_said(percent: float) -> None:
+    """h/H of the changed actuator behind the inverse of the model, by plays written down here."""
+    model = PlayModel(np.array([0.0, 1.0, 2.0, 4.0, 6.0]), np.array([1.3, 0.3, 0.2, 0.3, 0.2]))
+    changed_model = with_hysteresis_left(model, percent, 10.0)
+    inverse = model.inverse()
+    top = float(np.maximum(10.0 - model.thresholds, 0) @ model.weights)
+    v = top * np.interp(np.arange(6001), [0, 1000, 3000, 5000, 6000], [0, 1, -1, 1, 0])
+    y = plays(plays(v, inverse), changed_model)
+    down, up = y[1000:3001], y[3000:5001][::-1]
+    assert 100 * np.abs(down - up).max() / np.ptp(y[1000:]) == pytest.approx(percent, rel=0.03)
+    assert np.ptp(y) == pytest.approx(2 * top, rel=1e-3)
+
+
+def plays(values: np.ndarray, model: PlayModel) -> np.ndarray:
+    held, found = np.zeros(model.thresholds.size), []
+    for value in values:
+        held = np.maximum(value - model.thresholds, np.minimum(value + model.thresholds, held))
+        found.append(model.weights @ held)
+    return np.array(found)

@@ -1,0 +1,103 @@
+"""What is kept of a host's delay, what it takes of a margin, and a loop that refuses to run without one."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli import main
+from rtloop.configuration.file import Configuration, parse
+from rtloop.configuration.prepare import prepare
+from rtloop.errors import ConfigError, HostRefused
+from rtloop.supervision.host_delay import measured_delay, note_host_delay, require_margins, spent_margin
+from tests.recording.real_loop import ROOT, changed
+
+MARGIN_US = 73.05 / 360 / 95.09 * 1e6
+"""Phase margin over crossover of the paper's loop at 10 kHz."""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    return tmp_path / "run"
+
+
+def configured(*changes: tuple[str, str]) -> Configuration:
+    return parse(changed(*changes), "host-delay-test", ROOT / "deploy", "paper.toml")
+
+
+REQUIRED = ("# [axis.margins]  ", "[axis.margins]\nrequire_margin = true\n# ")
+
+
+def test_what_was_measured_is_kept_at_its_rate() -> None:
+    configuration = configured()
+    assert measured_delay(configuration) is None
+    note_host_delay(configuration, lateness_us=40.0)
+    note_host_delay(configuration, wire_ticks={"x": 3})
+    found = measured_delay(configuration)
+    assert found is not None
+    assert (found.lateness_us, found.wire_ticks) == (40.0, {"x": 3})
+    assert measured_delay(configured(("rate_hz = 10000\n", "rate_hz = 5000\n"))) is None
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"rate_hz": -1}', '{"rate_hz": 1e4, "lateness_us": "x"}'])
+def test_what_cannot_be_read_counts_as_not_measured(folder: Path, content: str) -> None:
+    configuration = configured()
+    note_host_delay(configuration, lateness_us=40.0)
+    (folder / "host-delay-test.host.json").write_text(content)
+    assert measured_delay(configuration) is None
+
+
+def test_nobody_elses_file_is_believed(folder: Path) -> None:
+    configuration = configured()
+    note_host_delay(configuration, lateness_us=40.0)
+    os.chmod(folder / "host-delay-test.host.json", 0o666)
+    assert measured_delay(configuration) is None
+    os.chmod(folder, 0o777)
+    with pytest.raises(HostRefused, match="others may write there"):
+        note_host_delay(configuration, lateness_us=1.0)
+
+
+def test_lateness_and_ticks_beyond_those_of_the_model_are_spent() -> None:
+    """A held output takes one tick through a wire; the rig's latency of one is in the loop already."""
+    configuration = configured(("latency_ticks = 0", "latency_ticks = 1"))
+    note_host_delay(configuration, lateness_us=40.0, wire_ticks={"x": 4})
+    (check,), host = prepare(configuration).checks, measured_delay(configuration)
+    assert host is not None
+    spent = spent_margin(check, host)
+    assert spent is not None
+    assert (spent.wire_ticks, spent.more_us) == (2, pytest.approx(240.0))
+    assert spent.more_ticks == pytest.approx(2.4)
+    assert spent.margin_us == pytest.approx(MARGIN_US - 100.0, rel=0.01)
+    assert not spent.is_spent
+    assert "240 µs = 2.4 ticks of delay more" in spent.words
+    assert spent_margin(replace(check, plant=None), host) is None
+
+
+def test_a_margin_that_is_required() -> None:
+    free = prepare(configured())
+    require_margins(free)
+    asking = prepare(configured(REQUIRED))
+    require_margins(prepare(configured(REQUIRED), paced=False))
+    with pytest.raises(ConfigError, match="delay of this host is not known"):
+        require_margins(asking)
+    note_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
+    require_margins(asking)
+    note_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
+    with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
+        require_margins(asking)
+    unknown = replace(asking, checks=(replace(asking.checks[0], plant=None),))
+    with pytest.raises(ConfigError, match="the axis's margin is not known"):
+        require_margins(unknown)
+
+
+def test_a_run_is_refused_before_it_begins(tmp_path: Path) -> None:
+    (tmp_path / "asking.toml").write_text(changed(REQUIRED, ('specification = "paper-spec.toml"', "")))
+    done = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
+    assert done.exit_code == 78
+    assert "axis.x.margins.require_margin: the delay of this host is not known" in done.stderr
+    assert not list(tmp_path.glob("*.mcap*"))
