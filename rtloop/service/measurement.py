@@ -22,15 +22,14 @@ from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
 from rtloop.analysis.measured.response import Signals
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.checks import promised_loop
-from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
 from rtloop.service.desk import Refused
 from rtloop.service.live import LiveLaw
-from rtloop.signals import Flag, Mode
+from rtloop.service.playing import REST_S, Player
 from rtloop.supervision.supervisor import Supervisor
 
-REST_S, FADE_S, POLL_S = 0.2, 0.05, 0.02
+FADE_S = 0.05
 FIRST_PERIODS = 2
 TRIES, LESS = 3, 0.7
 """How often less is tried, and how much less, where the position went too far."""
@@ -42,7 +41,6 @@ LOWEST_LINES = 2
 """The lowest frequency, in lines, where none is given."""
 EXCITED = 0.3
 """Part of a light mode's frequency, to both sides, that is excited for it alone."""
-PATIENCE_S = 2.0
 IN_STEP = "sim"
 """The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 REST_MARGIN = 1.2
@@ -109,7 +107,7 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
         asked = replace(asked, from_hz=(1 - EXCITED) * near_hz, to_hz=(1 + EXCITED) * near_hz)
     lines = _grid(asked, rate_hz, near_hz, half_width_hz)
     periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
-    run = _Run(supervisor, live, number, rate_hz)
+    run = _Run(Player(supervisor, live, number, "response"), live.prepared.plan.driver_kind)
     with run.about_the_reference(asked.amplitude_um):
         found = run.approach(lines, asked.amplitude_um, periods)
     try:
@@ -134,29 +132,25 @@ class _TooFar(Refused):
 
 
 class _Run:
-    """Plays periods on one axis, and reads what the loop did."""
+    """Multisines about the reference that is held, within a stated motion."""
 
-    def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, rate_hz: float) -> None:
-        self._supervisor, self._live, self._number, self._rate_hz = supervisor, live, number, rate_hz
-        self._axis, self._driver = live.prepared.plan.axes[number], live.prepared.plan.driver_kind
-        self._columns = {name: signals.axis_column(number, one) for name, one in NAMES.items()}
-        self._hold_um = live.held(number)
-        self._set = live.references_set[number]
+    def __init__(self, player: Player, driver: str) -> None:
+        self._player, self._driver = player, driver
         self._lowest_um, self._highest_um = -np.inf, np.inf
 
     @contextmanager
     def about_the_reference(self, amplitude_um: float) -> Iterator[None]:
         """Rest first, to know what is allowed; at the end hold what was held, unless somebody else set a reference."""
-        ticks = round(REST_S * self._rate_hz)
-        rest = self._read(self._supervisor.ticks, ticks)[:, self._columns["position_um"]]
+        player = self._player
+        rest = player.column(player.read(player.tick, round(REST_S * player.rate_hz)), signals.POSITION)
         slack_um = REST_MARGIN * np.abs(rest - rest.mean()).max()
         self._lowest_um, self._highest_um = rest.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
         try:
             yield
         finally:
-            if self._ours:
+            if player.ours:
                 with suppress(RtloopError):
-                    self._take_back()
+                    player.hold(player.hold_um)
 
     def approach(self, lines: Grid, amplitude_um: float, periods: int) -> dict[str, Real]:
         """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
@@ -171,7 +165,7 @@ class _Run:
                 tries -= 1
                 if not tries:
                     raise
-                self._take_back()
+                self._player.hold(self._player.hold_um)
                 aims = [LESS * aim for aim in aims]
             else:
                 period, aims = another, aims[1:]
@@ -179,13 +173,12 @@ class _Run:
 
     def play(self, period: Real, periods: int) -> dict[str, Real]:
         """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
-        samples = played(period, periods, self._hold_um, round(FADE_S * self._rate_hz))
-        tick = self._live.set_waveform(self._axis, samples.tolist(), 1, repeat=False)
-        self._set += 1
-        rows = self._read(tick, samples.size)
-        if not np.array_equal(rows[:, self._columns["reference_um"]], samples):
+        player = self._player
+        samples = played(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
+        rows = player.read(player.play(samples[:, np.newaxis]), samples.size, self._judge)
+        if not np.array_equal(player.column(rows, signals.REFERENCE), samples):
             raise Refused("response: the reference was changed meanwhile")
-        found = {name: rows[:, column] for name, column in self._columns.items()}
+        found = {name: player.column(rows, signal) for name, signal in NAMES.items()}
         return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != IN_STEP else {})
 
     def _whole(self, lines: Grid, found: dict[str, Real]) -> Signals:
@@ -195,46 +188,7 @@ class _Run:
             *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in parts)
         )
 
-    def _take_back(self) -> None:
-        """Hold what was held, and come to rest."""
-        self._live.set_reference(self._axis, {"kind": "hold", "value": self._hold_um})
-        self._set += 1
-        time.sleep(REST_S)
-
-    @property
-    def _ours(self) -> bool:
-        """Whether nobody else has set a reference since."""
-        return self._live.references_set[self._number] == self._set
-
-    def _read(self, first: int, count: int) -> Real:
-        """Records of `count` ticks from `first` on, as they come. Raises Refused as soon as one is not fit."""
-        ring = self._supervisor.block.ring("ticks")
-        rows = np.empty((count, ring.slots.shape[1]))
-        there, deadline_s = 0, time.monotonic() + count / self._rate_hz + PATIENCE_S
-        while there < count:
-            copied, _, lost = drain(ring, first + there, rows[there:])
-            if lost:
-                raise Refused("response: ticks were lost before they could be read")
-            self._judge(rows[there : there + copied])
-            there += copied
-            if time.monotonic() > deadline_s:
-                raise Refused("response: the loop's ticks do not come")
-            time.sleep(POLL_S)
-        return rows
-
-    def _judge(self, rows: Real) -> None:
-        if not self._ours:
-            raise Refused("response: somebody else has set a reference")
-        if not len(rows):
-            return
-        flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
-        if causes := signals.trip_causes(flags):
-            raise Refused(f"response: tripped: {', '.join(causes)}")
-        if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
-            raise Refused("response: not in closed loop")
-        if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
-            raise Refused("response: command or drive is clipped: another setpoint, or a smaller amplitude, is needed")
-        position_um = rows[:, self._columns["position_um"]]
+    def _judge(self, position_um: Real) -> None:
         low, high = float(position_um.min()), float(position_um.max())
         if not self._lowest_um <= low <= high <= self._highest_um:
             raise _TooFar(f"response: the position went to {low:.4g} … {high:.4g} µm, beyond the stated "

@@ -1,0 +1,94 @@
+"""References played on one axis of a loop that runs, and what the loop did, as its ticks come.
+
+What is read is the ring that the recorder reads: it is in the recording as well.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rtloop import signals
+from rtloop.engine.ring import drain
+from rtloop.hil.modal import Real
+from rtloop.service.desk import Refused
+from rtloop.service.live import LiveLaw
+from rtloop.signals import Flag, Mode
+from rtloop.supervision.supervisor import Supervisor
+
+REST_S, POLL_S, PATIENCE_S = 0.2, 0.02, 2.0
+
+
+class Player:
+    """Plays on axis `number` about the constant that it holds; `doing` says what for in every refusal.
+
+    Raises Refused where the reference is none that is held.
+    """
+
+    def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, doing: str) -> None:
+        self._supervisor, self._live, self._number, self._doing = supervisor, live, number, doing
+        self.axis = live.prepared.plan.axes[number]
+        self.rate_hz = live.prepared.configuration.loop.rate_hz
+        self.hold_um = live.held(number)
+        self._set = live.references_set[number]
+
+    @property
+    def tick(self) -> int:
+        """The next tick."""
+        return self._supervisor.ticks
+
+    @property
+    def ours(self) -> bool:
+        """Whether nobody else has set a reference since."""
+        return self._live.references_set[self._number] == self._set
+
+    def play(self, samples: Real, *, repeat: bool = False) -> int:
+        """Samples (n, 1 or 2), a tick each; the tick of the first one. Raises ConfigError, Refused."""
+        tick = self._live.set_waveform(self.axis, samples, 1, repeat)
+        self._set += 1
+        return tick
+
+    def hold(self, value_um: float) -> None:
+        """A constant, and a while to come to rest. Raises Refused."""
+        self._live.set_reference(self.axis, {"kind": "hold", "value": value_um})
+        self._set += 1
+        time.sleep(REST_S)
+
+    def column(self, rows: Real, signal: int) -> Real:
+        """A signal (ticks,) of the axis, such as POSITION, in records that were read."""
+        return rows[:, signals.axis_column(self._number, signal)]
+
+    def read(self, first: int, count: int, judge: Callable[[Real], None] = lambda _: None) -> Real:
+        """Records of `count` ticks from `first` on, as they come. Raises Refused as soon as one is not fit.
+
+        `judge` may refuse, too: it is handed the position of the records that have come.
+        """
+        ring = self._supervisor.block.ring("ticks")
+        rows = np.empty((count, ring.slots.shape[1]))
+        there, deadline_s = 0, time.monotonic() + (first + count - self.tick) / self.rate_hz + PATIENCE_S
+        while there < count:
+            copied, _, lost = drain(ring, first + there, rows[there:])
+            if lost:
+                raise Refused(f"{self._doing}: ticks were lost before they could be read")
+            if not self.ours:
+                raise Refused(f"{self._doing}: somebody else has set a reference")
+            if copied:
+                self._require_fit(rows[there : there + copied])
+                judge(self.column(rows[there : there + copied], signals.POSITION))
+            there += copied
+            if time.monotonic() > deadline_s:
+                raise Refused(f"{self._doing}: the loop's ticks do not come")
+            time.sleep(POLL_S)
+        return rows
+
+    def _require_fit(self, rows: Real) -> None:
+        flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
+        if causes := signals.trip_causes(flags):
+            raise Refused(f"{self._doing}: tripped: {', '.join(causes)}")
+        if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
+            raise Refused(f"{self._doing}: not in closed loop")
+        if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
+            less = "another setpoint, or a smaller amplitude, is needed"
+            raise Refused(f"{self._doing}: command or drive is clipped: {less}")
