@@ -106,6 +106,15 @@ def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
     return Transfer(plant.zeros, np.where(moved, factor * plant.poles, plant.poles), gain)
 
 
+def around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
+    """The plant, and with its resonance shifted to `count` places within ±`percent`; itself alone where it has none."""
+    found = [("the model", plant)]
+    if percent and np.any(plant.poles.imag > 0):
+        shifts = [float(shift) for shift in np.linspace(-percent, percent, count) if shift]
+        found += [(f"resonance {shift:+g} %", with_resonance_shifted(plant, shift)) for shift in shifts]
+    return found
+
+
 def lightest_pair(plant: Transfer) -> complex:
     """The pole of positive imaginary part with the least damping ratio. Raises ValueError where all poles are real."""
     upper = plant.poles[plant.poles.imag > 0]

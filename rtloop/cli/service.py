@@ -188,6 +188,36 @@ def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repe
     return 0
 
 
+@ctl.command()
+@click.argument("axis")
+@click.argument("file", type=click.File())
+@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Of learning.")
+@click.option(
+    "--resonance-percent",
+    default=2.0,
+    show_default=True,
+    type=click.FloatRange(0, 50, max_open=True),
+    help="Only if the error shrinks with the resonance anywhere within so much of the model's.",
+)
+@click.option("--out", type=OUTPUT, help="The table that was learned, for `ctl waveform`; never over an existing file.")
+@JSON
+@click.pass_context
+@fails_clearly
+def learn(
+    context: click.Context, axis: str, file: Any, cycles: int, resonance_percent: float, out: Path | None, as_json: bool
+) -> int:  # fmt: skip
+    """Learn the scan of AXIS whose period is in FILE.
+
+    A number to a line and tick, in µm. It is played, and corrected by its error from cycle to cycle: the reference, and
+    what is added to the command. The best table goes on playing. At Ctrl-C what was held is held again.
+    """
+    from rtloop.commands.learn import learn as learn_scan
+
+    samples = [number for numbers in _numbers(file) for number in numbers[:1]]
+    body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
+    return learn_scan(_client(context), body, out, as_json)
+
+
 AMPLITUDE = click.option(
     "--amplitude-um", default=0.5, show_default=True, type=click.FloatRange(0, min_open=True),
     help="The position is moved by no more than this.",

@@ -124,13 +124,18 @@ def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
     return max(of_rig, 0 if axis.model is None else axis.model.delay_ticks)
 
 
-def promised_loop(axis: AxisOptions, rate_hz: float) -> Loop | None:
-    """The loop of an axis with a controller of its own, on its model; None where there is none or nothing linear is known."""
+def promised_loop(axis: AxisOptions, rate_hz: float, plant: Transfer | None = None) -> Loop | None:
+    """The loop of an axis with a controller of its own, on its model or another `plant`.
+
+    None where there is none, or nothing linear is known of it.
+    """
     law = controller_of(axis, 1 / rate_hz)
     if axis.model is None or law is None or law.count > 1:
         return None
     try:
-        return discrete_loop(linear_part(law), axis.model.transfer(), axis.model.delay_ticks, axis.prefilter.path())
+        return discrete_loop(
+            linear_part(law), plant or axis.model.transfer(), axis.model.delay_ticks, axis.prefilter.path()
+        )
     except ValueError:
         return None
 

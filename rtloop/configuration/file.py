@@ -251,8 +251,9 @@ def _validated(
 
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
     """One line for each fault of `raw`, which stands at the key `prefix`; None where it is not at hand."""
-    details = error.errors(include_url=False)
-    details = [detail for detail in details if not (detail["type"] == "too_short" and detail["input"])]
+    found = error.errors(include_url=False)
+    # what is too short because some of it is faulty is told by its faults
+    details = [detail for detail in found if not (detail["type"] == "too_short" and detail["input"])] or found
     more = [f"and {len(details) - MAX_FAULTS} more"] if len(details) > MAX_FAULTS else []
     return [_short(_fault(detail, prefix, raw, known_keys or set())) for detail in details[:MAX_FAULTS]] + more
 

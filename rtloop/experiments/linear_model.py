@@ -23,6 +23,7 @@ from rtloop.hil.modal import Complex, Real
 from rtloop.laws.linearise import linear_part
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
+from rtloop.linear.transfer import Transfer
 
 GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
 
@@ -35,12 +36,13 @@ class LinearModel:
         self.dynamics = model.transfer()
         self._delay_ticks = model.delay_ticks
         self._plant = sampled_plant(self.dynamics, 1 / rate_hz, model.delay_ticks)
+        self._path = axis.prefilter.path()
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
         shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
         if not shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
-            loop = discrete_loop(controller, self.dynamics, model.delay_ticks, axis.prefilter.path())
+            loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._path)
             self.loop = loop if loop.is_stable else None
 
     @property
@@ -121,15 +123,14 @@ class LinearModel:
 
     def stable_at(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted."""
-        shifted = self.with_resonance_shifted(shift_percent)
+        shifted = self.loop_with(with_resonance_shifted(self.dynamics, shift_percent))
         return shifted is not None and shifted.is_stable
 
-    def with_resonance_shifted(self, shift_percent: float) -> Loop | None:
-        """The loop with the plant's resonance shifted; None without a controller. Raises ValueError without one."""
-        if self._controller is None or self.loop is None:
+    def loop_with(self, plant: Transfer) -> Loop | None:
+        """The loop with another plant; None without a controller."""
+        if self._controller is None:
             return None
-        shifted = with_resonance_shifted(self.dynamics, shift_percent) if shift_percent else self.dynamics
-        return discrete_loop(self._controller, shifted, self._delay_ticks, self.loop.reference)
+        return discrete_loop(self._controller, plant, self._delay_ticks, self._path)
 
     @cached_property
     def tolerated(self) -> Range | None:

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.analysis.learning import Learning, learning
+from rtloop.analysis.perturbation import around
 from rtloop.errors import ConfigError
 from rtloop.experiments.procedure import Experiment, Run, Unsuited, hold
 from rtloop.experiments.setting import Setting
@@ -22,8 +23,6 @@ REST_S, SETTLE_S, MEASURED_S = 0.1, 0.1, 0.2
 """At least so long; whole periods."""
 GROWN = 1.1
 """An error larger by this factor than the least so far is not learned from: the table goes back."""
-PLACES = 5
-"""Shifts of the resonance between the ends at which learning must converge."""
 
 
 class ScanOptions(Options):
@@ -100,10 +99,7 @@ def _learning(setting: Setting, options: ScanOptions, period_ticks: int) -> Lear
         raise Unsuited(
             f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
         )
-    places = [0.0]
-    if model.resonance_hz and percent:
-        places += [float(place) for place in np.linspace(-percent, percent, PLACES) if place]
-    loops = [(f"resonance {place:+g} %", model.with_resonance_shifted(place)) for place in places]
+    loops = [(name, model.loop_with(plant)) for name, plant in around(model.dynamics, percent)]
     try:
         return learning([(name, loop) for name, loop in loops if loop is not None], period_ticks)
     except ValueError as error:

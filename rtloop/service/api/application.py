@@ -30,6 +30,7 @@ from rtloop.service.api.bodies import (
     MAX_BODY_BYTES,
     Body,
     ControllerBody,
+    LearnBody,
     ModeBody,
     ReferenceBody,
     ResponseBody,
@@ -40,9 +41,12 @@ from rtloop.service.api.bodies import (
 from rtloop.service.api.lanes import Busy, Lane, Lanes
 from rtloop.service.api.metrics import metrics_text
 from rtloop.service.desk import Refused, Taken
+from rtloop.service.learning import learn
+from rtloop.service.live import LiveLaw
 from rtloop.service.measurement import Asked, Results, measure
 from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, status
+from rtloop.supervision.supervisor import Supervisor
 
 WATCH_HZ = 20.0
 MAX_STREAMS = 16
@@ -82,13 +86,15 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
                                                                           body.repeat))),
     "/response": (ResponseBody, "Measure the response of the closed loop about the reference that is held.",
                   lambda service, body: _response(service, body)),
+    "/learn": (LearnBody, "Play a period and learn it; it goes on playing.",
+               lambda service, body: _learn(service, body)),
     "/tune": (TuneBody, "Change keys of controller, limits, interlocks, prefilter or model.",
               lambda service, body: _tick(_live(service).tune(body.axis, body.section, body.values))),
     "/controller": (ControllerBody, "Verify another controller and swap it in bumplessly.",
                     lambda service, body: _tick(_live(service).load_controller(body.axis, body.controller))),
 }  # fmt: skip
 """Path → body, what it does, how. All are POST; a command's answer is the tick at which it took effect."""
-LANES = {"/response": Lane.MEASUREMENT, "/stop": Lane.SAFETY, "/reset": Lane.SAFETY,
+LANES = {"/response": Lane.MEASUREMENT, "/learn": Lane.MEASUREMENT, "/stop": Lane.SAFETY, "/reset": Lane.SAFETY,
          "/tune": Lane.BUILD, "/controller": Lane.BUILD, "/reload": Lane.BUILD}  # fmt: skip
 """The rest is ordinary."""
 
@@ -110,12 +116,21 @@ def _reference(service: Service, body: ReferenceBody) -> int:
 
 def _response(service: Service, body: ResponseBody) -> dict[str, Any]:
     """Figures and lines; the figures stay with the service."""
-    live, supervisor = _live(service), service.supervisor
-    if supervisor is None or service.state is not State.RUNNING:
-        raise Refused(f"response: the service is {service.state}; a loop that runs is needed")
-    found = measure(supervisor, live, body.axis, Asked(**body.model_dump(exclude={"axis"})))
+    found = measure(*_running(service, "response"), body.axis, Asked(**body.model_dump(exclude={"axis"})))
     service.measured.setdefault(body.axis, Results()).note(found)
     return found.for_json()
+
+
+def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
+    """Every cycle, and the table that is played now."""
+    return learn(*_running(service, "learn"), body.axis, body.asked).for_json()
+
+
+def _running(service: Service, doing: str) -> tuple[Supervisor, LiveLaw]:
+    live, supervisor = _live(service), service.supervisor
+    if supervisor is None or service.state is not State.RUNNING:
+        raise Refused(f"{doing}: the service is {service.state}; a loop that runs is needed")
+    return supervisor, live
 
 
 def _setpoint(service: Service, body: SetpointBody) -> int:

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, mod
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
 from rtloop.hil.options import LARGEST_INTEGER
+from rtloop.service.learning import Asked as Taught
 from rtloop.service.measurement import Asked
 
 MAX_BODY_BYTES = 4 << 20
@@ -107,6 +108,20 @@ class ResponseBody(Body):
     period_s: float | None = Field(default=None, ge=0.05, le=10)
     near_hz: float | None = Field(default=None, gt=0)
     resonance_only: bool = False
+
+
+class LearnBody(Body):
+    """One period of the wanted position, in µm, a tick a sample, and how it is learned (`learning.Asked`)."""
+
+    axis: Name
+    samples: Annotated[list[float], FailFast(), Field(min_length=4)]
+    cycles: int = Field(default=Taught.cycles, ge=1, le=50)
+    resonance_percent: float = Field(default=Taught.resonance_percent, ge=0, lt=50)
+
+    @property
+    def asked(self) -> Taught:
+        """As it is learned."""
+        return Taught(np.array(self.samples), self.cycles, self.resonance_percent)
 
 
 class TuneBody(Body):

@@ -1,0 +1,162 @@
+"""A periodic reference that is learned while the loop runs: between cycles its table is corrected by the error."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.analysis.learning import Learning, learning
+from rtloop.analysis.perturbation import around
+from rtloop.configuration.checks import promised_loop
+from rtloop.errors import ConfigError, RtloopError
+from rtloop.hil.modal import Real
+from rtloop.service.desk import Refused
+from rtloop.service.live import LiveLaw
+from rtloop.service.playing import Player
+from rtloop.signals import FEED, POSITION, REFERENCE
+from rtloop.supervision.supervisor import Supervisor
+
+GLIDE_S, SETTLE_S, MEASURED_S = 0.5, 0.1, 0.2
+"""From what is held to the first sample; and of a cycle at least so long, in whole periods."""
+LONGEST_S = 300.0
+GROWN = 1.1
+"""An error larger by this factor than the least so far ends the learning, at the best table."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One period of the wanted position (n,), in µm, a tick a sample; how often it is learned; how far to be sure."""
+
+    wanted_um: Real
+    cycles: int = 5
+    resonance_percent: float = 2.0
+    """Nothing is played unless the error shrinks with the resonance anywhere within so much of the model's."""
+
+
+class Cycle(NamedTuple):
+    """Of one table: rms and largest error, µm, over the mean of the periods that were judged."""
+
+    rms_um: float
+    largest_um: float
+
+
+class Learned(NamedTuple):
+    """Every cycle, the first one with nothing learned; the best table (n, 2), which goes on playing; why it ended."""
+
+    cycles: list[Cycle]
+    table: Real
+    ended: str
+
+    def for_json(self) -> dict[str, Any]:
+        """Plain values."""
+        reference, command = self.table.T.tolist()
+        cycles = [one._asdict() for one in self.cycles]
+        return {"cycles": cycles, "ended": self.ended, "reference_um": reference, "command_um": command}
+
+
+def learn(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Learned:
+    """Play a period again and again on an axis that holds a reference, and learn it.
+
+    Raises ConfigError for what can be granted in no state, and for a loop in which learning would not converge; Refused
+    for what this state does not allow, and where it was given up: the loop then plays the best table, or holds what it
+    held, unless it tripped or somebody else has set a reference.
+    """
+    number = live.axis_number(axis)
+    rate_hz = live.prepared.configuration.loop.rate_hz
+    ticks = asked.wanted_um.size
+    settle, judged = (int(np.ceil(seconds * rate_hz / ticks)) for seconds in (SETTLE_S, MEASURED_S))
+    if (took_s := (asked.cycles + 1) * (settle + judged) * ticks / rate_hz) > LONGEST_S:
+        raise _unsuitable(f"{asked.cycles} cycles take {took_s:.0f} s; at most {LONGEST_S:g} s are allowed")
+    teacher = _teacher(live, number, asked)
+    player = Player(supervisor, live, number, "learn")
+    tried = _Tried()
+    try:
+        glide = _glide(player.hold_um, float(asked.wanted_um[0]), round(GLIDE_S * rate_hz))
+        player.read(player.play(glide), len(glide))
+        ended = _taught(player, teacher, asked, settle, judged, tried)
+        player.play(tried.best, repeat=True)
+    except RtloopError:
+        if player.ours:
+            with suppress(RtloopError):
+                if tried.tables:
+                    player.play(tried.best, repeat=True)
+                else:
+                    player.hold(player.hold_um)
+        raise
+    return Learned(tried.cycles, tried.best, ended)
+
+
+class _Tried:
+    """Tables and what became of each."""
+
+    def __init__(self) -> None:
+        self.cycles: list[Cycle] = []
+        self.tables: list[Real] = []
+
+    def note(self, table: Real, error_um: Real) -> None:
+        """Another one."""
+        self.tables.append(table)
+        self.cycles.append(Cycle(float(np.sqrt(np.mean(error_um**2))), float(np.abs(error_um).max())))
+
+    @property
+    def number(self) -> int:
+        """Of the best cycle."""
+        return min(range(len(self.cycles)), key=lambda one: self.cycles[one].rms_um)
+
+    @property
+    def best(self) -> Real:
+        """Its table."""
+        return self.tables[self.number]
+
+
+def _taught(player: Player, teacher: Learning, asked: Asked, settle: int, judged: int, tried: _Tried) -> str:
+    """Cycle after cycle; why it ended."""
+    table = np.column_stack([asked.wanted_um, np.zeros_like(asked.wanted_um)])
+    for cycle in range(asked.cycles + 1):
+        error_um = _error(player, asked.wanted_um, table, settle, judged)
+        tried.note(table, error_um)
+        if tried.cycles[-1].rms_um > GROWN * tried.cycles[tried.number].rms_um:
+            return f"the error grew in cycle {cycle}: back to cycle {tried.number}"
+        table = teacher.improved(table, error_um)
+    return f"after {asked.cycles} cycles"
+
+
+def _teacher(live: LiveLaw, number: int, asked: Asked) -> Learning:
+    configuration = live.prepared.configuration
+    options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
+    loops = []
+    if options.model is not None and len(configuration.together(number)) == 1:
+        for name, plant in around(options.model.transfer(), asked.resonance_percent):
+            loop = promised_loop(options, rate_hz, plant)
+            loops += [] if loop is None else [(name, loop)]
+    if not loops:
+        raise _unsuitable(f"axis {options.name!r}: no model of a loop of its own; what is learned follows from that")
+    try:
+        return learning(loops, asked.wanted_um.size)
+    except ValueError as error:
+        raise _unsuitable(f"axis {options.name!r}: {error}") from None
+
+
+def _error(player: Player, wanted_um: Real, table: Real, settle: int, judged: int) -> Real:
+    """Wanted minus measured (n,), the mean of the periods behind those to settle.
+
+    Played once and then held, so that the next table begins where this one ended, whenever it comes.
+    """
+    ticks, whole = wanted_um.size, np.tile(table, (settle + judged, 1))
+    rows = player.read(player.play(whole), len(whole))[settle * ticks :]
+    played = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
+    if not np.array_equal(played, np.tile(table, (judged, 1))):
+        raise Refused("learn: the reference was changed, or held, meanwhile")
+    return wanted_um - player.column(rows, POSITION).reshape(judged, ticks).mean(axis=0)
+
+
+def _glide(from_um: float, to_um: float, ticks: int) -> Real:
+    """Half a cosine (ticks, 1)."""
+    return (from_um + (to_um - from_um) * (1 - np.cos(np.pi * np.arange(1, ticks + 1) / ticks)) / 2)[:, np.newaxis]
+
+
+def _unsuitable(message: str) -> ConfigError:
+    return ConfigError("request", [f"learn: {message}"])
