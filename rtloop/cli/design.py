@@ -53,4 +53,45 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
     return verify_configuration(config, spec, out, as_json)
 
 
+@design.command()
+@click.argument("spec", type=OUTPUT)
+@click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [one of its own].")
+@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
+@JSON
+@fails_clearly
+def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> int:
+    """Search a controller that damps the resonances of SPEC.toml wherever they lie in their ranges.
+
+    A PI part and biquads, whose slowest closed-loop mode around a resonance dies away as fast as can be over all
+    [scenarios], with walls on max |S|, on the disturbance and on noise; certified over sweeps and random plants.
+
+    Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where nothing found keeps what is asked.
+    """
+    from rtloop.commands.robust import search_specification
+
+    return search_specification(spec, config, out, axis, as_json)
+
+
+@design.command()
+@CONFIG
+@click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
+@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--axis", default="x", show_default=True, help="The axis whose taps are made.")
+@click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (extra: plot).")
+@JSON
+@fails_clearly
+def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> int:
+    """Make the taps with which the loop of CONFIG steps as fast as its drive allows.
+
+    Both rows of [axis.prefilter], by linear programming over [shape.scenarios]: the least settling time with which
+    overshoot, undershoot and v stay within their limits, then the least variation of v.
+
+    Exit 1 where there are none, with the constraint that binds and the fastest that is possible.
+    """
+    from rtloop.commands.robust import shape_configuration
+
+    return shape_configuration(config, spec, out, axis, plot, as_json)
+
+
 COMMANDS = (design,)

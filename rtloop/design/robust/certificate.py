@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import highest
 from rtloop.design.robust.objective import BAND, Walls
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.linear.discretise import DiscreteController
@@ -98,4 +98,5 @@ def _measured(
         return radius, math.inf, math.inf, math.inf, math.inf
     disturbance = float(loop.sensitivity(walls.disturbance_hz)[0]) if walls.disturbance_hz else 0.0
     decay = slowest_ms(loop, np.abs(family.modes))
-    return radius, decay, margins(loop).max_sensitivity, disturbance, noise_gain(loop)
+    peak, _ = highest(loop.sensitivity, loop.frequencies)
+    return radius, decay, peak, disturbance, noise_gain(loop)

@@ -55,7 +55,9 @@ class ShapeOptions(Options):
 
     taps: int = Field(default=48, ge=2, le=128)
     """Of each row."""
+    settling_ms: float | None = Field(default=None, gt=0)
+    """Settle by then, with the least variation of v; none: as fast as can be."""
     undershoot_percent: float = Field(default=5.0, ge=0, lt=100)
-    points_per_tick: int = Field(default=5, ge=1, le=20)
+    points_per_tick: int = Field(default=10, ge=1, le=20)
     """At which the position is judged, between ticks too."""
     scenarios: ScenarioOptions = ScenarioOptions(resonance_percent=5.0, damping=(1.0,), gain_percent=0.0)

@@ -71,8 +71,8 @@ class Family:
         """All light modes moved together, `count` places, at every corner of damping, gain and delay."""
         r, g = self.options.resonance_percent, self.options.gain_percent
         places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]
-        damping = sorted({min(self.options.damping), 1.0, max(self.options.damping)}) if self.modes.size else [1.0]
-        for ticks, factor, gain in itertools.product(self.delays, damping, sorted({-g, 0.0, g})):
+        damping = sorted({min(self.options.damping), max(self.options.damping)}) if self.modes.size else [1.0]
+        for ticks, factor, gain in itertools.product(self.delays, damping, sorted({-g, g})):
             yield from (Scenario((float(place),) * self.modes.size, factor, gain, ticks) for place in places)
 
     def drawn(self, count: int, seed: int) -> Iterator[Scenario]:

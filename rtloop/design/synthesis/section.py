@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from rtloop import __version__
-from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.synthesis.synthesise import Synthesis
 from rtloop.design.toml_text import roots, section
 from rtloop.hil.modal import Complex, RepeatedPoles, modal_sum
@@ -30,8 +31,12 @@ def controller_section(found: Synthesis, design: DesignOptions, source: str, tex
 
     Reading the numbers gives the same bits again; without a date, the same input gives the same text.
     """
-    lines = [*provenance(found, design, source, text)]
-    return "".join(f"# {line}\n" for line in lines) + _section(found.controller, design)
+    return commented_section(found.controller, design.controller, provenance(found, design, source, text))
+
+
+def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
+    """[axis.controller] below comment `lines`."""
+    return "".join(f"# {line}\n" for line in lines) + _section(controller, output)
 
 
 def controller_configuration(
@@ -41,6 +46,13 @@ def controller_configuration(
 
     Its rig is the plant of `design`; `specification` is the file's path relative to the configuration's.
     """
+    return configuration_around(found.controller, design, provenance(found, design, source, text), axis, specification)
+
+
+def configuration_around(
+    controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str
+) -> str:
+    """A configuration with any controller for the plant of `design`, below comment `lines`."""
     assert design.plant is not None
     plant, delay_ticks = design.plant.transfer(), design.plant.delay_ticks
     actuator = {"thresholds_v": [0.0], "weights_um_per_v": [STAND_IN_UM_PER_V]}
@@ -57,13 +69,13 @@ def controller_configuration(
                 "name": axis,
                 "specification": specification,
                 "feedforward": actuator,
-                "controller": tomllib.loads(_section(found.controller, design))["axis"]["controller"],
+                "controller": controller_values(controller, design.controller),
                 "model": {**_zpk(plant), "delay_ticks": delay_ticks},
             }
         ],
     }
     heading = [
-        *provenance(found, design, source, text),
+        *lines,
         "",
         f"Driver, feedforward and limits stand in for yours: a simulated rig of the plant, {STAND_IN_UM_PER_V} µm/V.",
         f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
@@ -94,10 +106,10 @@ def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) 
     digest = hashlib.sha256(text.encode()).hexdigest()
     lines = [
         f"Synthesised by rtloop {__version__} from {source} (SHA-256 {digest[:16]}…)",
-        *(f"plant: {_formula(plant.transfer())}" for plant in [design.plant] if plant),
-        f"W1 = {_formula(w.tracking)}",
-        f"W2 = {_formula(w.command)}",
-        f"W3 = {_formula(w.disturbance)}",
+        *(f"plant: {formula(plant.transfer())}" for plant in [design.plant] if plant),
+        f"W1 = {formula(w.tracking)}",
+        f"W2 = {formula(w.command)}",
+        f"W3 = {formula(w.disturbance)}",
         f"H∞ (Glover & Doyle 1988): γ_opt = {hinf.gamma_opt:.6g}, γ = {hinf.gamma:.6g}, "
         f"achieved {hinf.achieved:.6g} at order {full}",
         "each specification is relaxed by up to γ",
@@ -109,8 +121,12 @@ def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) 
     return lines
 
 
-def _section(controller: Transfer, design: DesignOptions) -> str:
-    output = design.controller
+def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
+    """[axis.controller] as plain values."""
+    return tomllib.loads(_section(controller, output))["axis"]["controller"]
+
+
+def _section(controller: Transfer, output: OutputOptions) -> str:
     prewarp = "" if output.prewarp_hz is None else f"prewarp_hz = {output.prewarp_hz!r}\n"
     return (
         "[axis.controller]\n"
@@ -127,7 +143,7 @@ def _roots(roots: Complex) -> str:
     return "[\n" + "".join(pairs) + "]" if pairs else "[]"
 
 
-def _formula(transfer: Transfer) -> str:
+def formula(transfer: Transfer) -> str:
     """Gain and factors, short, for people."""
     above = "".join(_factors(transfer.zeros)) or "1"
     below = "".join(_factors(transfer.poles))

@@ -1,0 +1,155 @@
+"""What `rtloop design robust` and `rtloop design shape` do: from files to files and words."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.configuration.checks import Findings, check_axes
+from rtloop.configuration.file import load, parse
+from rtloop.configuration.prepare import prepare
+from rtloop.configuration.text_files import read_text
+from rtloop.design.robust.search import Robust, robust_controller
+from rtloop.design.robust.section import robust_configuration, robust_section, taps_section, with_controller, with_taps
+from rtloop.design.robust.shape import Shaped, shaped
+from rtloop.design.robust.subject import subject_of
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.errors import ConfigError, NoDesign, OutputError
+from rtloop.terminal.robust import print_robust, print_shaped
+
+
+def search_specification(spec: Path, config: Path | None, out: Path | None, axis: str, as_json: bool) -> int:
+    """Write a configuration with the controller to `out`, or its section to stdout.
+
+    `config` is the configuration that it goes into. Raises ConfigError, NoDesign, OutputError.
+    """
+    path, text, design = load_specification(spec)
+    if config is not None:
+        _require_axis(config, axis)
+    try:
+        found = robust_controller(design, lambda line: click.echo(line, err=True))
+    except NoController as error:
+        raise NoDesign(f"{spec}: {error}") from None
+    except ValueError as error:
+        raise ConfigError(str(spec), [str(error)]) from None
+    whole = None
+    if config is not None:
+        whole = with_controller(read_text(config), found, design, path.name, text, axis)
+    elif out is not None:
+        beside = os.path.relpath(path.resolve(), out.resolve().parent)
+        whole = robust_configuration(found, design, path.name, text, axis, beside)
+    if out is not None and whole is not None:
+        _write_configuration(out, whole)
+    if as_json:
+        click.echo(json.dumps(_robust_as_dict(found, out)))
+        return 0
+    print_robust(found)
+    if out is None:
+        click.echo(whole if whole is not None else robust_section(found, design, path.name, text), nl=False)
+    else:
+        click.echo(f"{out}: rtloop design shape {out} makes the taps of its reference")
+    return 0
+
+
+def shape_configuration(
+    config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool
+) -> int:
+    """Write CONFIG with both rows of taps to `out`, or their section to stdout; a picture to `plot`.
+
+    Raises ConfigError, NoDesign, OutputError, MissingExtra.
+    """
+    configuration = load(config)
+    options = next((one for one in configuration.axes if one.name == axis), None)
+    if options is None:
+        names = ", ".join(one.name for one in configuration.axes)
+        raise ConfigError(str(config), [f"axis: {axis!r} is not there; the configuration has {names}"])
+    findings = Findings()
+    check = next(one for one in check_axes(configuration, findings) if one.name == axis)
+    if findings.faults:
+        raise ConfigError(str(config), findings.faults)
+    if spec is None and options.specification is not None:
+        spec = configuration.folder / options.specification
+    if spec is None:
+        raise ConfigError(str(config), [f"axis.{axis}.specification: missing; --spec names one"])
+    try:
+        subject = subject_of(options, check, load_specification(spec).design)
+    except ValueError as error:
+        raise ConfigError(str(config), [f"axis.{axis}: {error}"]) from None
+    try:
+        found = shaped(subject, curve=plot is not None, progress=lambda line: click.echo(line, err=True))
+    except NoDesign as error:
+        raise NoDesign(f"{config}: {error}") from None
+    files = []
+    if out is not None:
+        beside = os.path.relpath(spec.resolve(), out.resolve().parent)
+        _write_configuration(out, with_taps(read_text(config), found, subject, config.name, axis, beside))
+        files.append(out)
+    if plot is not None:
+        from rtloop.design.robust.plots import picture
+
+        _write(plot, picture(found, subject, f"{configuration.name}, axis {axis}"))
+        files.append(plot)
+    if as_json:
+        click.echo(json.dumps(_shaped_as_dict(found, files)))
+        return 0
+    print_shaped(found, subject)
+    if out is None:
+        click.echo(taps_section(found, subject, config.name), nl=False)
+    for file in files:
+        click.echo(file, err=True)
+    return 0
+
+
+def _require_axis(config: Path, axis: str) -> None:
+    """Before minutes are spent. Raises ConfigError."""
+    names = [one.name for one in load(config).axes]
+    if axis not in names:
+        raise ConfigError(str(config), [f"axis: {axis!r} is not there; the configuration has {', '.join(names)}"])
+
+
+def _robust_as_dict(found: Robust, out: Path | None) -> dict[str, Any]:
+    controller, proof = found.controller, found.certificate
+    return {
+        "gain": controller.gain,
+        "zeros": [[root.real, root.imag] for root in controller.zeros],
+        "poles": [[root.real, root.imag] for root in controller.poles],
+        "plants": proof.count,
+        "worst": {
+            name: {"value": worst.value, "scenario": str(worst.scenario)}
+            for name, worst in zip(proof._fields[1:], proof[1:], strict=True)
+        },
+        "output": None if out is None else str(out),
+    }
+
+
+def _shaped_as_dict(found: Shaped, files: list[Path]) -> dict[str, Any]:
+    return {
+        "taps": found.taps.reference.tolist(),
+        "command_taps": found.taps.command.tolist(),
+        "settling_ms": found.settling_ms,
+        "fastest_ms": found.fastest_ms,
+        "variation": found.variation,
+        "plants": found.proved,
+        "worst": found.proof._asdict(),
+        "trade_off": [list(point) for point in found.curve],
+        "files": [str(file) for file in files],
+    }
+
+
+def _write_configuration(out: Path, text: str) -> None:
+    """Checked as `check` does, then written."""
+    prepare(parse(text, out.stem, out.resolve().parent, str(out)))
+    _write(out, text.encode())
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror}") from None

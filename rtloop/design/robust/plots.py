@@ -1,0 +1,48 @@
+"""Picture of taps: overshoot against settling time, and the step that was chosen."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from rtloop.design.robust.programme import BAND
+from rtloop.design.robust.shape import Shaped, Subject
+from rtloop.design.verification.plots import PAPER_TIME, RUN_TIME, TEMPLATE
+from rtloop.errors import MissingExtra
+
+
+def picture(found: Shaped, subject: Subject, title: str) -> bytes:
+    """A PNG file. Raises MissingExtra without matplotlib."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtra("pictures need matplotlib: pip install 'rtloop[plot]'") from None
+    figure = Figure(figsize=(10, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    trade, position, command = figure.subplots(3, 1)
+    if found.curve:
+        settling, least = np.array(found.curve).T
+        trade.semilogy(settling, 100 * np.maximum(least, 1e-6), color=RUN_TIME, marker="o", label="least overshoot")
+    trade.axhline(100 * subject.overshoot, color=TEMPLATE, linestyle="--", label="overshoot, as specified")
+    trade.axvline(found.settling_ms, color=PAPER_TIME, linestyle=":", label="chosen")
+    trade.set_xlabel("settling time / ms, in every scenario")
+    trade.set_ylabel("overshoot / %")
+    time, x, v = found.step
+    period_s = subject.controller.period_s
+    position.plot(1e3 * time, x, color=RUN_TIME, label="x on the model, between ticks too")
+    position.axhspan(1 - BAND, 1 + BAND, color="0.9", label=f"±{100 * BAND:g} %")
+    position.set_ylabel("x per unit step")
+    command.step(1e3 * period_s * np.arange(v.size), v, where="post", color=RUN_TIME, label="v on the model")
+    command.set_ylabel("v per unit step")
+    command.set_xlabel("time / ms")
+    for panel in (position, command):
+        panel.set_xlim(0, 4 * found.settling_ms)
+    for panel in (trade, position, command):
+        panel.grid(visible=True, which="both", alpha=0.2)
+        panel.legend(fontsize=8, framealpha=0.9)
+    figure.suptitle(f"{title}: taps", fontsize=11)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=110)
+    return file.getvalue()

@@ -1,0 +1,161 @@
+"""Both rows of taps as a linear programme: x and v of every scenario are linear in them.
+
+    least ε :   x ≤ 1 + ε always,   |x − 1| ≤ band from the settling time on,   x ≥ −undershoot,
+                low ≤ v ≤ high,   x → 1 for ever                            in every scenario, between ticks too
+    then, at the ε that is allowed:   least Σ |v[k] − v[k−1]| on the model
+
+A programme is solved on some of its rows; those that the answer breaks join them, until it breaks none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, hstack
+
+from rtloop.design.robust.responses import Responses, columns
+from rtloop.hil.modal import Real
+
+BAND = 0.05
+"""Around the final value, for settling."""
+TOLERANCE = 1e-7
+"""By which a row may be missed: 4 pm of 40 µm."""
+MOST_NEW = 400
+INSIDE = 0.99
+"""Share of what is allowed that a programme uses, for what lies between its points and its scenarios."""
+LARGEST_TAP = 20.0
+"""Far beyond what a drive allows; without any bound the solver's presolve may lose its way."""
+INFEASIBLE = 2
+
+
+class Bounds(NamedTuple):
+    """x ≥ −undershoot after a unit step; steps by up to `step_um` between levels of `lowest_um` … step_um, with v within
+    `low_um` … `high_um`.
+    """
+
+    undershoot: float
+    step_um: float
+    lowest_um: float
+    low_um: float
+    high_um: float
+
+    def command(self, static: Real) -> tuple[Real, Real]:
+        """Least and largest v per unit step such that v fits from any level to any level; `static` v/x at rest."""
+        step, lowest = self.step_um, self.lowest_um
+        low = np.maximum(self.low_um - lowest * static, step * static - self.high_um) / step
+        return low, np.minimum(self.high_um, (lowest + step) * static - self.low_um) / step
+
+
+class Taps(NamedTuple):
+    """Of the reference (n,), and straight into the command (n,); the overshoot ε that they leave."""
+
+    reference: Real
+    command: Real
+    overshoot: float
+
+
+class Programme:
+    """Of scenarios' responses; the first one is the model."""
+
+    def __init__(self, found: list[Responses], taps: int, points: int, bounds: Bounds):
+        self.taps, self.points = taps, points
+        self.ticks = found[0].command.shape[1]
+        self.time = np.tile(np.arange(1, self.ticks * points + 1) / points, len(found))
+        position = np.vstack([self._rows(one.position, points) for one in found])
+        self.command = np.vstack([self._rows(one.command, 1) for one in found])
+        self.rows = np.vstack([position, self.command])
+        static = np.repeat([one.static_command for one in found], self.ticks)
+        self.low, self.high = bounds.command(static)
+        self.undershoot = bounds.undershoot
+        self.active = np.zeros(self.rows.shape[0], bool)
+        self.active[: self.time.size : 7 * points] = True
+        self.active[self.time.size :: 7] = True
+        self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
+
+    def feasible(self, settling: float, overshoot: float) -> bool:
+        """Whether some taps settle in `settling` ticks with ε ≤ `overshoot`."""
+        return self._solved(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
+
+    def least_overshoot(self, settling: float) -> Taps | None:
+        """The taps of least ε that settle in `settling` ticks; None where none do."""
+        solved = self._solved(settling, np.eye(2 * self.taps + 1)[-1], None)
+        return None if solved is None else self._taps(solved)
+
+    def quietest(self, settling: float, overshoot: float) -> Taps | None:
+        """The taps of least variation of v on the model with ε ≤ `overshoot`; None where there are none."""
+        count = min(self.ticks, 2 * self.taps + 40)
+        cost = np.concatenate([np.zeros(2 * self.taps + 1), np.ones(count)])
+        solved = self._solved(settling, cost, overshoot)
+        return None if solved is None else self._taps(solved)
+
+    def _taps(self, solved: Real) -> Taps:
+        return Taps(solved[: self.taps], solved[self.taps : 2 * self.taps], float(solved[2 * self.taps]))
+
+    def _rows(self, steps: Real, points: int) -> Real:
+        return np.hstack([columns(one, self.taps, points) for one in steps])
+
+    def _solved(self, settling: float, cost: Real, overshoot: float | None) -> Real | None:
+        """Variables: taps, ε, and as many variations of v as `cost` has more."""
+        count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
+        settled = self.time >= settling - 1e-9
+        low = np.concatenate([np.where(settled, 1 - INSIDE * BAND, -self.undershoot), self.low])
+        high = np.concatenate([np.full(self.time.size, 1.0), self.high])
+        slack = np.concatenate([np.ones(self.time.size), np.zeros(self.command.shape[0])])
+        rows = self.rows
+        limits: list[tuple[float, float | None]] = [(-LARGEST_TAP, LARGEST_TAP)] * (count - 1)
+        limits += [(0.0, INSIDE * (BAND if overshoot is None else overshoot)), *[(0.0, None)] * extra]
+        varied, varied_high = self._variation(extra)
+        static = csr_array(np.concatenate([self.static, np.zeros(1 + extra)])[None])
+        while True:
+            chosen = np.flatnonzero(self.active)
+            some = np.hstack([rows[chosen], -slack[chosen, None]])
+            lower = np.hstack([-rows[chosen], np.zeros((chosen.size, 1))])
+            above = csr_array(np.vstack([some, lower]))
+            if extra:
+                above = hstack([above, csr_array((above.shape[0], extra))])
+                above = csr_array(np.vstack([above.toarray(), varied]))
+            limit = np.concatenate([high[chosen], -low[chosen], varied_high])
+            found = _optimum(cost, above, limit, static, limits)
+            if found is None:
+                return None
+            values = rows @ found[: count - 1]
+            broken = np.maximum(values - high - slack * found[count - 1], low - values)
+            broken[self.active] = 0.0
+            new = np.flatnonzero(broken > TOLERANCE)
+            if not new.size:
+                return found
+            self.active[_peaks(broken, new)] = True
+
+    def _variation(self, count: int) -> tuple[Real, Real]:
+        """Rows that say v[k] − v[k−1] ≤ s[k] and ≥ −s[k] on the model, for `count` ticks."""
+        v = self.command[:count]
+        changes = np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))) if count else np.zeros((0, 2 * self.taps))
+        between, sizes = np.zeros((count, 1)), -np.eye(count)
+        return np.vstack([np.hstack([changes, between, sizes]), np.hstack([-changes, between, sizes])]), np.zeros(
+            2 * count
+        )
+
+
+def _optimum(cost: Real, above: Any, limit: Real, static: Any, limits: Sequence[tuple[float, float | None]]) -> Real | None:
+    """Where A x ≤ b and the static answer is 1; None where nothing is. Raises ArithmeticError if no method can say."""
+    for method, presolve in (("highs", True), ("highs", False), ("highs-ipm", True)):
+        result = linprog(
+            cost, A_ub=above, b_ub=limit, A_eq=static, b_eq=[1.0], bounds=limits, method=method,
+            options={"presolve": presolve},
+        )  # fmt: skip
+        if result.status == 0:
+            return np.asarray(result.x, dtype=float)
+        if result.status == INFEASIBLE:
+            return None
+    raise ArithmeticError(f"the linear programme was not solved: {result.message}")
+
+
+def _peaks(broken: Real, new: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Of rows that are broken, the worst of each run of neighbours, and not too many."""
+    before, after = np.r_[0.0, broken[:-1]], np.r_[broken[1:], 0.0]
+    peaks = new[(broken[new] >= before[new]) & (broken[new] >= after[new])]
+    return peaks[np.argsort(-broken[peaks])[:MOST_NEW]]

@@ -1,0 +1,99 @@
+"""What a loop answers to its two references, between ticks too: the columns of which taps make a step.
+
+    v[k] = w[k] + C(z)·(q[k] − x[k])          q: the filtered reference, w: straight into the command
+
+The plant's input is held over a tick, so that x between ticks follows exactly from a discretisation at a fraction of it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.hil.modal import Real
+from rtloop.linear.discretise import DiscreteController, held
+from rtloop.linear.sampled import Sampled
+from rtloop.linear.transfer import Transfer
+
+TIME_CONSTANTS = 8.0
+"""Of the slowest closed-loop mode after the last tap: what is left then is 0.03 % of what it was."""
+MOST_TICKS = 2000
+
+
+class Responses(NamedTuple):
+    """Answers to unit steps of q and of w from tick 0 on: x (2, ticks·points) at (i + 1)/points ticks, v (2, ticks)."""
+
+    position: Real
+    command: Real
+    static_command: float
+    """v at rest per unit of x."""
+
+
+def responses(
+    controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int, ticks: int
+) -> Responses:
+    """Of one loop. Raises ValueError for a loop that is not stable."""
+    a, b, c, d = _joined(controller, plant, delay_ticks, points)
+    order = a.shape[0]
+    if not np.all(np.abs(np.linalg.eigvals(a)) < 1):
+        raise ValueError("the loop is not stable")
+    states = np.zeros((order, 2))
+    outputs = np.empty((ticks, points + 1, 2))
+    for k in range(ticks):
+        outputs[k] = c @ states + d
+        states = a @ states + b
+    position = outputs[:, 1:].reshape(-1, 2).T
+    return Responses(position, outputs[:, 0].T, 1 / plant.dc_gain)
+
+
+def horizon(controller: DiscreteController | Sampled, family: Family, scenarios: list[Scenario], taps: int) -> int:
+    """Ticks after which the slowest mode of all scenarios' loops has died away behind the last tap."""
+    radius = 0.0
+    for one in scenarios:
+        a, *_ = _joined(controller, family.plant(one), one.delay_ticks, 1)
+        radius = max(radius, float(np.max(np.abs(np.linalg.eigvals(a)))))
+    decay = -1 / math.log(radius) if 0 < radius < 1 else 0.0
+    return min(taps + 20 + math.ceil(TIME_CONSTANTS * decay), MOST_TICKS)
+
+
+def columns(steps: Real, taps: int, stride: int) -> Real:
+    """The answer to a step (k,) delayed by 0 … taps − 1 ticks of `stride` values, (k, taps)."""
+    padded = np.concatenate([np.zeros((taps - 1) * stride), steps])
+    return np.stack([padded[(taps - 1 - i) * stride :][: steps.size] for i in range(taps)], axis=1)
+
+
+def _joined(
+    controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int
+) -> tuple[Real, Real, Real, Real]:
+    """A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v and x at the points of a tick.
+
+    States: controller, commands on their way, plant.
+    """
+    ac, bc, cc, dc = controller.system
+    fine = held(plant, controller.period_s / points)
+    nc, n = bc.size, fine.b.size
+    place, order = nc + delay_ticks, nc + delay_ticks + n
+    seen = np.zeros(order)
+    seen[place:] = fine.c
+    command = np.concatenate([cc, np.zeros(order - nc)]) - dc * seen
+    direct = np.array([dc, 1.0])
+    oldest = np.eye(order)[nc] if delay_ticks else command
+    oldest_direct = np.zeros(2) if delay_ticks else direct
+    within, within_direct = np.eye(n, order, place), np.zeros((n, 2))
+    rows, rows_direct = [command], [direct]
+    for _ in range(points):
+        within = fine.a @ within + np.outer(fine.b, oldest)
+        within_direct = fine.a @ within_direct + np.outer(fine.b, oldest_direct)
+        rows.append(fine.c @ within)
+        rows_direct.append(fine.c @ within_direct)
+    a, b = np.zeros((order, order)), np.zeros((order, 2))
+    a[:nc, :nc], a[:nc, place:], b[:nc, 0] = ac, -np.outer(bc, fine.c), bc
+    for i in range(delay_ticks):
+        last = i + 1 == delay_ticks
+        a[nc + i] = command if last else np.eye(order)[nc + i + 1]
+        b[nc + i] = direct if last else 0.0
+    a[place:], b[place:] = within, within_direct
+    return a, b, np.array(rows), np.array(rows_direct)

@@ -1,0 +1,106 @@
+"""What a search and a programme found, as sections of a configuration, with where they come from."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from typing import Any
+
+from rtloop import __version__
+from rtloop.design.robust.certificate import Certificate
+from rtloop.design.robust.search import Robust
+from rtloop.design.robust.shape import Shaped, Subject
+from rtloop.design.synthesis.section import commented_section, configuration_around, controller_values, formula
+from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
+from rtloop.design.toml_text import edited, section
+
+
+def robust_section(found: Robust, design: DesignOptions, source: str, text: str) -> str:
+    """[axis.controller]; the same specification gives the same text."""
+    return commented_section(found.controller, _output(design), _provenance(found, design, source, text))
+
+
+def robust_configuration(
+    found: Robust, design: DesignOptions, source: str, text: str, axis: str, specification: str
+) -> str:
+    """A whole configuration, around a simulated rig of the plant."""
+    written = design.model_copy(update={"controller": _output(design)})
+    lines = _provenance(found, design, source, text)
+    return configuration_around(found.controller, written, lines, axis, specification)
+
+
+def with_controller(text: str, found: Robust, design: DesignOptions, source: str, spec_text: str, axis: str) -> str:
+    """A configuration's `text` with the controller in its axis. Raises ValueError where it has no such axis."""
+    return _with(
+        text, axis, {"controller": controller_values(found.controller, _output(design))},
+        _provenance(found, design, source, spec_text),
+    )  # fmt: skip
+
+
+def with_taps(text: str, found: Shaped, subject: Subject, source: str, axis: str, specification: str | None) -> str:
+    """A configuration's `text` with both rows of taps in its axis, whose specification stands at `specification`."""
+    values = taps_values(found)
+    beside = {} if specification is None else {"specification": specification}
+    return _with(text, axis, {"prefilter": values, **beside}, taps_provenance(found, subject, source))
+
+
+def taps_section(found: Shaped, subject: Subject, source: str) -> str:
+    """[axis.prefilter] alone."""
+    return section("axis.prefilter", taps_values(found), taps_provenance(found, subject, source))
+
+
+def taps_values(found: Shaped) -> dict[str, Any]:
+    """[axis.prefilter] as plain values."""
+    return {"taps": found.taps.reference.tolist(), "command_taps": found.taps.command.tolist()}
+
+
+def taps_provenance(found: Shaped, subject: Subject, source: str) -> list[str]:
+    """Where taps come from, a line each."""
+    around, proof = subject.options.scenarios, found.proof
+    return [
+        f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
+        f"±{around.resonance_percent:g} %",
+        f"on {found.proved} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ {100 * proof.overshoot:.3g} %, "
+        f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
+    ]
+
+
+def kept(proof: Certificate) -> list[tuple[str, float, str]]:
+    """Label, worst value and where, of everything that is certified."""
+    return [
+        ("slowest mode around a resonance, ms", proof.decay_ms.value, str(proof.decay_ms.scenario)),
+        ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
+        ("|S| at the disturbance's frequency", proof.disturbance.value, str(proof.disturbance.scenario)),
+        ("noise gain into v", proof.noise_gain.value, str(proof.noise_gain.scenario)),
+    ]
+
+
+def _provenance(found: Robust, design: DesignOptions, source: str, text: str) -> list[str]:
+    digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
+    assert design.plant is not None
+    return [
+        f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
+        f"plant: {formula(design.plant.transfer())}",
+        f"worst of {found.certificate.count} plants:",
+        *(f"  {name} {value:.4g} ({where})" for name, value, where in kept(found.certificate)),
+    ]
+
+
+def _with(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
+    raw = tomllib.loads(text)
+    names = [one.get("name") for one in raw.get("axis", [])]
+    if axis not in names:
+        raise ValueError(f"axis: {axis!r} is not in the configuration, which has {', '.join(map(str, names)) or 'none'}")
+    raw["axis"] = [{**one, **parts} if one.get("name") == axis else one for one in raw["axis"]]
+    return edited(_without(text, comments[0]), raw, comments)
+
+
+def _without(text: str, heading: str) -> str:
+    """`text` without the comments that the same command put there before: from its first words to an empty line."""
+    paragraphs, mark = text.split("\n\n"), "# " + " ".join(heading.split()[:2]) + " "
+    return "\n\n".join(paragraph for paragraph in paragraphs if not paragraph.startswith(mark))
+
+
+def _output(design: DesignOptions) -> OutputOptions:
+    """Roots are written such that "matched" gives them back."""
+    return design.controller.model_copy(update={"method": "matched", "prewarp_hz": None})

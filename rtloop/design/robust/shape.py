@@ -1,0 +1,230 @@
+"""The fastest step that a loop, its taps and its drive can make in every scenario, by bisection over programmes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
+from rtloop.design.robust.programme import BAND, Bounds, Programme, Taps
+from rtloop.design.robust.responses import Responses, horizon, responses
+from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.errors import NoDesign
+from rtloop.hil.modal import Real
+from rtloop.linear.discretise import DiscreteController
+from rtloop.linear.sampled import Sampled
+from rtloop.linear.transfer import Transfer
+
+PLACES, PROVED, ROUNDS = 7, 41, 6
+"""Of each resonance in a programme, and in the proof of its answer; how often the worst of a proof joins a programme."""
+PROOF_POINTS = 10
+LONGEST = 0.9
+"""Settling beyond this part of the taps' length is not looked for."""
+CURVE = (0.93, 1.15, 23)
+"""Settling times of the trade-off, relative to the fastest, and how many."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The loop that taps are made for, and what they must keep; `overshoot` as a fraction."""
+
+    controller: DiscreteController | Sampled
+    plant: Transfer
+    delay_ticks: int
+    bounds: Bounds
+    overshoot: float
+    options: ShapeOptions
+
+    def family(self) -> Family:
+        """The plants around its model."""
+        return Family(self.plant, self.delay_ticks, self.options.scenarios, self.controller.period_s)
+
+
+class Judged(NamedTuple):
+    """Of a step: settling to ±5 % in ms, overshoot, undershoot, least and largest v, per unit; and where (the worst)."""
+
+    settling_ms: float
+    overshoot: float
+    undershoot: float
+    lowest_command: float
+    highest_command: float
+
+
+class Shaped(NamedTuple):
+    """`taps` that settle in `settling_ms`; `fastest_ms` is the least possible; `proof` the worst of `proved` plants, at
+    PROOF_POINTS points a tick; `model` the model's step, `variation` of v on it; `curve` (ms, ε) of the trade-off.
+    """
+
+    taps: Taps
+    settling_ms: float
+    fastest_ms: float
+    variation: float
+    proof: Judged
+    proved: int
+    step: tuple[Real, Real, Real]
+    curve: tuple[tuple[float, float], ...]
+
+
+def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], None] = lambda _: None) -> Shaped:
+    """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none."""
+    options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
+    scenarios = list(dict.fromkeys([family.nominal, *family.swept(PLACES)]))
+    fastest = 0.0
+    for _ in range(ROUNDS):
+        programme = programme_of(subject, scenarios)
+        fastest = fastest_settling(programme, subject.overshoot, fastest)
+        if fastest is None:
+            raise NoDesign(_no_taps(subject, programme))
+        progress(
+            f"fastest of {len(scenarios)} scenarios: {fastest * tick_ms:.4g} ms, overshoot {100 * subject.overshoot:g} %"
+        )
+        settling = fastest if options.settling_ms is None else options.settling_ms / tick_ms
+        if settling < fastest - 1e-9:
+            raise NoDesign(
+                f"shape.settling_ms: {options.settling_ms:g} ms cannot be reached in all scenarios with overshoot ≤ "
+                f"{100 * subject.overshoot:g} %; the fastest is {fastest * tick_ms:.4g} ms. {_binding(subject)}"
+            )
+        taps = programme.quietest(settling, subject.overshoot)
+        if taps is None:
+            raise NoDesign(f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help")
+        judged = {one: judged_of(subject, taps, one) for one in dict.fromkeys([*scenarios, *family.swept(PROVED)])}
+        worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(2)]
+        new = [one for one in dict.fromkeys(worst) if one not in scenarios]
+        kept = _worst(judged.values())
+        if not new or (kept.settling_ms <= settling * tick_ms + 1e-9 and kept.overshoot <= subject.overshoot):
+            break
+        scenarios += new
+    time, position, command = _steps(subject, taps, family.nominal)
+    drawn = trade_off(programme, fastest, tick_ms) if curve else ()
+    variation = float(np.sum(np.abs(np.diff(command, prepend=0.0))))
+    return Shaped(
+        taps, settling * tick_ms, fastest * tick_ms, variation, kept, len(judged), (time, position, command), drawn
+    )
+
+
+def programme_of(subject: Subject, scenarios: list[Scenario]) -> Programme:
+    """The linear programme over scenarios, the model first. Raises NoDesign where a loop is not stable."""
+    family, options = subject.family(), subject.options
+    ticks = horizon(subject.controller, family, scenarios, options.taps)
+    found = [_answered(subject, family, one, options.points_per_tick, ticks) for one in scenarios]
+    return Programme(found, options.taps, options.points_per_tick, subject.bounds)
+
+
+def fastest_settling(programme: Programme, overshoot: float, at_least: float = 0.0) -> float | None:
+    """The least settling time in ticks, `at_least` so long, at which ε ≤ `overshoot`, to a point between ticks.
+
+    None where there is none.
+    """
+
+    def kept(place: int) -> bool:
+        return programme.feasible(place / programme.points, overshoot)
+
+    low, longest, step = round(at_least * programme.points), int(LONGEST * programme.taps) * programme.points, 2
+    if low and kept(low):
+        return low / programme.points
+    high = low + step if low else longest
+    while not kept(high):
+        if high >= longest:
+            return None
+        low, step = high, 2 * step
+        high = min(low + step, longest)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if kept(middle) else (middle, high)
+    return high / programme.points
+
+
+def trade_off(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
+    """Least ε for settling times around `fastest` ticks, from where it is the whole band."""
+    found: list[tuple[float, float]] = []
+    for place in np.unique(np.round(np.linspace(*CURVE) * fastest * programme.points)):
+        taps = programme.least_overshoot(place / programme.points)
+        if taps is not None:
+            found.append((float(place) / programme.points * tick_ms, taps.overshoot))
+    return tuple(found)
+
+
+def _worst(found: Iterable[Judged]) -> Judged:
+    """Of each quantity."""
+    settling, over, under, low, high = (np.array(values) for values in zip(*found, strict=True))
+    return Judged(
+        float(settling.max()), float(over.max()), float(under.max()), float(low.min()), float(high.max())
+    )  # fmt: skip
+
+
+def judged_of(subject: Subject, taps: Taps, scenario: Scenario) -> Judged:
+    """What a step does on one plant."""
+    time, position, command = _steps(subject, taps, scenario)
+    outside = np.flatnonzero(np.abs(position - 1) > BAND)
+    settled = float(time[min(outside[-1] + 1, time.size - 1)]) if outside.size else 0.0
+    over, under = max(0.0, float(position.max()) - 1), max(0.0, -float(position.min()))
+    return Judged(1e3 * settled, over, under, float(command.min()), float(command.max()))
+
+
+def _steps(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
+    """Times in s, x at them, and v at the ticks after a unit step, PROOF_POINTS points a tick."""
+    family, count = subject.family(), taps.reference.size
+    ticks = horizon(subject.controller, family, [scenario], count)
+    found = _answered(subject, family, scenario, PROOF_POINTS, ticks)
+    q, w = np.cumsum(taps.reference), np.cumsum(taps.command)
+    changes = np.diff(q, prepend=0.0), np.diff(w, prepend=0.0)
+    position, command = np.zeros(ticks * PROOF_POINTS), np.zeros(ticks)
+    for part, change in enumerate(changes):
+        spread = np.zeros((change.size - 1) * PROOF_POINTS + 1)
+        spread[::PROOF_POINTS] = change
+        position += np.convolve(spread, found.position[part])[: position.size]
+        command += np.convolve(change, found.command[part])[: command.size]
+    time = np.arange(1, position.size + 1) / PROOF_POINTS * subject.controller.period_s
+    return time, position, command
+
+
+def _answered(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
+    try:
+        return responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
+    except ValueError as error:
+        raise NoDesign(f"shape.scenarios: with {scenario} {error}; a more robust controller is needed") from None
+
+
+def _no_taps(subject: Subject, programme: Programme) -> str:
+    """Why no settling time will do."""
+    longest = int(LONGEST * programme.taps)
+    tick_ms, found = 1e3 * subject.controller.period_s, programme.least_overshoot(longest)
+    if found is not None:
+        return (
+            f"specification.overshoot_percent: {100 * subject.overshoot:g} % cannot be kept in all scenarios with "
+            f"{programme.taps} taps; the least is {100 * found.overshoot:.4g} % at {longest * tick_ms:g} ms. "
+            "More of it, a smaller [shape.scenarios] or more taps would help"
+        )
+    return f"shape: nothing settles within {longest * tick_ms:g} ms. {_binding(subject)}"
+
+
+def _binding(subject: Subject) -> str:
+    """What would be gained by relaxing each constraint alone."""
+    options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
+    far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
+    relaxed = {
+        "no limit on v": replace(subject, bounds=bounds._replace(low_um=-far, high_um=far)),
+        "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
+        f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
+        "the model alone": replace(
+            subject, options=options.model_copy(update={"scenarios": _alone(options.scenarios)})
+        ),
+    }  # fmt: skip
+    found = dict[str, float | None]()
+    for name, one in relaxed.items():
+        family = one.family()
+        scenarios = list(dict.fromkeys([family.nominal, *family.swept(3)]))
+        found[name] = fastest_settling(programme_of(one, scenarios), one.overshoot)
+    listed = ", ".join(
+        f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in found.items()
+    )
+    helps = min(found, key=lambda name: math.inf if (value := found[name]) is None else value)
+    return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {helps}"
+
+
+def _alone(options: ScenarioOptions) -> ScenarioOptions:
+    return options.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

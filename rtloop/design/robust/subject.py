@@ -1,0 +1,49 @@
+"""What taps are made for, from a configuration: its loop as it runs, its drive, its specification."""
+
+from __future__ import annotations
+
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import AxisCheck
+from rtloop.design.robust.programme import Bounds
+from rtloop.design.robust.shape import Subject
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.hysteresis.plays import loading_curve
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+
+
+def subject_of(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
+    """Of one axis. Raises ValueError, naming the key, for what is missing or cannot be."""
+    model, asked, options = axis.model or design.plant, design.specification, design.shape
+    if check.linear is None:
+        raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
+    if model is None:
+        raise ValueError("model: missing; there is no plant to make taps for")
+    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
+        raise ValueError(
+            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
+            "for settling is ±5 %"
+        )
+    if asked.command is None:
+        raise ValueError("specification.command.reference_um: missing; the largest step decides what v may do")
+    if axis.prefilter.sections:
+        raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
+    if axis.limits.slew_v_per_s is not None:
+        raise ValueError("limits.slew_v_per_s: a running slew limit is not linear; taps are made for loops without one")
+    low_um, high_um = reach_um(axis)
+    step_um = asked.command.reference_um
+    bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
+    return Subject(
+        check.linear, design.sensor.seen_through(model.transfer()), model.delay_ticks, bounds,
+        asked.overshoot_percent / 100, options,
+    )  # fmt: skip
+
+
+def reach_um(axis: AxisOptions) -> tuple[float, float]:
+    """Least and largest v in µm: what the drive's limits reach on the initial loading curve, within `command_um`."""
+    limits, law = axis.limits, axis.feedforward
+    largest = limits.command_um
+    if not isinstance(law, PrandtlIshlinskiiOptions):
+        return (-largest if limits.lowest_v < 0 else 0.0), largest
+    model, _ = law.models()
+    high, low = (float(loading_curve(model, volts)) for volts in (limits.drive_v, -limits.lowest_v))
+    return -min(low, largest), min(high, largest)

@@ -1,0 +1,277 @@
+"""Robust controllers: scenarios, the search and its proof against plants put together independently, the command."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy import signal
+
+from rtloop.analysis.closed_loop import sampled_plant
+from rtloop.cli import main
+from rtloop.design.robust import certificate
+from rtloop.design.robust.certificate import certified
+from rtloop.design.robust.controller import bounds, candidates, transfer_of
+from rtloop.design.robust.evolution import evolve
+from rtloop.design.robust.objective import Objective, Walls
+from rtloop.design.robust.options import ScenarioOptions
+from rtloop.design.robust.scenarios import Family, Scenario, light_modes
+from rtloop.design.robust.search import robust_controller
+from rtloop.design.robust.section import robust_configuration
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.toml_text import section as text
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
+
+PERIOD_S = 1e-4
+OMEGA, RATIO = 2 * np.pi * 600.0, 0.01
+STAGE = Transfer.from_factors(OMEGA**2, [], [[1.0, 2 * RATIO * OMEGA, OMEGA**2]])
+RANGE = ScenarioOptions(resonance_percent=8.0, damping=(0.5, 2.0), gain_percent=5.0)
+SPEC = f"""
+[plant]
+form = "factors"
+gain = {OMEGA**2!r}
+denominator = [[1.0, {2 * RATIO * OMEGA!r}, {OMEGA**2!r}]]
+delay_ticks = 0
+[specification]
+overshoot_percent = 0.5
+[specification.disturbance]
+largest_um = 1.0
+error_um = 0.1
+up_to_hz = 5.0
+[specification.command]
+reference_um = 20.0
+command_um = 21.0
+[scenarios]
+resonance_percent = 8.0
+damping = [0.5, 2.0]
+gain_percent = 5.0
+[robust]
+biquads = 1
+restarts = 2
+generations = 80
+"""
+
+
+def sampled(gain_percent: float, shift_percent: float, factor: float, delay_ticks: int):
+    """G(z) of the stage, changed, by scipy: numerator and denominator."""
+    omega, ratio = OMEGA * (1 + shift_percent / 100), RATIO * factor
+    plain = ([(1 + gain_percent / 100) * omega**2], [1.0, 2 * ratio * omega, omega**2])
+    above, below, _ = signal.cont2discrete(plain, PERIOD_S, method="zoh")
+    return np.trim_zeros(above[0], "f"), np.append(below, np.zeros(delay_ticks))
+
+
+def at(polynomials, z):
+    return np.polyval(polynomials[0], z) / np.polyval(polynomials[1], z)
+
+
+def written(controller: Transfer):
+    """C(z) of the zeros, poles and gain that "matched" makes, as polynomials: numerator and denominator."""
+    found = discretise(controller, PERIOD_S, "matched")
+    return found.gain * np.real(np.poly(found.zeros)), np.real(np.poly(found.poles))
+
+
+def closed_loop(controller, plant):
+    return np.polyadd(np.polymul(controller[1], plant[1]), np.polymul(controller[0], plant[0]))
+
+
+def noise(controller, plant) -> float:
+    """rms of v per rms of white noise: the norm of the impulse response of C/(1 + L)."""
+    above, below = np.polymul(controller[0], plant[1]), closed_loop(controller, plant)
+    above = np.concatenate([np.zeros(below.size - above.size), above])
+    return float(np.linalg.norm(signal.lfilter(above, below, np.eye(1, 20_000)[0])))
+
+
+def peak(controller, plant) -> float:
+    """max |S| on a dense grid."""
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 100_000))
+    return float(np.max(1 / np.abs(1 + at(controller, z) * at(plant, z))))
+
+
+def decay_ms(controller, plant) -> float:
+    """Time constant of the slowest closed-loop mode between 0.55 and 1.85 times the resonance."""
+    poles = np.roots(closed_loop(controller, plant))
+    band = np.abs(np.angle(poles)) / PERIOD_S / OMEGA
+    counted = np.abs(poles[(band > 0.55) & (band < 1.85)])
+    return float(np.max(-1e3 * PERIOD_S / np.log(counted), initial=0.0))
+
+
+def a_point(random) -> np.ndarray:
+    low, high = bounds(2)
+    return np.clip(np.array([-3.0, -3.0, *([-1.0, 0.5, -0.8, -0.5] * 2)]) + 0.4 * random.standard_normal(10), low, high)
+
+
+@pytest.mark.parametrize("delay_ticks", [0, 1, 3])
+def test_a_scenario_is_the_plant_with_its_resonance_damping_gain_and_delay_changed(delay_ticks) -> None:
+    family = Family(STAGE, 0, RANGE, PERIOD_S)
+    changed = sampled_plant(family.plant(Scenario((7.0,), 0.5, -4.0, delay_ticks)), PERIOD_S, delay_ticks)
+    z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 60) * PERIOD_S)
+    np.testing.assert_allclose(changed.response(z), at(sampled(-4.0, 7.0, 0.5, delay_ticks), z), rtol=1e-8)
+
+
+def test_modes_that_are_damped_or_beyond_half_the_rate_do_not_move() -> None:
+    poles = [*np.roots([1, 0.02 * 3000, 3000.0**2]), *np.roots([1, 2000, 2000.0**2]), *np.roots([1, 500, 4e4**2])]
+    model = Transfer.from_zpk([], poles, 1.0)
+    assert np.abs(light_modes(model, PERIOD_S)) == pytest.approx([3000.0])
+    moved = Family(model, 0, RANGE, PERIOD_S).plant(Scenario((5.0,), 1.0, 0.0, 0))
+    assert sorted(np.abs(moved.poles)) == pytest.approx([2000.0] * 2 + [3150.0] * 2 + [4e4] * 2)
+    assert moved.dc_gain == pytest.approx(model.dc_gain, rel=1e-12)
+
+
+def test_two_modes_move_by_themselves_in_every_combination() -> None:
+    model = Transfer.from_zpk([], [*np.roots([1, 30, 3000.0**2]), *np.roots([1, 80, 8000.0**2])], 1.0)
+    found = {one.resonance for one in Family(model, 2, RANGE, PERIOD_S).corners()}
+    assert {(-8.0, 8.0), (8.0, -8.0), (0.0, 8.0), (0.0, 0.0)} <= found
+    assert {one.delay_ticks for one in Family(model, 2, RANGE, PERIOD_S).corners()} == {2}
+    both = RANGE.model_copy(update={"delay_ticks": (0, 1)})
+    assert {one.delay_ticks for one in Family(model, 2, both, PERIOD_S).corners()} == {0, 1}
+
+
+def test_evolution_finds_the_minimum_of_a_bent_valley_and_its_seed_decides() -> None:
+    def rosenbrock(points):
+        return np.sum(100 * (points[:, 1:] - points[:, :-1] ** 2) ** 2 + (1 - points[:, :-1]) ** 2, axis=1)
+
+    found = [evolve(rosenbrock, np.zeros(4), 0.5, 800, np.random.default_rng(3)) for _ in range(2)]
+    assert found[0].point == pytest.approx(np.ones(4), abs=1e-4)
+    assert np.array_equal(found[0].point, found[1].point)
+
+
+def test_what_is_written_is_the_controller_that_was_searched(rng=np.random.default_rng(5)) -> None:
+    """C(z) of the file, by "matched", at every frequency; its integrator stays one."""
+    z = np.exp(1j * np.linspace(0.01, 3.1, 200))
+    for _ in range(50):
+        point = a_point(rng)
+        numerator, denominator = written(transfer_of(point, PERIOD_S))
+        np.testing.assert_allclose(
+            at((numerator, denominator), z), candidates(point[None]).response(z)[0], rtol=1e-7
+        )  # fmt: skip
+        a, b, c, d = (part[0] for part in candidates(point[None]).matrices())
+        by_states = signal.ss2tf(a, b[:, None], c[None], np.array([[d]]))
+        np.testing.assert_allclose(at((by_states[0][0], by_states[1]), z), at((numerator, denominator), z), rtol=1e-5)
+
+
+def test_what_is_searched_is_the_worst_of_the_closed_loops(rng=np.random.default_rng(8)) -> None:
+    """Poles from polynomials of L, |S| from their ratio: none of them stacked."""
+    family = Family(STAGE, 1, RANGE, PERIOD_S)
+    scenarios = [family.nominal, Scenario((8.0,), 0.5, 5.0, 1), Scenario((-8.0,), 2.0, -5.0, 3)]
+    objective = Objective(family, scenarios, Walls(2.0, 3.0, 0.1, 5.0), 2)
+    judged = 0
+    for _ in range(20):
+        point = a_point(rng)
+        point[:2] = rng.uniform(-8.0, -4.0), -0.5
+        found = objective.measured(point[None])
+        controller = written(transfer_of(point, PERIOD_S))
+        radii, decays, peaks, at_5 = [], [], [], []
+        for one in scenarios:
+            plant = sampled(one.gain, one.resonance[0], one.damping, one.delay_ticks)
+            radii.append(np.abs(np.roots(closed_loop(controller, plant))).max())
+            decays.append(1e-3 * decay_ms(controller, plant))
+            peaks.append(np.max(1 / np.abs(1 + at(controller, objective.z) * at(plant, objective.z))))
+            low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
+            at_5.append(1 / np.abs(1 + at(controller, low) * at(plant, low)))
+        assert found.radius[0] == pytest.approx(max(radii), abs=1e-6)
+        if max(radii) < 0.9999:
+            judged += 1
+            assert found.decay_s[0] == pytest.approx(max(decays), rel=1e-4)
+            assert found.disturbance[0] == pytest.approx(max(at_5), rel=1e-6)
+            assert found.sensitivity[0] == pytest.approx(max(peaks), rel=1e-6)
+    assert judged >= 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_proofs():
+    """Of fewer plants: each costs some ten milliseconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(certificate, "SWEPT", 5)
+        patch.setattr(certificate, "DRAWN", 10)
+        yield
+
+
+@pytest.fixture(scope="module")
+def found(short_proofs):
+    return robust_controller(DesignOptions.model_validate(tomllib.loads(SPEC)))
+
+
+def test_a_controller_damps_the_resonance_and_keeps_its_walls_wherever_the_plant_lies(found) -> None:
+    """Plants of one's own between the scenarios: all stable, max |S| ≤ 2, the disturbance held, the resonance damped."""
+    controller, random = written(found.controller), np.random.default_rng(1)
+    low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
+    for _ in range(20):
+        plant = sampled(random.uniform(-5, 5), random.uniform(-8, 8), np.exp(random.uniform(*np.log([0.5, 2]))), 0)
+        assert np.abs(np.roots(closed_loop(controller, plant))).max() < 1
+        assert peak(controller, plant) <= 2.0 + 1e-9
+        assert noise(controller, plant) <= 3.0 + 1e-9
+        assert 1 / np.abs(1 + at(controller, low) * at(plant, low)) <= 0.1 + 1e-9
+        assert decay_ms(controller, plant) < 1e3 / (0.5 * RATIO * OMEGA) / 5  # left alone it rings for 53 ms
+
+
+def test_a_proof_is_what_its_worst_plants_do(found) -> None:
+    proof, controller = found.certificate, written(found.controller)
+    for worst, value_of in ((proof.noise_gain, noise), (proof.sensitivity, peak), (proof.decay_ms, decay_ms)):
+        scenario = worst.scenario
+        plant = sampled(scenario.gain, scenario.resonance[0], scenario.damping, scenario.delay_ticks)
+        assert worst.value == pytest.approx(value_of(controller, plant), rel=1e-5)
+
+
+def test_a_proof_names_the_plant_that_is_worst() -> None:
+    """An integrator alone on a light mode: unstable first where the mode is lightest and lowest, and the gain highest."""
+    family = Family(STAGE, 0, RANGE, PERIOD_S)
+    controller = discretise(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
+    proof = certified(controller, family, Walls(2.0, 3.0, 0.1, 5.0))
+    assert proof.radius.scenario.damping == 0.5
+    assert proof.radius.scenario.gain == 5.0
+    unstable = discretise(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 200.0), PERIOD_S, "matched")
+    assert "unstable with" in certified(unstable, family, Walls(2.0, 3.0, 0.1, 5.0)).missed(proof_walls(), None)[0]
+
+
+def proof_walls() -> Walls:
+    return Walls(2.0, 3.0, 0.1, 5.0)
+
+
+def test_what_cannot_be_is_refused_with_what_misses() -> None:
+    raw = tomllib.loads(SPEC)
+    raw["robust"] |= {"decay_ms": 0.05, "generations": 20, "restarts": 1}
+    with pytest.raises(NoController, match=r"slowest mode around a resonance.* at most 0.05 is asked"):
+        robust_controller(DesignOptions.model_validate(raw))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "said"),
+    [
+        ("scenarios", "damping", [], "damping"),
+        ("scenarios", "damping", [-1.0], "factors from 0.01 to 10"),
+        ("scenarios", "resonance_percent", float("nan"), "resonance_percent"),
+        ("scenarios", "delay_ticks", [-1], "0 to 16 samples"),
+        ("robust", "largest_sensitivity", 0.5, "greater than 1"),
+        ("plant", "gain", -1.0, "a gain at 0 Hz above 0"),
+    ],
+)
+def test_a_specification_that_cannot_be_is_a_clear_error(tmp_path, section, key, value, said) -> None:
+    raw = tomllib.loads(SPEC)
+    raw[section] |= {key: value}
+    (tmp_path / "spec.toml").write_text(text("", raw))
+    result = CliRunner().invoke(main, ["design", "robust", str(tmp_path / "spec.toml")])
+    assert result.exit_code == 78
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_the_command_puts_the_controller_into_a_configuration_and_keeps_its_words(tmp_path, found) -> None:
+    (tmp_path / "spec.toml").write_text(SPEC)
+    design, out = DesignOptions.model_validate(tomllib.loads(SPEC)), tmp_path / "made.toml"
+    text = robust_configuration(found, design, "spec.toml", SPEC, "z", "spec.toml")
+    out.write_text(text.replace("gain = ", "# a word of mine\ngain = ", 1))
+    arguments = ["design", "robust", str(tmp_path / "spec.toml"), "--config", str(out)]
+    made = CliRunner().invoke(main, [*arguments, "--axis", "z", "--out", str(out), "--json"])
+    assert made.exit_code == 0, made.stderr
+    report, axis = json.loads(made.stdout), tomllib.loads(out.read_text())["axis"][0]
+    assert axis["controller"]["zeros"] == report["zeros"] == tomllib.loads(text)["axis"][0]["controller"]["zeros"]
+    assert axis["controller"]["method"] == "matched"
+    assert report["worst"]["sensitivity"]["value"] <= 2.0
+    assert "# a word of mine" in out.read_text()
+    assert out.read_text().count("# Found by") == 1
+    missing = CliRunner().invoke(main, [*arguments, "--axis", "nowhere"])
+    assert missing.exit_code == 78
+    assert "'nowhere' is not there" in missing.stderr
