@@ -9,8 +9,8 @@ import pytest
 from scipy import signal
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
-from rtloop.analysis.reference import ReferencePath
 from rtloop.analysis.learning import LARGEST_CONTRACTION, learning
+from rtloop.analysis.reference import ReferencePath
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 
