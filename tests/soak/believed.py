@@ -2,7 +2,7 @@
 
 The paper's loop, also with the rig's resonance moved where the model is not, and a stage that `design auto` designed
 for; steps of 1 to 40 µm. Seen is a recording under another seed than the simulation's, judged at ticks. Ends with 1
-where what is simulated is further from what is seen than LIMITS.
+where more than one run in twenty is further from what is simulated than LIMITS: a loop hunts in a dead band at random.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ DWELL_S = 0.5
 COLUMNS = ("OS %", "ts ms", "x nm", "v nm")
 LIMITS = (3.0, 15.0, 3.0, 60.0)
 """How far a simulation may be from a run, each being one draw of the noise: so much, or half of what is seen."""
+MOST_FAR = 0.05
 REFERENCE = 'kind = "steps"\nlevels = {levels}\ndwell_s = {dwell_s}\nrepeat = false\n'
 
 
@@ -141,7 +142,7 @@ def main() -> int:
             values = zip(COLUMNS, np.quantile(sizes[:, row], quantile, axis=0), strict=True)
             print(f"{title} − seen, {words}: " + "  ".join(f"{column} {value:.2f}" for column, value in values))
     print(f"{given.draws} runs, {bad} far")
-    return int(bad > 0)
+    return int(bad > MOST_FAR * given.draws)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from rtloop.signals import Flag, trip_causes
 
 SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
 """Of a level: so many of the slowest mode."""
-REST_S, SETTLES_S = 1.0, 0.5
+REST_S, SETTLES_S = 2.0, 0.5
 """How long the rest is looked at, and what passes before."""
 RESTS = (0.03, 0.12, 0.24, 0.48)
 """Where, as parts of the range."""
