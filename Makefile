@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-backends check install uninstall test-systemd rig clean soak-identification
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -67,6 +67,10 @@ soak-identification: $(READY)
 # Recordings, identification, synthesis and a run on forty rigs drawn at random: about ten minutes.
 soak-chain: $(READY)
 	$(BIN)/python -m tests.soak.chain
+
+# A service measures its own loop on rigs of known transfer function: about six minutes.
+soak-response: $(READY)
+	$(BIN)/python -m tests.soak.response
 
 # One configuration on every backend that needs no hardware, side by side: two minutes.
 soak-backends: $(READY)
