@@ -42,6 +42,7 @@ PER_AXIS = (
     Signal("command_um", "µm", "command v to the inverse hysteresis, before its limit"),
     Signal("demand_v", "V", "drive that the law asks for, before limit and slew"),
     Signal("drive_v", "V", "drive u written to the driver"),
+    Signal("feed_um", "µm", "second column of a table reference, added to v in closed loop; 0 without one"),
 )
 (
     TICK,
@@ -58,7 +59,7 @@ PER_AXIS = (
     SAMPLE_AGE,
     ENABLE,
 ) = range(len(COMMON))
-ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE = range(len(PER_AXIS))
+ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE, FEED = range(len(PER_AXIS))
 COMMON_COUNT = len(COMMON)
 PER_AXIS_COUNT = len(PER_AXIS)
 
@@ -122,7 +123,7 @@ def columns(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] 
 
 
 def axis_column(axis: int, signal: int) -> int:
-    """Column of a per-axis signal (ADC … DRIVE) of axis number `axis`."""
+    """Column of a per-axis signal (ADC … FEED) of axis number `axis`."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
 
 

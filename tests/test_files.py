@@ -90,7 +90,7 @@ def test_a_configuration_has_a_largest_size(tmp_path, read):
 def test_a_table_that_is_none_is_not_told(tmp_path, content):
     for name in ("shadow", "shadow.npy"):
         (tmp_path / name).write_text(content)
-        with pytest.raises(ValueError, match="not a column of numbers") as caught:
+        with pytest.raises(ValueError, match="not one or two columns of numbers") as caught:
             table(tmp_path, name)
         assert SECRET not in str(caught.value)
 

@@ -179,9 +179,11 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
 @click.pass_context
 @fails_clearly
 def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repeat: bool) -> int:
-    """Play the numbers in FILE, one to a line, on AXIS."""
-    samples = _numbers(file)
-    body = {"axis": axis, "samples": samples, "hold_ticks": hold_ticks, "repeat": repeat}
+    """Play the numbers in FILE, one to a line, on AXIS; a second one is added to the command, in µm."""
+    columns = [list(column) for column in zip(*_numbers(file), strict=True)] or [[]]
+    body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
+    if len(columns) > 1:
+        body["command_um"] = columns[1]
     click.echo(json.dumps(_client(context).post("/waveform", body)))
     return 0
 
@@ -286,14 +288,18 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
     return 0
 
 
-def _numbers(file: Any) -> list[float]:
-    """One to a line; empty lines are left out. Raises a usage error."""
-    found: list[float] = []
+def _numbers(file: Any) -> list[list[float]]:
+    """One to a line, or two; empty lines are left out. Raises a usage error."""
+    found: list[list[float]] = []
     for number, line in enumerate(file, start=1):
         try:
-            found += [float(line)] if line.strip() else []
+            numbers = [float(part) for part in line.replace(",", " ").split()]
         except ValueError:
             raise click.UsageError(f"{file.name}, line {number}: {line.strip()!r}; a number is needed") from None
+        found += [numbers] if numbers else []
+        if numbers and (len(numbers) > 2 or len(numbers) != len(found[0])):
+            said = f"{file.name}, line {number}: {len(numbers)} numbers"
+            raise click.UsageError(f"{said}; one to a line, or two to each, are needed")
     return found
 
 

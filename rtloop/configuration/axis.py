@@ -26,14 +26,16 @@ class PrefilterOptions(Options):
     """Reference pre-filter: FIR taps, then second-order sections [b0, b1, b2, a1, a2] in z."""
 
     taps: Numbers = ()
+    command_taps: Numbers = ()
+    """A second row, whose output, in µm, is added to the controller's command."""
     sections: Matrix = ()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.taps) > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
+        taps = max(len(self.taps), len(self.command_taps))
+        if taps > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
             raise ValueError(
-                f"{len(self.taps)} taps and {len(self.sections)} sections: "
-                f"at most {MAX_TAPS} and {MAX_SECTIONS} are allowed"
+                f"{taps} taps and {len(self.sections)} sections: at most {MAX_TAPS} and {MAX_SECTIONS} are allowed"
             )
         for section in self.sections:
             if len(section) != 5:
@@ -104,7 +106,10 @@ class StepsOptions(Options):
 
 
 class TableOptions(Options):
-    """Samples from a file, one number to a line (.csv, .txt) or an .npy array, `hold_ticks` ticks each."""
+    """Samples from a file, one number to a line (.csv, .txt) or an .npy array, `hold_ticks` ticks each.
+
+    A second column, (n, 2), is added to the command of a closed loop, in µm.
+    """
 
     kind: Literal["table"]
     file: str

@@ -62,12 +62,15 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
             asked.append((f"reference from tick {command['tick']} on", mode, command["values"].tolist()))
     for where, mode, values in asked:
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
+        added = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
         lowest, highest = extent(values, plan.table[first : first + count])
         if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{where}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP) and max(-lowest, highest) > limits.command_um:
             yield f"{where}: reaches {max(-lowest, highest):g} µm, beyond limits.command_um = {limits.command_um:g}"
+        if (most := float(np.max(np.abs(added), initial=0.0))) > limits.command_um:
+            yield f"{where}: adds {most:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
 
 
 def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:

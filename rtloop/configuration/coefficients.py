@@ -11,7 +11,7 @@ from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptio
 from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
 from rtloop.hil.modal import Real
-from rtloop.law.layout import Records
+from rtloop.law.layout import TAP_LANES, Records
 from rtloop.law.memory import records
 from rtloop.laws.contract import Controller, Law, record_of
 from rtloop.laws.linearise import linear_part
@@ -100,9 +100,14 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
-    fields: dict[str, object] = {"tap_count": len(options.taps), "section_count": len(options.sections)}
-    if options.taps:
-        fields["taps"] = options.taps
+    longest = max(len(options.taps), len(options.command_taps))
+    fields: dict[str, object] = {
+        "tap_count": -(-longest // TAP_LANES) * TAP_LANES,
+        "section_count": len(options.sections),
+    }
+    if longest:
+        fields["taps"] = options.taps or (1.0,)
+        fields["command_taps"] = options.command_taps or (0.0,)
     if options.sections:
         fields["sections"] = options.sections
     return fields

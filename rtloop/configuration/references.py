@@ -69,8 +69,7 @@ def generator_values(
     if isinstance(options, TableOptions):
         if options.hold_ticks > MAX_HOLD_TICKS:
             raise ValueError(f"hold_ticks: {options.hold_ticks}; at most {MAX_HOLD_TICKS} are allowed")
-        samples = read_samples(folder / options.file)
-        return Generator.TABLE, table.add(samples), samples.size, options.hold_ticks, float(options.repeat)
+        return table_values(read_samples(folder / options.file), options.hold_ticks, options.repeat, table)
     if isinstance(options, ChirpOptions):
         sweep = (options.amplitude, options.start_hz, options.end_hz, options.duration_s, options.offset)
         return Generator.CHIRP, *sweep, float(options.logarithmic)
@@ -80,8 +79,19 @@ def generator_values(
     return kind, options.amplitude, options.frequency_hz, options.offset, options.phase_deg / 360
 
 
+def table_values(
+    samples: npt.NDArray[np.float64], hold_ticks: int, repeat: bool, table: TableOfSamples
+) -> tuple[float, ...]:
+    """Kind and parameters of a generator that plays `samples` (n, 1 or 2): references, and what is added to v."""
+    count, columns = samples.shape
+    first = table.add(samples.T.ravel())
+    return Generator.TABLE, first, count, hold_ticks, float(repeat), float(columns == 2)
+
+
 def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float64]:
-    """A column of numbers; of files in or below a folder only, where one is given. Raises ValueError.
+    """One or two columns of numbers, (n, columns); of files in or below a folder only, where one is given.
+
+    Raises ValueError.
 
     What the file holds is not told: who names a file is not always who may read it.
     """
@@ -91,31 +101,35 @@ def read_samples(path: Path, below: Path | None = None) -> npt.NDArray[np.float6
     except OSError as error:
         raise ValueError(f"file: {path}: {error.strerror or error}") from None
     except _NotANumber as error:
-        raise ValueError(f"file: {path}: not a column of numbers (line {error})") from None
+        raise ValueError(f"file: {path}: not one or two columns of numbers (line {error})") from None
     except Exception:  # what the header of an .npy may do wrong has no end
-        raise ValueError(f"file: {path}: not a column of numbers") from None
+        raise ValueError(f"file: {path}: not one or two columns of numbers") from None
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
         raise ValueError(f"file: {path}: holds {getattr(loaded, 'dtype', 'an archive')}; real numbers are needed")
     if loaded.size > MAX_SAMPLES:
         raise ValueError(f"file: {path}: {loaded.size} samples; at most {MAX_SAMPLES} are allowed")
     samples = loaded.astype(float)
-    if samples.ndim != 1 or samples.size == 0:
-        raise ValueError(f"file: {path}: shape {samples.shape}; one column of at least one number is needed")
+    if samples.ndim == 1:
+        samples = samples[:, np.newaxis]
+    if samples.ndim != 2 or samples.shape[1] not in (1, 2) or samples.size == 0:
+        raise ValueError(f"file: {path}: shape {loaded.shape}; one or two columns of at least one number are needed")
     if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
         raise ValueError(f"file: {path}: holds numbers that are not finite or beyond {USABLE_MAGNITUDE:g}")
     return samples
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """One number to a line; empty lines and comments (#) do not count. Raises _NotANumber with the line's number."""
-    numbers = []
+    """A number to a line, or two; empty lines and comments (#) do not count. Raises _NotANumber with the line."""
+    rows: list[list[float]] = []
     for count, line in enumerate(text.splitlines(), start=1):
         if content := line.partition("#")[0].strip():
             try:
-                numbers.append(float(content))
+                rows.append([float(number) for number in content.split("," if "," in content else None)])
             except ValueError:
                 raise _NotANumber(count) from None
-    return np.array(numbers)
+            if len(rows[-1]) > 2 or len(rows[-1]) != len(rows[0]):
+                raise _NotANumber(count)
+    return np.array(rows)
 
 
 def volts(lowest: float, highest: float) -> str:

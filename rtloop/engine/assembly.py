@@ -103,6 +103,7 @@ class Assembly:
         self._point("extra_output_index", np.array(written, np.int64))
         self._point("adc_v", np.zeros(len(axes)))
         self._point("references", np.zeros(len(axes)))
+        self._point("feeds_um", np.zeros(len(axes)))
         inputs = [index_of(facts.inputs, plan.wiring[axis].input) for axis in axes]
         outputs = [index_of(facts.outputs, plan.wiring[axis].output) for axis in axes]
         self._point("input_index", np.array(inputs, np.int64))

@@ -26,9 +26,9 @@ from rtloop.hil.native.pointers import address_pointer, carray, copy
 from rtloop.hil.native.words import exchanged as exchanged_word
 from rtloop.hil.native.words import store_release as store_word
 from rtloop.law.access import coefficients_of, loop_of, state_of
-from rtloop.law.law import fits, reset_trip, set_controller, set_mode
+from rtloop.law.law import fits, reset_trip, set_controller, set_mode, set_prefilter
 from rtloop.law.layout import COEFFICIENTS
-from rtloop.law.prefilter import fill_prefilter_anew
+from rtloop.law.prefilter import fill_prefilter_anew, filtered
 from rtloop.law.reference import GENERATOR_PARAMETERS, Generator
 from rtloop.signals import Mode
 
@@ -154,7 +154,7 @@ def _change_units(loop, mode, held):
                 in_force = state_of(law, a).applied_command_um
             elif mode == CLOSED_LOOP:
                 in_force = state_of(law, a).position_um
-            generators[a].kind, generators[a].parameters[0] = HOLD, in_force
+            generators[a].kind, generators[a].parameters[0], generators[a].feed_um = HOLD, in_force, 0.0
             generators[a].start_tick = generators[a].held_until = loop.tick
         generators[a].volts = volts
 
@@ -167,6 +167,7 @@ def _set_reference(loop, command):
             generators[a].kind = np.int64(command.values[0])
             generators[a].start_tick = loop.tick
             generators[a].held_until = loop.tick
+            generators[a].feed_um = 0.0
             generators[a].volts = volts
             for i in range(GENERATOR_PARAMETERS):
                 generators[a].parameters[i] = command.values[1 + i]
@@ -203,15 +204,18 @@ def _load_law(loop, first, another):
 def _take_axis(law, a, staged):
     """Coefficients of one axis, from an address."""
     before, after = coefficients_of(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
-    refilled = before.tap_count != after.tap_count or before.section_count != after.section_count
+    refilled = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
     if not refilled:
         for i in range(after.section_count):
             for j in range(after.sections.shape[1]):
                 refilled = refilled or before.sections[i, j] != after.sections[i, j]
-    size = law.coefficients_bytes
+    size, state = law.coefficients_bytes, state_of(law, a)
+    last_um = filtered(before, state)
     copy(law.coefficients + a * size, staged, size)
     if refilled:
-        fill_prefilter_anew(state_of(law, a))
+        fill_prefilter_anew(state)
+    elif state.tap_index >= 0:
+        set_prefilter(law, a, last_um)
 
 
 @seldom

@@ -22,7 +22,7 @@ _ADDRESSES = (
     # buffers that the driver and the clock fill or read
     *("inputs", "outputs", "timing"),
     # law
-    *("law", "generators", "table", "adc_v", "references", "input_index", "output_index"),
+    *("law", "generators", "table", "adc_v", "references", "feeds_um", "input_index", "output_index"),
     *("conditions", "extra_input_index", "extra_output_index"),
     # shared block
     *("words", "last_drive_v", "commands", "commands_marks", "schedule", "staged"),

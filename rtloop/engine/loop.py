@@ -47,6 +47,7 @@ from rtloop.signals import (
     ENABLE,
     ERROR,
     EXEC,
+    FEED,
     FLAGS,
     LATENESS,
     LAW,
@@ -222,6 +223,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs = floats(loop.outputs, loop.output_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
+    feeds_um = floats(loop.feeds_um, loop.axis_count)
     input_index, output_index = (
         integers(loop.input_index, loop.axis_count),
         integers(loop.output_index, loop.axis_count),
@@ -233,6 +235,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
     for a in range(loop.axis_count):
         adc_v[a] = inputs[input_index[a]]
         references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
+        feeds_um[a] = generators[a].feed_um
     heartbeat_ns = float(load_acquire(words_of(loop), HEARTBEAT_WORD))
     conditions = conditions_of(loop)
     conditions.driver_status = status
@@ -240,7 +243,7 @@ def _evaluate(loop, status, now_ns, lateness_us):
     conditions.sample_age_us = inputs[loop.input_count]
     conditions.lateness_us = lateness_us
     conditions.enable_v = inputs[loop.enable_index] if loop.enable_index >= 0 else 0.0
-    evaluate(law, adc_v, references, conditions)
+    evaluate(law, adc_v, references, feeds_um, conditions)
     for a in range(loop.axis_count):
         outputs[output_index[a]] = state_of(law, a).drive_v
     if law.extra_count != 0:
@@ -287,6 +290,7 @@ def _fill_signals(loop, row):
     """Sample age, the signals of each axis, extra inputs and outputs, the observed signals."""
     inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
     adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
+    feeds_um = floats(loop.feeds_um, loop.axis_count)
     law = law_of(loop)
     row[SAMPLE_AGE] = inputs[loop.input_count]
     row[ENABLE] = conditions_of(loop).enable_v
@@ -299,6 +303,7 @@ def _fill_signals(loop, row):
         row[column + COMMAND] = state.command_um
         row[column + DEMAND] = state.demand_v
         row[column + DRIVE] = state.drive_v
+        row[column + FEED] = feeds_um[a]
     column = COMMON_COUNT + loop.axis_count * PER_AXIS_COUNT
     if law.extra_count != 0:
         _fill_extras(loop, row, column)

@@ -1,7 +1,8 @@
 """The law of one tick for all axes: `evaluate` before the drive is written, `update` after.
 
-    x_d ─► pre-filter ─(+)─ e ─► CONTROLLER ─► v ─► limit ─► FEEDFORWARD ─► demand ─► limit, slew ─► u
-                        −▲ x
+        ┌────────── command taps ───────────┐
+    x_d ┴─► taps ─► sections ─(+)─ e ─► CONTROLLER ─(+)─ v ─► limit ─► FEEDFORWARD ─► demand ─► limit, slew ─► u
+                               −▲ x
 
 The two in capitals are plug-ins, of which this file knows nothing but how to call them. Modes replace the left part:
 FEEDFORWARD takes v from the reference, RAW takes the demand in volts, OFF and a trip ramp u to its safe value. Every
@@ -30,8 +31,8 @@ from rtloop.law.access import (
     together_of,
 )
 from rtloop.law.extras import hand_in, hand_out
-from rtloop.law.layout import COEFFICIENTS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TOLD
-from rtloop.law.prefilter import fill_prefilter_anew, prefilter
+from rtloop.law.layout import COEFFICIENTS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TAP_LANES, TOLD
+from rtloop.law.prefilter import fill_prefilter_anew, filtered, prefilter
 from rtloop.law.safety import axis_causes, clip, loop_causes, toward, usable
 from rtloop.law.slots import (
     CONTROLLER_OUTPUT,
@@ -64,7 +65,7 @@ def fits(law, a, address):
     """Whether every count in the coefficients of axis `a` at `address` stays within its record: no kernel looks."""
     coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
     count = np.int64(coefficients.controller_axes)
-    if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS:
+    if coefficients.tap_count < 0 or coefficients.tap_count > MAX_TAPS or coefficients.tap_count % TAP_LANES != 0:
         return False
     if coefficients.section_count < 0 or coefficients.section_count > MAX_SECTIONS:
         return False
@@ -115,6 +116,17 @@ def set_controller(law, a):
 
 
 @jit
+def set_prefilter(law, a, last_um):
+    """Have axis `a` go on with other taps, which are in place, from what those before made of the last references."""
+    coefficients, state = coefficients_of(law, a), state_of(law, a)
+    wanted_um, added_um = filtered(coefficients, state)
+    if loop_of(law).mode == CLOSED_LOOP:
+        state.command_bump_um += last_um[1] - added_um
+        if coefficients.section_count == 0:
+            state.bump += wanted_um - last_um[0]
+
+
+@jit
 def reset_trip(law):
     """Forget the causes of a trip; the mode stays OFF until it is set."""
     loop_of(law).trip = 0
@@ -122,10 +134,10 @@ def reset_trip(law):
 
 
 @jit
-def evaluate(record, adc_v, references, conditions):
+def evaluate(record, adc_v, references, feeds_um, conditions):
     """Drives of this tick, in `drive_v` of each axis, from the inputs in V and the references (µm; V in RAW mode).
 
-    `record` is one LAW record, `conditions` one CONDITIONS record.
+    `feeds_um` is added to commands in closed loop. `record` is one LAW record, `conditions` one CONDITIONS record.
     """
     law = opened(record)
     loop = loop_of(law)
@@ -134,11 +146,13 @@ def evaluate(record, adc_v, references, conditions):
     for a in range(law.axis_count):
         coefficients, state = coefficients_of(law, a), state_of(law, a)
         state.position_um = (adc_v[a] - coefficients.offset_v) * coefficients.um_per_v
-        state.usable = 1 if usable(adc_v[a]) and usable(references[a]) else 0
+        state.usable = 1 if usable(adc_v[a]) and usable(references[a]) and usable(feeds_um[a]) else 0
         causes |= axis_causes(coefficients, state, adc_v[a], conditions)
         causes |= watch(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
-        wanted_um = prefilter(coefficients, state, references[a]) if state.usable != 0 else references[a]
-        state.error_um = wanted_um - state.position_um
+        wanted_um, added_um = references[a], 0.0
+        if state.usable != 0:
+            wanted_um, added_um = prefilter(coefficients, state, references[a])
+        state.error_um, state.feed_um = wanted_um - state.position_um, feeds_um[a] + added_um
     loop.new_trip = causes & ~loop.trip
     loop.trip |= causes
     if loop.trip != 0:
@@ -172,7 +186,7 @@ def _trip_by_law(loop):
 def _control(law, a):
     """Command of one axis that has a controller of its own; False where that failed."""
     coefficients, state = coefficients_of(law, a), state_of(law, a)
-    _tell(law, a, coefficients, state, coefficients.resting_error[0] * state.applied_command_um)
+    _tell(law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um))
     good = state.entering == 0 or controller_enter(law, a, law.controls)
     succeeded, command_um = controller_output(law, a, coefficients, law.controls)
     good = good and succeeded
@@ -198,7 +212,8 @@ def _control_together(law, first, count):
     for i in range(first, first + count):
         coefficients, resting_um = coefficients_of(law, i), 0.0
         for j in range(count):
-            resting_um += coefficients.resting_error[j] * state_of(law, first + j).applied_command_um
+            other = state_of(law, first + j)
+            resting_um += coefficients.resting_error[j] * (other.applied_command_um - other.feed_um)
         _tell(law, i, coefficients, state_of(law, i), resting_um)
         entering = entering or state_of(law, i).entering != 0
     _gather(law, first, count)
@@ -228,15 +243,19 @@ def _tell(law, i, coefficients, state, resting_um):
     control = control_of(law, i)
     met_um = state.error_um - _bump(coefficients, state, state.error_um - resting_um)
     control.reference_um, control.position_um, control.error_um = state.position_um + met_um, state.position_um, met_um
-    control.command_um = control.applied_um = state.applied_command_um
+    control.command_um = control.applied_um = state.applied_command_um - state.feed_um
 
 
 @jit
 def _command(law, i, coefficients, state, command_um):
-    """Note the command of an axis, with what it still owes to the one before; False where it is none."""
-    gap_um = state.applied_command_um - command_um
+    """Note the command of an axis, with what it still owes to the one before; False where it is none.
+
+    What the reference adds to it is none of the controller's, which is told of its own part alone.
+    """
+    gap_um = state.applied_command_um - state.feed_um - command_um
     state.command_bump_um = _died(coefficients, state.command_bump_um, state.entering != 0, gap_um)
-    state.command_um = control_of(law, i).command_um = command_um + state.command_bump_um
+    control_of(law, i).command_um = command_um + state.command_bump_um
+    state.command_um = control_of(law, i).command_um + state.feed_um
     if not usable(command_um):
         note_failure(state, CONTROLLER_OUTPUT, command_um)
         return False
@@ -340,5 +359,6 @@ def _follow(law, a, loop, coefficients):
     applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)
     if usable(applied_um):
         state.applied_command_um = applied_um
+        control_of(law, a).applied_um = applied_um - state.feed_um
     else:
         loop.pending |= TRIP_LAW

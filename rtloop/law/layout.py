@@ -13,10 +13,12 @@ import numpy as np
 from rtloop.law.validity import COUNT, SWITCH, Allowed, Bits
 from rtloop.signals import TRIP_MASK, Flag, Mode
 
-REVISION = 3
+REVISION = 4
 """Of what the law does with its memory, and of how it is laid out. Up to 2 there was one controller and one
-feedforward, within the records of the axes."""
+feedforward, within the records of the axes; up to 3 one row of taps."""
 MAX_TAPS = 128
+TAP_LANES = 4
+"""Taps in use are padded with zeros to a multiple of this."""
 MAX_SECTIONS = 12
 MAX_COUPLED = 8
 """Axes that one controller may have."""
@@ -41,8 +43,9 @@ def whole_lines(fields: list[Any]) -> np.dtype[Any]:
 
 COEFFICIENTS = whole_lines(
     [
-        # reference pre-filter: FIR taps, then second-order sections b0 b1 b2 a1 a2
+        # reference pre-filter: FIR taps to the error and to the command; then second-order sections b0 b1 b2 a1 a2
         ("taps", np.float64, (MAX_TAPS,)),
+        ("command_taps", np.float64, (MAX_TAPS,)),
         ("sections", np.float64, (MAX_SECTIONS, 5)),
         ("resting_error", np.float64, (MAX_COUPLED,)),  # error per command of each axis at which the controller rests
         ("tap_count", np.int64),
@@ -82,7 +85,8 @@ COEFFICIENTS = whole_lines(
 )
 STATE = whole_lines(
     [
-        ("tap_history", np.float64, (MAX_TAPS,)),
+        ("tap_history", np.float64, (2 * MAX_TAPS,)),  # newest first from `tap_index` on, and all of it twice
+        ("tap_sums", np.float64, (2 * TAP_LANES,)),
         ("section_history", np.float64, (MAX_SECTIONS, 2)),
         ("tap_index", np.int64),
         # what makes a new mode, or another controller, go on from where the old one was
@@ -106,6 +110,7 @@ STATE = whole_lines(
         # signals of the current tick
         ("position_um", np.float64),
         ("error_um", np.float64),
+        ("feed_um", np.float64),  # of the command, what comes from the reference and not from the controller
         ("command_um", np.float64),
         ("applied_command_um", np.float64),
         ("demand_v", np.float64),
@@ -123,13 +128,14 @@ LOOP_STATE = np.dtype(
 every output is at its safe value; causes that the end of a tick found, for the next."""
 TRIPS = Bits(sum(Flag) & TRIP_MASK)
 ALLOWED_COEFFICIENTS = {
-    "tap_count": Allowed(0, MAX_TAPS),
+    "tap_count": Allowed(0, MAX_TAPS, TAP_LANES),
     "section_count": Allowed(0, MAX_SECTIONS),
     "controller_axes": Allowed(0, MAX_COUPLED),
     **dict.fromkeys(("frozen_ticks", "tracking_ticks", "oscillation_swings", "swing_ticks", "late_ticks"), COUNT),
 }
 """What whole numbers may be; the numbers of laws depend on how many there are."""
 ALLOWED_STATE = {
+    "tap_index": Allowed(ANEW, MAX_TAPS - 1),
     "entering": Allowed(0, 2),
     "usable": SWITCH,
     "swing_direction": Allowed(-1, 1),
@@ -143,7 +149,7 @@ ALLOWED_LOOP_STATE = {
     "settled": SWITCH,
     "pending": TRIPS,
 }
-"""What whole numbers may be in records that come from elsewhere; of `tap_index`, see `rtloop.law.memory`."""
+"""What whole numbers may be in records that come from elsewhere."""
 CONDITIONS = np.dtype(
     [
         ("driver_status", np.int64),

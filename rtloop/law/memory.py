@@ -98,8 +98,7 @@ class Layout:
     def split(self, snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[int, Records, Records, Records]:
         """Tick, coefficients, axes' state and loop state of a snapshot, as copies that the kernels can work on.
 
-        Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed; a
-        `tap_index` of -1 says that the taps are still to be filled.
+        Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed.
         """
         data = bytes(snapshot)
         if len(data) != self.snapshot_bytes(axes):
@@ -119,8 +118,7 @@ class Layout:
         """Raise ValueError for the first whole number of axis `number` that is not allowed."""
         axis, state, owner = coefficients[number], states[number], f"axis {number}"
         require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_numbers(number, len(coefficients))})
-        taps = Allowed(-1, max(int(axis["tap_count"]), 1) - 1)
-        require_allowed(owner, state, {**ALLOWED_STATE, "tap_index": taps})
+        require_allowed(owner, state, ALLOWED_STATE)
         for slot in ("feedforward", "controller"):
             law = self.law(axis, slot)
             if law is None:

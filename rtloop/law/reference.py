@@ -22,7 +22,8 @@ class Generator(IntEnum):
     HOLD = 0
     """value"""
     TABLE = 1
-    """first sample, samples, ticks per sample, 1 to repeat (else the last one is held)"""
+    """first sample, samples, ticks per sample, 1 to repeat (else the last one is held), 1 where as many samples of what
+    is added to the command stand behind those of the reference"""
     SINE = 2
     """amplitude, frequency in Hz, offset, phase in turns"""
     TRIANGLE = 3
@@ -43,6 +44,8 @@ GENERATOR = np.dtype(
         ("held_until", np.int64),
         # 1 for volts, of mode raw; else µm
         ("volts", np.int64),
+        # what is added to the command, in µm, from a table's second column
+        ("feed_um", np.float64),
     ],
     align=True,
 )
@@ -54,7 +57,10 @@ TURN = 2.0 * math.pi
 
 @guarded
 def reference_sample(generator, tick, period_s, table, inputs):
-    """Reference of one axis at `tick`; `table` (n,) holds the samples of all tables, `inputs` the driver's volts."""
+    """Reference of one axis at `tick`; `table` (n,) holds the samples of all tables, `inputs` the driver's volts.
+
+    What comes with it for the command is in `generator.feed_um`.
+    """
     if tick < generator.held_until:
         return generator.held
     p = generator.parameters
@@ -65,7 +71,9 @@ def reference_sample(generator, tick, period_s, table, inputs):
     if generator.kind == TABLE:
         index, hold_ticks = elapsed // np.int64(p[2]), np.int64(p[2])
         generator.held_until = generator.start_tick + (index + 1) * hold_ticks
-        generator.held = table[np.int64(p[0]) + _table_index(index, np.int64(p[1]), p[3] != 0.0)]
+        place = np.int64(p[0]) + _table_index(index, np.int64(p[1]), p[3] != 0.0)
+        generator.held = table[place]
+        generator.feed_um = table[place + np.int64(p[1])] if p[4] != 0.0 else 0.0
         return generator.held
     if generator.kind == SINE:
         return p[2] + p[0] * math.sin(TURN * _phase(elapsed * period_s * p[1] + p[3]))

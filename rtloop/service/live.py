@@ -14,7 +14,7 @@ from rtloop.configuration.axis import AxisOptions, ReferenceOptions
 from rtloop.configuration.file import Configuration, describe, shared_faults
 from rtloop.configuration.laws import Library
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.references import TableOfSamples, extent, generator_values, volts
+from rtloop.configuration.references import TableOfSamples, extent, generator_values, table_values, volts
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
@@ -94,14 +94,17 @@ class LiveLaw:
         with self._lock:
             return self._play(self.axis_number(axis), values, samples)
 
-    def set_waveform(self, axis: str, samples: list[float], hold_ticks: int, repeat: bool) -> int:
-        """Play samples, `hold_ticks` ticks each; returns the tick. Raises ConfigError, Refused."""
-        data = np.asarray(samples, float)
-        if data.size == 0 or not np.all(np.abs(data) < USABLE_MAGNITUDE):
-            raise _unsuitable(f"waveform: {data.size} samples; at least one, and finite numbers only, are needed")
+    def set_waveform(self, axis: str, samples: np.ndarray[Any, Any], hold_ticks: int, repeat: bool) -> int:
+        """Play samples (n, 1 or 2), `hold_ticks` ticks each; returns the tick. Raises ConfigError, Refused.
+
+        The second column is added to the command.
+        """
+        if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
+            raise _unsuitable(f"waveform: {len(samples)} samples; at least one, and finite numbers only, are needed")
+        table = TableOfSamples()
+        values = list(table_values(samples, hold_ticks, repeat, table))
         with self._lock:
-            values = [Generator.TABLE, 0, data.size, hold_ticks, float(repeat)]
-            return self._play(self.axis_number(axis), values, data)
+            return self._play(self.axis_number(axis), values, table.samples)
 
     def play_raw(self, number: int, volts: np.ndarray[Any, Any]) -> int:
         """Play `volts` (n,) once, for raw mode; returns the tick. Raises Refused."""

@@ -31,13 +31,13 @@ class Differs(AssertionError):
 @jit
 def run_law(law, adc_v, references, modes, conditions, out):
     """The law over arrays of inputs, as `run_law` of loop.c."""
-    adc, reference = np.empty(1), np.empty(1)
+    adc, reference, feed = np.empty(1), np.empty(1), np.zeros(1)
     for k in range(adc_v.size):
         if modes[k] >= 0:
             reset_trip(law)
             set_mode(law, modes[k], False)
         adc[0], reference[0] = adc_v[k], references[k]
-        evaluate(law, adc, reference, conditions[0])
+        evaluate(law, adc, reference, feed, conditions[0])
         update(law)
         state = state_of(law, 0)
         out[k, 0], out[k, 1] = state.command_um, state.demand_v

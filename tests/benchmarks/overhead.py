@@ -30,13 +30,13 @@ FAR_AWAY_NS = 1 << 62
 def bare_ticks(pointers, clock, law, conditions, references, buffers, ticks):
     """The calls of a tick in their order, and nothing around them. `buffers`: inputs, outputs, timing."""
     inputs, outputs, timing = buffers
-    adc_v, reference = np.empty(1), np.empty(1)
+    adc_v, reference, feed = np.empty(1), np.empty(1), np.zeros(1)
     for k in range(ticks):
         call(clock[0], clock[2], timing.ctypes.data)
         call(pointers[1], pointers[0], inputs.ctypes.data)
         call(clock[1], clock[2], timing.ctypes.data)
         adc_v[0], reference[0] = inputs[0], references[k]
-        evaluate(law, adc_v, reference, conditions[0])
+        evaluate(law, adc_v, reference, feed, conditions[0])
         outputs[0] = state_of(law, 0).drive_v
         call(clock[1], clock[2], timing.ctypes.data)
         call(pointers[2], pointers[0], outputs.ctypes.data)

@@ -52,16 +52,16 @@ class Signals(NamedTuple):
 
 
 @jit
-def run_law(law, modes, resets, adc_v, references, conditions, out):
+def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
     """Evaluate, update and note down each tick."""
-    adc, reference = np.empty(1), np.empty(1)
+    adc, reference, feed = np.empty(1), np.empty(1), np.empty(1)
     for k in range(modes.size):
         if resets[k] != 0:
             reset_trip(law)
         if modes[k] >= 0:
             set_mode(law, modes[k], False)
-        adc[0], reference[0] = adc_v[k], references[k]
-        evaluate(law, adc, reference, conditions[k])
+        adc[0], reference[0], feed[0] = adc_v[k], references[k], feeds_um[k]
+        evaluate(law, adc, reference, feed, conditions[k])
         update(law)
         state, loop = state_of(law, 0), loop_of(law)
         out[0, k], out[1, k], out[2, k] = state.drive_v, state.demand_v, state.command_um
@@ -112,6 +112,7 @@ class LawBench:
         lost: npt.ArrayLike = 0,
         late_us: npt.ArrayLike = 0.0,
         enable_v: npt.ArrayLike = 0.0,
+        feed_um: npt.ArrayLike = 0.0,
     ) -> Signals:
         """Run over `references` (ticks,); the rest may be a number for all ticks. `mode`, `reset` are for the first."""
         wanted = np.atleast_1d(np.asarray(references, float))
@@ -125,7 +126,7 @@ class LawBench:
         conditions["driver_status"], conditions["sample_age_us"] = status, age_us
         conditions["heartbeat_lost"], conditions["lateness_us"], conditions["enable_v"] = lost, late_us, enable_v
         adc = _spread(adc_v, wanted, float)
-        run_law(self.law.law, changes, forgiven, adc, wanted, conditions, out)
+        run_law(self.law.law, changes, forgiven, adc, wanted, _spread(feed_um, wanted, float), conditions, out)
         return Signals(*out)
 
     def memory(self) -> dict[str, bytes]:

@@ -133,24 +133,24 @@ def test_twice_the_same(options):
         ({"kind": "steps", "levels": [1], "dwell_s": 1e-5}, "dwell_s: 1e-05 is less than a period of 0.0001 s"),
         ({"kind": "input", "channel": "knob", "per_v": 1}, "'knob' is not a channel of this driver; it has adc0, joy"),
         ({"kind": "table", "file": "absent.csv"}, r"file: .*absent\.csv: .*(not found|No such file)"),
-        ({"kind": "table", "file": "words.csv"}, r"words\.csv: not a column of numbers"),
+        ({"kind": "table", "file": "words.csv"}, r"words\.csv: not one or two columns of numbers"),
         ({"kind": "table", "file": "nan.csv"}, r"nan\.csv: holds numbers that are not finite or beyond 1e\+09"),
         (
             {"kind": "table", "file": "wide.csv"},
-            r"wide\.csv: not a column of numbers \(line 1\)",
+            r"wide\.csv: not one or two columns of numbers \(line 1\)",
         ),
-        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy: shape \(2, 2\); one column"),
+        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy: shape \(2, 3\); one or two columns"),
         ({"kind": "table", "file": "complex.npy"}, r"complex\.npy: holds complex128; real numbers are needed"),
-        ({"kind": "table", "file": "nothing.npy"}, r"nothing\.npy: not a column of numbers"),
+        ({"kind": "table", "file": "nothing.npy"}, r"nothing\.npy: not one or two columns of numbers"),
         ({"kind": "table", "file": "empty.csv"}, r"empty\.csv: .*at least one number"),
-        ({"kind": "table", "file": "pickled.npy"}, r"pickled\.npy: not a column of numbers"),
+        ({"kind": "table", "file": "pickled.npy"}, r"pickled\.npy: not one or two columns of numbers"),
     ],
 )
 def test_references_that_cannot_be(tmp_path, options, message):
-    contents = {"words": "one\ntwo\n", "nan": "1\nnan\n", "wide": "1,2\n3,4\n", "empty": ""}
+    contents = {"words": "one\ntwo\n", "nan": "1\nnan\n", "wide": "1,2,3\n4,5,6\n", "empty": ""}
     for name, content in contents.items():
         (tmp_path / f"{name}.csv").write_text(content)
-    np.save(tmp_path / "wide.npy", np.zeros((2, 2)))
+    np.save(tmp_path / "wide.npy", np.zeros((2, 3)))
     np.save(tmp_path / "complex.npy", np.ones(3, complex))
     (tmp_path / "nothing.npy").write_bytes(b"")
     np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)

@@ -21,6 +21,11 @@ LAWS = {
     "formula": coefficients_of(controller=EQ_20, limits=LIMITED),
     "dead band": coefficients_of(controller=EQ_20, feedforward=EXACT, limits=LIMITED),
     "filtered": coefficients_of(controller=EQ_20, limits=LIMITED, prefilter={"sections": [[1, 0, 0, -1.99, 0.995]]}),
+    "taps": coefficients_of(
+        controller=EQ_20,
+        limits=LIMITED,
+        prefilter={"taps": [1.5, -0.25, -0.25] * 16, "command_taps": [0.5, 0.4, -0.3] * 17},
+    ),
     "tustin": coefficients_of(controller=EQ_20 | {"method": "tustin"}, limits=LIMITED),
 }
 WILD = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 9.99e8, -9.99e8, 1e-310, 60.0, -60.0, 9.99, -9.99])
@@ -31,7 +36,7 @@ def soak(law, conditions, wild, seed, ticks):
     """Worst |drive|, worst move above the running slew, worst above the trip's, ticks in a running mode, trips."""
     np.random.seed(seed)
     coefficients, state, loop = of_axis(law, 0), state_of(law, 0), loop_of(law)
-    adc, reference = np.zeros(1), np.zeros(1)
+    adc, reference, feed = np.zeros(1), np.zeros(1), np.zeros(1)
     largest_v, above_slew_v, above_trip_v, running, trips = 0.0, -np.inf, -np.inf, 0, 0
     level, amplitude, hz = 0.0, 0.0, 0.0
     for k in range(ticks):
@@ -47,13 +52,15 @@ def soak(law, conditions, wild, seed, ticks):
         if amplitude > 10.0:
             wave = 1.0 if wave > 0.0 else -1.0
         reference[0] = level + amplitude * wave
-        adc[0] = 2.0 * np.random.randn()
+        adc[0], feed[0] = 2.0 * np.random.randn(), amplitude * np.random.randn()
         conditions.driver_status, conditions.heartbeat_lost = 0, 0
         conditions.sample_age_us, conditions.lateness_us, conditions.enable_v = 0.0, 0.0, 0.0
         if np.random.random() < 0.003:
             adc[0] = wild[np.random.randint(0, wild.size)]
         if np.random.random() < 0.003:
             reference[0] = wild[np.random.randint(0, wild.size)]
+        if np.random.random() < 0.003:
+            feed[0] = wild[np.random.randint(0, wild.size)]
         if np.random.random() < 0.001:
             conditions.driver_status = np.random.randint(-2, 2)
             conditions.heartbeat_lost = 1 if np.random.random() < 0.2 else 0
@@ -63,7 +70,7 @@ def soak(law, conditions, wild, seed, ticks):
         if np.random.random() < 0.002:
             set_mode(law, np.random.randint(0, 4) if loop.trip == 0 else 0, False)
         last_v = state.drive_v
-        evaluate(law, adc, reference, conditions)
+        evaluate(law, adc, reference, feed, conditions)
         update(law)
         drive_v = state.drive_v
         if not abs(drive_v) <= largest_v:

@@ -75,7 +75,7 @@ def test_replay_says_identical_or_what_differs(path: Path, tmp_path: Path):
     assert "identical" in run("replay", path).stdout
 
     def nudge(rows: np.ndarray) -> None:
-        rows[rows[:, 0] == 777, -3] += 1e-9  # the drive
+        rows[rows[:, 0] == 777, -4] += 1e-9  # the drive
 
     changed_file = rewrite(path, tmp_path / "run.mcap", rows=nudge)
     verdict = answer("replay", changed_file, code=1)

@@ -52,14 +52,14 @@ def with_tick(base: Base, column: str, value: float) -> bytes:
 
 
 INDICES = [
-    *[("x.tap_count", value, f"0 to {MAX_TAPS}") for value in (-1, MAX_TAPS + 1, 2**40)],
+    *[("x.tap_count", value, f"a multiple of 4 from 0 to {MAX_TAPS}") for value in (-1, 2, MAX_TAPS + 1, 2**40)],
     *[("x.section_count", value, f"0 to {MAX_SECTIONS}") for value in (-1, MAX_SECTIONS + 1)],
     *[("x.play_count", value, f"a multiple of 4 from 0 to {MAX_PLAYS}") for value in (3, 68, 255)],
     *[("x.order", value, f"a multiple of 8 from 0 to {MAX_ORDER}") for value in (4, 32, 255)],
     *[("x.row_start", value, f"0 to {MAX_ORDER}") for value in (25, 255)],
     *[("x.row_stop", value, f"0 to {MAX_ORDER}") for value in (25, 255)],
     ("x.coupled", 2, "0 to 1"),
-    *[("x.tap_index", value, "-1 to 3") for value in (-2, 4, 10**6)],
+    *[("x.tap_index", value, f"-1 to {MAX_TAPS - 1}") for value in (-2, MAX_TAPS, 10**6)],
     *[("x.entering", value, "0 to 2") for value in (-1, 3)],
     ("x.usable", 2, "0 to 1"),
     ("x.swing_direction", 2, "-1 to 1"),

@@ -42,7 +42,7 @@ def reaches_beyond(data: bytes, axes: int) -> bool:
     try:
         with np.errstate(all="ignore"):
             for _ in range(TICKS):
-                evaluate(law.law, np.zeros(axes), np.ones(axes), conditions)
+                evaluate(law.law, np.zeros(axes), np.ones(axes), np.zeros(axes), conditions)
                 update(law.law)
     except IndexError:
         return True

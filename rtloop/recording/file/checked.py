@@ -164,8 +164,11 @@ def header_from(payload: bytes) -> dict[str, Any]:
 
 def require_columns(header: dict[str, Any]) -> None:
     """Raise Malformed where the columns are not those of the axes, the extras and the observed signals."""
-    expected = list(signals.columns(header["axes"], header["observed"], extras_of(header).columns))
-    if header["columns"] != expected:
+    axes, observed, extras = header["axes"], header["observed"], extras_of(header).columns
+    expected = list(signals.columns(axes, observed, extras))
+    feeds = {f"{axis}_{signals.PER_AXIS[signals.FEED].name}" for axis in axes}
+    before = [name for name in expected if name not in feeds]  # up to revision 3 of the law
+    if header["columns"] not in (expected, before):
         raise Malformed(f"columns: {_shown(header['columns'])}; axes and observed make {_shown(expected)}")
 
 

@@ -147,10 +147,11 @@ class Rerun:
         """Recorded references, as a table that starts with these rows; commands cannot change them."""
         table, generators = self._block["table"], self._assembly.generators
         for axis in range(len(self.law.axes)):
-            start = axis * SLICE_TICKS
-            table[start : start + len(rows)] = rows[:, signals.axis_column(axis, signals.REFERENCE)]
+            start, count = 2 * axis * SLICE_TICKS, len(rows)
+            table[start : start + count] = rows[:, signals.axis_column(axis, signals.REFERENCE)]
+            table[start + count : start + 2 * count] = rows[:, signals.axis_column(axis, signals.FEED)]
             generators["kind"][axis] = Generator.TABLE
-            generators["parameters"][axis, :4] = start, len(rows), 1, 0
+            generators["parameters"][axis, :5] = start, count, 1, 0, 1
             generators["start_tick"][axis] = generators["held_until"][axis] = first_tick
 
 
@@ -174,7 +175,7 @@ def _plan(
         coefficients=law.coefficients,
         mode=Mode.OFF,
         generators=np.zeros(len(axes), GENERATOR),
-        table=np.zeros(SLICE_TICKS * len(axes)),
+        table=np.zeros(2 * SLICE_TICKS * len(axes)),
         schedule=commands,
         observed=source.facts.observed,
         extras=extras_of(header),

@@ -78,7 +78,7 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
     "/setpoint": (SetpointBody, "Hold the reference of an axis at a value.",
                   lambda service, body: _tick(_setpoint(service, body))),
     "/waveform": (WaveformBody, "Play samples on an axis.",
-                  lambda service, body: _tick(_live(service).set_waveform(body.axis, body.samples, body.hold_ticks,
+                  lambda service, body: _tick(_live(service).set_waveform(body.axis, body.columns, body.hold_ticks,
                                                                           body.repeat))),
     "/response": (ResponseBody, "Measure the response of the closed loop about the reference that is held.",
                   lambda service, body: _response(service, body)),
@@ -105,7 +105,7 @@ def _reference(service: Service, body: ReferenceBody) -> int:
         raise ConfigError("reference", describe(error, "reference", body.reference)) from None
     except ValueError as error:
         raise ConfigError("reference", [f"reference.{error}"]) from None
-    return live.set_waveform(body.axis, samples.tolist(), table.hold_ticks, table.repeat)
+    return live.set_waveform(body.axis, samples, table.hold_ticks, table.repeat)
 
 
 def _response(service: Service, body: ResponseBody) -> dict[str, Any]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field
+import numpy as np
+import numpy.typing as npt
+from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, model_validator
 
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
@@ -72,12 +74,26 @@ class SetpointBody(Body):
 
 
 class WaveformBody(Body):
-    """Samples, `hold_ticks` ticks each."""
+    """Samples, `hold_ticks` ticks each; `command_um`, as many, is added to the command of a closed loop."""
 
     axis: Name
     samples: Annotated[list[float], FailFast(), Field(min_length=1)]
+    command_um: Annotated[list[float], FailFast()] = Field(default_factory=list)
     hold_ticks: int = Field(default=1, ge=1, le=MAX_HOLD_TICKS)
     repeat: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.command_um and len(self.command_um) != len(self.samples):
+            raise ValueError(
+                f"command_um: {len(self.command_um)} numbers for {len(self.samples)} samples; as many are needed"
+            )
+        return self
+
+    @property
+    def columns(self) -> npt.NDArray[np.float64]:
+        """Samples (n, 1), or (n, 2) with what is added to the command."""
+        return np.array([self.samples, self.command_um] if self.command_um else [self.samples], float).T
 
 
 class ResponseBody(Body):

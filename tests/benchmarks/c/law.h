@@ -12,7 +12,7 @@ enum {
     TRIP_HEARTBEAT = 1 << 12, TRIP_STALE = 1 << 13, TRIP_FROZEN = 1 << 14, TRIP_TRACKING = 1 << 15,
     TRIP_OSCILLATION = 1 << 16, TRIP_LATE = 1 << 17, TRIP_ENABLE = 1 << 18, TRIP_LAW = 1 << 19,
 };
-enum { LANES = 4, BLOCK = 8, ANOTHER_MODE = 1, CONTROLLER_OUTPUT = 2, FEEDFORWARD_OUTPUT = 8, FEEDFORWARD_UPDATE = 10 };
+enum { LANES = 4, BLOCK = 8, MAX_TAPS = 128, ANOTHER_MODE = 1, CONTROLLER_OUTPUT = 2, FEEDFORWARD_OUTPUT = 8, FEEDFORWARD_UPDATE = 10 };
 
 typedef const struct law_coefficients *restrict law_c;
 typedef struct law_state *restrict law_s;
@@ -90,16 +90,21 @@ static inline void controller_enter(law_c c, law_s s, double error_um, double co
     for (unsigned i = 0; i < c->order; i++) s->controller[i] += c->tracking[i] * gap;
 }
 
-static inline double prefilter(law_c c, law_s s, double value) {
+static inline double prefilter(law_c c, law_s s, double value, double *added_um) {
+    *added_um = 0;
     if (c->tap_count > 0) {
-        int64_t index = s->tap_index;
-        s->tap_history[index] = value;
-        value = 0;
-        for (int64_t i = 0; i < c->tap_count; i++) {
-            value += c->taps[i] * s->tap_history[index];
-            index = index == 0 ? c->tap_count - 1 : index - 1;
-        }
-        s->tap_index = s->tap_index + 1 == c->tap_count ? 0 : s->tap_index + 1;
+        int64_t index = (s->tap_index > 0 ? s->tap_index : MAX_TAPS) - 1;
+        s->tap_index = index;
+        s->tap_history[index] = s->tap_history[index + MAX_TAPS] = value;
+        const double *history = s->tap_history + index;
+        double x[4] = {0}, v[4] = {0};
+        for (int64_t i = 0; i < c->tap_count; i += 4)
+            for (int64_t lane = 0; lane < 4; lane++) {
+                x[lane] += c->taps[i + lane] * history[i + lane];
+                v[lane] += c->command_taps[i + lane] * history[i + lane];
+            }
+        value = (x[0] + x[1]) + (x[2] + x[3]);
+        *added_um = (v[0] + v[1]) + (v[2] + v[3]);
     }
     for (int64_t i = 0; i < c->section_count; i++) {
         const double *q = c->sections[i];
@@ -141,14 +146,14 @@ static inline void trip_by_law(loop_s loop) {
 }
 
 static inline bool control(law_c c, law_s s) {
-    double resting_um = c->resting_error[0] * s->applied_command_um;
+    double applied_um = s->applied_command_um - s->feed_um, resting_um = c->resting_error[0] * applied_um;
     double met_um = s->error_um - bump(c, s, s->error_um - resting_um);
-    if (s->entering) controller_enter(c, s, met_um, s->applied_command_um);
+    if (s->entering) controller_enter(c, s, met_um, applied_um);
     double command_um = controller_output(c, s, met_um);
     bool good = usable(command_um);
     if (!good) failed(s, CONTROLLER_OUTPUT, command_um);
-    s->command_bump_um = died(c, s->command_bump_um, s->entering != 0, s->applied_command_um - command_um);
-    s->command_um = command_um + s->command_bump_um;
+    s->command_bump_um = died(c, s->command_bump_um, s->entering != 0, applied_um - command_um);
+    s->command_um = (command_um + s->command_bump_um) + s->feed_um;
     return good;
 }
 
@@ -245,6 +250,7 @@ static inline int64_t watch(law_c c, law_s s, int64_t mode, double adc_v, double
 
 static inline void evaluate(
     law_c c, law_s s, loop_s loop, int64_t axes, const double *restrict adc_v, const double *restrict references,
+    const double *restrict feeds_um,
     const struct conditions *restrict now
 ) {
     bool lost = now->heartbeat_lost != 0;
@@ -253,7 +259,7 @@ static inline void evaluate(
     for (int64_t a = 0; a < axes; a++) {
         double position_um = (adc_v[a] - c[a].offset_v) * c[a].um_per_v;
         s[a].position_um = position_um;
-        s[a].usable = usable(adc_v[a]) && usable(references[a]);
+        s[a].usable = usable(adc_v[a]) && usable(references[a]) && usable(feeds_um[a]);
         if (!s[a].usable) causes |= TRIP_NON_FINITE;
         if (adc_v[a] < c[a].sensor_min_v || adc_v[a] > c[a].sensor_max_v) causes |= TRIP_SENSOR_RANGE;
         if (position_um < -c[a].position_limit_um || position_um > c[a].position_limit_um) causes |= TRIP_POSITION;
@@ -265,8 +271,10 @@ static inline void evaluate(
     loop->trip |= causes;
     if (loop->trip) loop->mode = OFF;
     for (int64_t a = 0; a < axes; a++) {
-        double wanted_um = s[a].usable ? prefilter(&c[a], &s[a], references[a]) : references[a];
+        double added_um = 0, wanted_um = references[a];
+        if (s[a].usable) wanted_um = prefilter(&c[a], &s[a], references[a], &added_um);
         s[a].error_um = wanted_um - s[a].position_um;
+        s[a].feed_um = feeds_um[a] + added_um;
     }
     if (loop->mode == CLOSED_LOOP) {
         bool good = true;

@@ -5,19 +5,22 @@
 #include "law.h"
 #include "rig.h"
 
+enum { HOLD, TABLE, STOP = 1, HEARTBEAT_NS = 2, RECORDER_CURSOR = 3, MAX_AXES = 8, COMMON = 13, PER_AXIS = 8 };
+
 void run_law(
     const struct law_coefficients *restrict c, struct law_state *restrict s, struct loop_state *restrict loop,
     int64_t axes, const double *restrict adc_v, const double *restrict references, const int64_t *restrict modes,
     int64_t ticks, double *restrict out
 ) {
     const struct conditions now = {0};
+    const double feeds_um[MAX_AXES] = {0};
     for (int64_t k = 0; k < ticks; k++) {
         if (modes[k] >= 0) {
             loop->trip = 0;
             loop->mode = modes[k];
             for (int64_t a = 0; a < axes; a++) s[a].entering = 1, s[a].failed = 0;
         }
-        evaluate(c, s, loop, axes, &adc_v[k * axes], &references[k * axes], &now);
+        evaluate(c, s, loop, axes, &adc_v[k * axes], &references[k * axes], feeds_um, &now);
         update(c, s, loop, axes);
         out[4 * k] = s->command_um;
         out[4 * k + 1] = s->demand_v;
@@ -39,7 +42,6 @@ struct run {
     int64_t axes, columns, capacity, tick;
     double period_ns, period_us, heartbeat_timeout_ns;
 };
-enum { HOLD, TABLE, STOP = 1, HEARTBEAT_NS = 2, RECORDER_CURSOR = 3, MAX_AXES = 8, COMMON = 13, PER_AXIS = 7 };
 
 static inline double reference_sample(struct generator *g, int64_t tick, const double *table) {
     if (tick < g->held_until) return g->held;
@@ -51,15 +53,18 @@ static inline double reference_sample(struct generator *g, int64_t tick, const d
     int64_t count = (int64_t)g->parameters[1];
     g->held_until = g->start_tick + (index + 1) * hold_ticks;
     index = g->parameters[3] != 0 ? index % count : index < count ? index : count - 1;
-    return g->held = table[(int64_t)g->parameters[0] + index];
+    index += (int64_t)g->parameters[0];
+    g->feed_um = g->parameters[4] != 0 ? table[index + count] : 0;
+    return g->held = table[index];
 }
 
 static inline void run_tick(struct run *restrict r) {
-    double adc_v[MAX_AXES], references[MAX_AXES];
+    double adc_v[MAX_AXES], references[MAX_AXES], feeds_um[MAX_AXES];
     double deadline_ns = (double)(int64_t)(r->tick * r->period_ns), none = NAN;
     for (int64_t a = 0; a < r->axes; a++) {
         adc_v[a] = rig_sample(&r->rig_coefficients[a], &r->rig_state[a]);
         references[a] = reference_sample(&r->generators[a], r->tick, r->table);
+        feeds_um[a] = r->generators[a].feed_um;
     }
     double true_um[MAX_AXES], hysteresis_um[MAX_AXES];
     for (int64_t a = 0; a < r->axes; a++) {
@@ -70,7 +75,7 @@ static inline void run_tick(struct run *restrict r) {
     bool lost = none - heartbeat_ns > r->heartbeat_timeout_ns;
     struct law_state *s = r->law_state;
     struct conditions now = {.heartbeat_lost = lost, .lateness_us = (none - deadline_ns) * 1e-3};
-    evaluate(r->law_coefficients, s, r->loop_state, r->axes, adc_v, references, &now);
+    evaluate(r->law_coefficients, s, r->loop_state, r->axes, adc_v, references, feeds_um, &now);
     for (int64_t a = 0; a < r->axes; a++) {
         r->last_drive_v[a] = s[a].drive_v;
         rig_advance(&r->rig_coefficients[a], &r->rig_state[a], s[a].drive_v);
@@ -98,6 +103,7 @@ static inline void run_tick(struct run *restrict r) {
         column[4] = s[a].command_um;
         column[5] = s[a].demand_v;
         column[6] = s[a].drive_v;
+        column[7] = feeds_um[a];
         observed[0] = true_um[a];
         observed[1] = hysteresis_um[a];
     }
