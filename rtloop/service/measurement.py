@@ -113,7 +113,7 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
     with run.about_the_reference(asked.amplitude_um):
         found = run.approach(lines, asked.amplitude_um, periods)
     try:
-        return measurement(found, rate_hz, near_hz, model)
+        return measurement(found, rate_hz, near_hz, model, options.prefilter.command_taps)
     except ValueError as error:
         raise Refused(f"response: {error}") from None
 
@@ -180,7 +180,7 @@ class _Run:
     def play(self, period: Real, periods: int) -> dict[str, Real]:
         """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
         samples = played(period, periods, self._hold_um, round(FADE_S * self._rate_hz))
-        tick = self._live.set_waveform(self._axis, samples.tolist(), 1, repeat=False)
+        tick = self._live.set_waveform(self._axis, samples[:, np.newaxis], 1, repeat=False)
         self._set += 1
         rows = self._read(tick, samples.size)
         if not np.array_equal(rows[:, self._columns["reference_um"]], samples):
