@@ -111,7 +111,7 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
     with run.about_the_reference(asked.amplitude_um):
         found = run.approach(lines, asked.amplitude_um, periods)
     try:
-        return measurement(found, rate_hz, near_hz, model)
+        return measurement(found, rate_hz, near_hz, model, options.prefilter.command_taps)
     except ValueError as error:
         raise Refused(f"response: {error}") from None
 

@@ -47,11 +47,19 @@ class TrueLoop:
         return margins_of(self.open, from_hz, to_hz)
 
     def run(
-        self, reference: np.ndarray, seed: int = 0, bend: Callable[[float], float] = lambda v: v
+        self,
+        reference: np.ndarray,
+        seed: int = 0,
+        bend: Callable[[float], float] | None = None,
+        past: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        """Recorded signals for a reference, sample by sample; `bend` is what the actuator makes of the command."""
-        if bend(0.25) == 0.25:
+        """Recorded signals for a reference; `bend` is what the actuator makes of the command, to which `past` is added.
+
+        Where neither is given the loop is linear, and quickly filtered.
+        """
+        if bend is None and past is None:
             return self._linear(reference, seed)
+        bend, past = bend or (lambda v: v), np.zeros(reference.size) if past is None else past
         omega = 2 * np.pi * self.hz
         b, a, _ = signal.cont2discrete(([omega**2], [1, 2 * self.damping * omega, omega**2]), 1 / RATE_HZ, "zoh")
         b1, b2 = b.ravel()[1:]
@@ -62,7 +70,7 @@ class TrueLoop:
             y[k] = b1 * u[k + 1] + b2 * u[k] - a[1] * y[k - 1] - a[2] * y[k - 2] if k > 1 else 0.0
             x[k] = y[k] + noise[k]
             e[k] = reference[k] - x[k]
-            v[k] = self.kp * e[k] + integral
+            v[k] = self.kp * e[k] + integral + past[k]
             integral += self.ki_per_s / RATE_HZ * e[k]
             u[k + 2 + self.delay_ticks] = bend(v[k])
         return {"reference_um": reference, "error_um": e, "command_um": v, "position_um": x, "true_um": y}

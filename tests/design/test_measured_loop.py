@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import signal
 
 from rtloop.analysis.measured import excitation
 from rtloop.analysis.measured.measurement import Measurement, measurement
@@ -175,3 +176,18 @@ def test_a_period_with_a_missed_tick_is_left_out() -> None:
     missed[lines.samples :: lines.samples] = 1.0
     with pytest.raises(ValueError, match="2 are needed"):
         measurement({**found, "periods_missed": missed}, RATE_HZ)
+
+
+def test_what_reaches_the_command_past_the_controller_is_not_the_controllers() -> None:
+    """A second row of taps, and a second column: the loop is the same, the error another."""
+    loop = TrueLoop(595.5, 0.02, 1, 40.0, noise_um=1e-4)
+    lines = grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
+    reference = played(excitation.fitting(lines, *_answers(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
+    taps, feed = [0.3, -0.1, 0.05], 0.2 * np.roll(reference, 7)
+    past = signal.lfilter(taps, 1.0, reference) + feed
+    found = loop.run(reference, past=past)
+    with_it = measurement({**found, "feed_um": feed}, RATE_HZ, 595.5, command_taps=taps)
+    without = measurement(found, RATE_HZ, 595.5)
+    true = loop.open(lines.hz)
+    assert np.median(np.abs(with_it.response.plant * with_it.response.controller / true - 1)) < 1e-3
+    assert np.median(np.abs(without.response.plant * without.response.controller / true - 1)) > 0.1

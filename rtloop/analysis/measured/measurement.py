@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.signal import lfilter
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import margins
@@ -68,9 +69,15 @@ class Measurement:
 
 
 def measurement(
-    signals: Mapping[str, Real], rate_hz: float, near_hz: float | None = None, model: Loop | None = None
+    signals: Mapping[str, Real],
+    rate_hz: float,
+    near_hz: float | None = None,
+    model: Loop | None = None,
+    command_taps: Sequence[float] = (),
 ) -> Measurement:
     """Of recorded `reference_um`, `error_um`, `command_um` and `position_um`, each (ticks,).
+
+    What reaches the command past the controller is `feed_um`, where that is given, and the reference by `command_taps`.
 
     Periods of the multisine with a tick that has `periods_missed`, where that is given, are left out. The light mode is
     looked for near `near_hz`, or else where the plant answers most. Raises ValueError for a reference without a
@@ -83,7 +90,8 @@ def measurement(
     grid = part.grid(reference, rate_hz)
     whole = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
     folded = (part.folded(signals[name])[whole] for name in ("error_um", "command_um", "position_um"))
-    found = response(grid, Signals(*folded))
+    past = lfilter(command_taps or (0.0,), 1.0, reference) + signals.get("feed_um", 0.0)
+    found = response(grid, Signals(*folded, part.folded(past)[0]))
     mode = _mode(found, rate_hz, near_hz)
     loop = measured_loop(found, rate_hz, mode)
     return Measurement(found, loop, measured_margins(loop), mode, model)

@@ -30,7 +30,7 @@ SILENT_NEARBY = 10
 class Signals:
     """Whole periods at the same reference, each (periods, samples): error, command and position, µm.
 
-    `direct` is the part of the command that comes from the reference past the controller, (samples,).
+    `direct` is the part of the command that comes from the reference past the controller, (samples,); None: nothing.
     """
 
     error: Real

@@ -31,12 +31,14 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     if recording.header["driver"]["kind"] != IN_STEP:
         signals["periods_missed"] = recording["periods_missed"]
     described = next(one for one in tomllib.loads(recording.configuration)["axis"] if one["name"] == axis)
-    model, known = None, None
+    if f"{axis}_feed_um" in recording:
+        signals["feed_um"] = recording[f"{axis}_feed_um"]
+    model, known, taps = None, None, described.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
         options = AxisOptions.model_validate(described)
         model, known = promised_loop(options, rate_hz), options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (known[0] if known else None)
     try:
-        return measurement(signals, rate_hz, near_hz, model)
+        return measurement(signals, rate_hz, near_hz, model, taps)
     except ValueError as fault:
         raise UnsuitableData(f"{path}: {fault}") from None

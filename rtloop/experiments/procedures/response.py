@@ -80,7 +80,8 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     (taken,) = recordings
     names = ("reference_um", "error_um", "command_um", "position_um")
     near_hz, loop = (taken.model.resonance_hz, taken.model.loop) if taken.model else (None, None)
-    found = measurement(dict(zip(names, taken.read(*names), strict=True)), taken.rate_hz, near_hz, loop)
+    signals, taps = dict(zip(names, taken.read(*names), strict=True)), taken.axis_options.prefilter.command_taps
+    found = measurement(signals, taken.rate_hz, near_hz, loop, taps)
     if (moved_um := found.response.moved_um) > options.amplitude_um:
         raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")
     promised = margins(loop)._asdict() if loop else {}
