@@ -281,6 +281,47 @@ def resonance(context: click.Context, axis: str, as_json: bool, **asked: Any) ->
 
 @ctl.command()
 @click.argument("axis")
+@click.option(
+    "--amplitude-um",
+    default=0.5,
+    show_default=True,
+    type=click.FloatRange(0, min_open=True),
+    help="The position is moved by no more than this while the resonance is measured.",
+)
+@click.option(
+    "--bound-percent",
+    default=15.0,
+    show_default=True,
+    type=click.FloatRange(0, 50, min_open=True),
+    help="A resonance further from the model's changes nothing.",
+)
+@click.option(
+    "--within-percent",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(0, 50),
+    help="The taps are made for resonances so near the measured one.",
+)
+@click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
+@click.option("--yes", is_flag=True, help="Swap without asking.")
+@JSON
+@click.pass_context
+@fails_clearly
+def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
+    """Make the taps of AXIS anew for its resonance as it is now.
+
+    It is measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in at
+    a tick, after a look at a step before and after. With --json and without --yes nothing is swapped. Exit 1 where the
+    taps stayed.
+    """
+    from rtloop.commands.retune import Asked
+    from rtloop.commands.retune import retune as retune_axis
+
+    return retune_axis(_client(context), Asked(axis=axis, **asked), as_json)
+
+
+@ctl.command()
+@click.argument("axis")
 @click.argument("section", type=click.Choice(["controller", "limits", "interlocks", "prefilter", "model"]))
 @click.argument("values")
 @click.pass_context

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -51,6 +52,14 @@ class LiveLaw:
         self._playing = [(int(one["kind"]), float(one["parameters"][0])) for one in prepared.plan.generators]
         self.references_set = [0] * len(prepared.plan.axes)
         """How often each axis was given another reference."""
+
+    @property
+    def as_it_runs(self) -> dict[str, Any]:
+        """The configuration as plain values, with what was tuned since, and the folder that its files are in."""
+        configuration = self.prepared.configuration
+        values = tomllib.loads(configuration.text)
+        values["axis"] = [axis.model_dump(mode="json", exclude_unset=True) for axis in configuration.axes]
+        return {"folder": str(configuration.folder.resolve()), "values": values}
 
     def axis_number(self, name: str) -> int:
         """Raises ConfigError for a name that is no axis."""

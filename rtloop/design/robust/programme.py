@@ -140,7 +140,9 @@ class Programme:
         )
 
 
-def _optimum(cost: Real, above: Any, limit: Real, static: Any, limits: Sequence[tuple[float, float | None]]) -> Real | None:
+def _optimum(
+    cost: Real, above: Any, limit: Real, static: Any, limits: Sequence[tuple[float, float | None]]
+) -> Real | None:
     """Where A x ≤ b and the static answer is 1; None where nothing is. Raises ArithmeticError if no method can say."""
     for method, presolve in (("highs", True), ("highs", False), ("highs-ipm", True)):
         result = linprog(

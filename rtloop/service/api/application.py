@@ -161,6 +161,11 @@ def application(service: Service) -> Starlette:
     async def get_status(_: Request) -> Response:
         return JSONResponse(status(service))
 
+    async def get_configuration(_: Request) -> Response:
+        if service.live is None:
+            return _error(409, f"no loop is running: the service is {service.state}")
+        return JSONResponse(service.live.as_it_runs)
+
     async def get_metrics(_: Request) -> Response:
         return PlainTextResponse(metrics_text(service), media_type="text/plain; version=0.0.4")
 
@@ -191,6 +196,7 @@ def application(service: Service) -> Starlette:
 
     routes: list[Any] = [
         Route("/status", get_status),
+        Route("/configuration", get_configuration),
         Route("/metrics", get_metrics),
         Route("/openapi.json", get_openapi),
         WebSocketRoute("/watch", watch),
@@ -236,6 +242,7 @@ def openapi() -> dict[str, Any]:
     """An OpenAPI 3.1 description of the API."""
     paths: dict[str, Any] = {
         "/status": {"get": {"summary": "State, rate, faults, newest signals."}},
+        "/configuration": {"get": {"summary": "The configuration as it runs, with what was tuned since."}},
         "/metrics": {"get": {"summary": "Prometheus text."}},
     }
     answers = {"200": {"description": "done; a command's `tick` is when it took effect"},

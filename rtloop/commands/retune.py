@@ -1,0 +1,121 @@
+"""`rtloop ctl retune`: the resonance measured in a running loop, taps made anew for it, and swapped in at a tick."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+
+from rtloop.analysis.perturbation import resonance_hz, with_resonance_shifted
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.checks import Findings, check_axes
+from rtloop.configuration.file import parse
+from rtloop.design.robust.options import ScenarioOptions
+from rtloop.design.robust.programme import Taps
+from rtloop.design.robust.shape import Judged, Subject, judged_of, shaped
+from rtloop.design.robust.subject import subject_of
+from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.toml_text import section
+from rtloop.errors import ConfigError, LoopFault
+from rtloop.service.client import Client
+from rtloop.terminal.table import console, table
+
+MEASURED_S, MEASUREMENT_S = 1.0, 120.0
+"""How long the loop is excited at most amplitude, and how long an answer may take."""
+
+
+class Asked(NamedTuple):
+    """What a retuning may do: move the position, how far the resonance may be from the model's, for how much around it
+    the taps are made, and whether it may swap them in without asking.
+    """
+
+    axis: str
+    amplitude_um: float
+    bound_percent: float
+    within_percent: float
+    yes: bool
+    spec: Path | None
+
+
+def retune(client: Client, asked: Asked, as_json: bool) -> int:
+    """Measure, redesign, show, swap; 0 where the taps in force are the new ones. Raises RtloopError."""
+    running = client.get("/configuration")
+    axis, subject = _subject(running, asked)
+    model_hz = resonance_hz(subject.plant)
+    if model_hz is None:
+        raise ConfigError("retune", [f"axis.{asked.axis}.model: no light mode; there is no resonance to measure"])
+    body = {"axis": asked.axis, "amplitude_um": asked.amplitude_um, "duration_s": MEASURED_S, "resonance_only": True}
+    mode = client.post("/response", body, MEASUREMENT_S)["resonance"]
+    if mode is None:
+        raise LoopFault("retune: no light mode stands out about the model's; the taps stay as they are")
+    percent = 100 * (mode["hz"] / model_hz[0] - 1)
+    if abs(percent) > asked.bound_percent:
+        raise LoopFault(
+            f"retune: the resonance is at {mode['hz']:.2f} Hz, {percent:+.2f} % from the model's; within "
+            f"±{asked.bound_percent:g} % is allowed, and the taps stay as they are"
+        )
+    there = replace(
+        subject,
+        plant=with_resonance_shifted(subject.plant, percent),
+        options=subject.options.model_copy(
+            update={
+                "scenarios": ScenarioOptions(resonance_percent=asked.within_percent, damping=(1.0,), gain_percent=0.0)
+            }
+        ),
+    )
+    found = shaped(there)
+    nominal = there.family().nominal
+    before, after = judged_of(there, _taps_of(axis), nominal), judged_of(there, found.taps, nominal)
+    swapped = asked.yes
+    if not as_json:
+        _show(mode, percent, before, after)
+        swapped = asked.yes or click.confirm("swap the taps in?", err=True)
+    tick = None
+    if swapped:
+        values = {"taps": found.taps.reference.tolist(), "command_taps": found.taps.command.tolist()}
+        change = {"axis": asked.axis, "section": "prefilter", "values": values}
+        tick = client.post("/tune", change, MEASUREMENT_S)["tick"]
+    if as_json:
+        said = {"resonance": mode, "percent_from_model": percent, "before": before._asdict(), "after": after._asdict()}
+        click.echo(json.dumps({**said, "settling_ms": found.settling_ms, "tick": tick}))
+    elif tick is not None:
+        click.echo(f"swapped at tick {tick}")
+    return 0 if swapped else LoopFault.exit_code
+
+
+def _subject(running: dict[str, Any], asked: Asked) -> tuple[AxisOptions, Subject]:
+    """What taps are made for, from the configuration as it runs. Raises ConfigError."""
+    text = section("", running["values"])
+    configuration = parse(text, "running", Path(running["folder"]), "the running configuration")
+    axis = next((one for one in configuration.axes if one.name == asked.axis), None)
+    if axis is None:
+        names = ", ".join(one.name for one in configuration.axes)
+        raise ConfigError("retune", [f"axis {asked.axis!r}: there are {names}"])
+    spec = asked.spec or (configuration.folder / axis.specification if axis.specification else None)
+    if spec is None:
+        raise ConfigError("retune", [f"axis.{axis.name}.specification: missing; --spec names one"])
+    check = next(one for one in check_axes(configuration, Findings()) if one.name == axis.name)
+    try:
+        return axis, subject_of(axis, check, load_specification(spec).design)
+    except ValueError as error:
+        raise ConfigError("retune", [f"axis.{axis.name}: {error}"]) from None
+
+
+def _taps_of(axis: AxisOptions) -> Taps:
+    """Those in force."""
+    rows = axis.prefilter.taps or (1.0,), axis.prefilter.command_taps or (0.0,)
+    length = max(map(len, rows))
+    reference, command = (np.pad(np.asarray(row, float), (0, length - len(row))) for row in rows)
+    return Taps(reference, command, 0.0)
+
+
+def _show(mode: dict[str, Any], percent: float, before: Judged, after: Judged) -> None:
+    click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {percent:+.2f} % from the model's")
+    shown = table("of a step there", "settling / ms", "overshoot / %", "largest v per unit")
+    for name, one in (("with the taps in force", before), ("with the new ones", after)):
+        shown.add_row(name, f"{one.settling_ms:.3f}", f"{100 * one.overshoot:.3f}", f"{one.highest_command:.4f}")
+    console().print(shown)

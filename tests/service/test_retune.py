@@ -1,0 +1,128 @@
+"""Taps made anew for a resonance that was measured: what is shown, what is sent, and when nothing is.
+
+The measurement itself is in test_response.py; here the service is one that answers what it is told to.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from rtloop.commands.retune import Asked, retune
+from rtloop.errors import LoopFault
+
+HZ, DAMPING, PERIOD_S = 600.0, 0.02, 1e-4
+OMEGA = 2 * np.pi * HZ
+TEXT = f"""
+[loop]
+rate_hz = 10000
+[driver]
+kind = "sim"
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[[axis]]
+name = "x"
+specification = "spec.toml"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.controller]
+form = "transfer_function"
+numerator = [60.0]
+denominator = [1.0, 0.0]
+method = "tustin"
+[axis.model]
+form = "factors"
+gain = {OMEGA**2!r}
+denominator = [[1.0, {2 * DAMPING * OMEGA!r}, {OMEGA**2!r}]]
+"""
+SPECIFICATION = """
+[specification]
+overshoot_percent = 1.0
+[specification.command]
+reference_um = 10.0
+command_um = 43.0
+[shape]
+taps = 32
+points_per_tick = 2
+"""
+
+
+class Service:
+    """Runs TEXT, and measured `hz`."""
+
+    def __init__(self, folder: Path, hz: float | None) -> None:
+        (folder / "spec.toml").write_text(SPECIFICATION)
+        self._folder, self._hz, self.tuned = folder, hz, dict[str, Any]()
+
+    def get(self, resource: str) -> Any:
+        assert resource == "/configuration"
+        return {"folder": str(self._folder), "values": tomllib.loads(TEXT)}
+
+    def post(self, resource: str, body: dict[str, Any], _: float) -> Any:
+        if resource == "/response":
+            assert body["resonance_only"]
+            return {"resonance": None if self._hz is None else {"hz": self._hz, "hz_std": 0.1}}
+        assert (resource, body["axis"], body["section"]) == ("/tune", "x", "prefilter")
+        self.tuned = body["values"]
+        return {"tick": 1234}
+
+
+def asked(**changes: Any) -> Asked:
+    plain: dict[str, Any] = {"axis": "x", "amplitude_um": 0.5, "bound_percent": 15.0, "within_percent": 0.0}
+    return Asked(**plain | {"yes": True, "spec": None} | changes)
+
+
+def overshoot(hz: float, taps: dict[str, list[float]]) -> float:
+    """Of a step of the loop with another resonance, by scipy, a tick at a time."""
+    omega = 2 * np.pi * hz
+    plant = signal.tf2ss([omega**2], [1.0, 2 * DAMPING * omega, omega**2])
+    a, b, c, _, _ = signal.cont2discrete(plant, PERIOD_S, "zoh")
+    step = np.ones(400)
+    wanted, added = (signal.lfilter(taps[name], 1.0, step) for name in ("taps", "command_taps"))
+    x, total, before, position = np.zeros((2, 1)), 0.0, 0.0, np.zeros(step.size)
+    for k in range(step.size):
+        position[k] = (c @ x).item()
+        error = wanted[k] - position[k]
+        total, before = total + 30.0 * PERIOD_S * (error + before), error
+        x = a @ x + b * (total + added[k])
+    return float(position.max() - 1)
+
+
+def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    service = Service(tmp_path, 1.06 * HZ)
+    assert retune(service, asked(), as_json=False) == 0  # type: ignore[arg-type]
+    said = capsys.readouterr().out
+    assert "+6.00 % from the model's" in said
+    assert "swapped at tick 1234" in said
+    assert overshoot(1.06 * HZ, service.tuned) < 0.011
+    assert overshoot(HZ, service.tuned) > 0.02
+
+
+def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    service = Service(tmp_path, 0.95 * HZ)
+    assert retune(service, asked(yes=False), as_json=True) == 1  # type: ignore[arg-type]
+    said = json.loads(capsys.readouterr().out)
+    assert said["percent_from_model"] == pytest.approx(-5.0)
+    assert said["tick"] is None
+    assert said["after"]["overshoot"] <= 0.011
+    assert said["after"]["settling_ms"] < 3.2 < said["before"]["settling_ms"]
+    assert not service.tuned
+
+
+@pytest.mark.parametrize(
+    ("hz", "said"), [(None, "no light mode stands out"), (1.2 * HZ, r"720.00 Hz, \+20.00 % .*within ±15 % is allowed")]
+)
+def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path, hz: float | None, said: str):
+    service = Service(tmp_path, hz)
+    with pytest.raises(LoopFault, match=said):
+        retune(service, asked(), as_json=False)  # type: ignore[arg-type]
+    assert not service.tuned
