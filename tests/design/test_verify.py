@@ -23,9 +23,10 @@ from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification import text
 from rtloop.design.verification.judgement import Limit, described, held_up_to, specified
+from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
 from rtloop.design.verification.text import answer
-from rtloop.design.verification.verify import Robustness, as_dict
+from rtloop.design.verification.verify import Robustness
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 
