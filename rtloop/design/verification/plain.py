@@ -39,7 +39,7 @@ def as_dict(found: Verification) -> dict[str, Any]:
 
 def _scenarios(found: Scenarios) -> dict[str, Any]:
     rows = [
-        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": row.met(worst.value)}
+        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": found.met(row, worst)}
         for row, worst in found.rows
     ]
     return {"count": found.count, "rows": rows}
