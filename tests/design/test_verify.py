@@ -168,6 +168,7 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     found = judged(
         tmp_path, f"[specification]\novershoot_percent = 1.48\nmodulus_margin = 0.603\n{scenarios.format(1.0)}"
     )
+    assert found.scenarios is not None
     assert [row.name for row, _ in found.scenarios.missed] == ["modulus_margin"]  # taps mend what a step does
     assert not found.missed
     assert not found.meets
