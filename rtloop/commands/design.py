@@ -23,9 +23,10 @@ from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.verification.bench import Bench, Stand
 from rtloop.design.verification.page import page
+from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import Plants
 from rtloop.design.verification.simulated import simulate
-from rtloop.design.verification.verify import Subject, Verification, as_dict, verify
+from rtloop.design.verification.verify import Subject, Verification, verify
 from rtloop.errors import ConfigError, NoDesign, OutputError, RtloopError
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import measured_delay, spent_margin

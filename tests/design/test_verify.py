@@ -23,9 +23,10 @@ from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification import text
 from rtloop.design.verification.judgement import Limit, described, held_up_to, specified
+from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
 from rtloop.design.verification.text import answer
-from rtloop.design.verification.verify import Robustness, as_dict
+from rtloop.design.verification.verify import Robustness
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 
@@ -164,6 +165,13 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     row, one = worst["overshoot_percent"]
     assert one.value >= (row.running or math.nan)
     assert "resonance +1 %" in worst["resonance_decay_ms"][1].plant
+    found = judged(
+        tmp_path, f"[specification]\novershoot_percent = 1.48\nmodulus_margin = 0.603\n{scenarios.format(1.0)}"
+    )
+    assert found.scenarios is not None
+    assert [row.name for row, _ in found.scenarios.missed] == ["modulus_margin"]  # taps mend what a step does
+    assert not found.missed
+    assert not found.meets
     found = judged(tmp_path, MODEST + scenarios.format(3.0))
     assert found.scenarios is not None
     assert not found.missed

@@ -89,7 +89,7 @@ def scenarios(found: Verification) -> list[tuple[str, ...]]:
         return []
     rows = [(f"worst of {found.scenarios.count} scenarios, linear", "required", "as it runs", "", "on the plant with")]
     return rows + [
-        (row.label, required(row), _with_unit(row, worst.value), verdict(row.met(worst.value)), worst.plant)
+        (row.label, required(row), _with_unit(row, worst.value), verdict(found.scenarios.met(row, worst)), worst.plant)
         for row, worst in found.scenarios.rows
     ]
 

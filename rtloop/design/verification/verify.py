@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop
 from rtloop.analysis.comparison import compare
@@ -37,6 +37,8 @@ from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import SpentMargin
 
+OF_STEPS = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_command")
+"""Quantities that depend on what the reference passes; the others are the feedback's alone."""
 DELAYS = (0, 1, 2)
 """Samples of delay for which the tolerated shift of the resonance is always shown."""
 
@@ -92,10 +94,14 @@ class Scenarios:
     count: int
     rows: tuple[tuple[Row, Worst], ...]
 
+    def met(self, row: Row, worst: Worst) -> bool | None:
+        """The verdict: of a step's figures, which taps that fit the plant would mend, only that they exist."""
+        return None if row.name in OF_STEPS and not math.isnan(worst.value) else row.met(worst.value)
+
     @property
     def missed(self) -> list[tuple[Row, Worst]]:
         """The required ones that some plant misses."""
-        return [(row, worst) for row, worst in self.rows if row.met(worst.value) is False]
+        return [(row, worst) for row, worst in self.rows if self.met(row, worst) is False]
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,60 +237,3 @@ def _robustness(
     more = delay_ticks_tolerated(lambda ticks: subject.running(sensed, ticks)) - delay_ticks
     judged = runs(sensed) if on_paper is None else on_paper(plant)
     return Robustness(ranges, shifts, delay_margin_us(judged), more)
-
-
-def as_dict(found: Verification) -> dict[str, Any]:
-    """For JSON; null for what is not defined or has no limit."""
-    robust = found.robustness
-    return {
-        "meets": found.meets,
-        "stable": {
-            "continuous": None if found.continuous is None else found.continuous.is_stable,
-            "running": found.running.is_stable,
-        },
-        "delay_ticks": found.delay_ticks,
-        "rate_hz": 1 / found.running.period_s if found.running.period_s else None,
-        "rows": [_row(row) for row in found.rows],
-        "resonance_shift_percent": {name: _percent(value) for name, value in robust.shifts.items()},
-        "robustness_percent": {
-            name: {which: value and _percent(value) for which, value in ranges.items()}
-            for name, ranges in robust.ranges.items()
-        },
-        "delay_margin_us": _number(robust.delay_us),
-        "more_delay_ticks": robust.delay_ticks,
-        "together": None if found.together is None else found.together.as_dict(),
-        "scenarios": None if found.scenarios is None else _scenarios(found.scenarios),
-        "host_delay": None if found.host is None else asdict(found.host),
-        "simulated": None if found.simulated is None else found.simulated.as_dict(),
-        "warnings": list(found.warnings),
-    }
-
-
-def _scenarios(found: Scenarios) -> dict[str, Any]:
-    rows = [
-        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": row.met(worst.value)}
-        for row, worst in found.rows
-    ]
-    return {"count": found.count, "rows": rows}
-
-
-def _row(row: Row) -> dict[str, Any]:
-    limit = row.limit
-    return {
-        "name": row.name,
-        "unit": row.unit,
-        "required": None if limit is None else {"value": _number(limit.value), "at_most": limit.at_most},
-        "continuous": _number(row.continuous),
-        "continuous_met": row.met(row.continuous),
-        "running": _number(row.running),
-        "running_met": row.met(row.running),
-        "claim": row.claim or None,
-    }
-
-
-def _percent(found: Range) -> list[float | None]:
-    return [None if found.down is None else -found.down, found.up]
-
-
-def _number(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
