@@ -94,9 +94,7 @@ def walls_of(design: DesignOptions) -> Walls:
     )  # fmt: skip
 
 
-def _searched(
-    objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress
-) -> Minimum:
+def _searched(objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress) -> Minimum:
     """The best of `restarts` short searches of which some go on."""
     options, found = design.robust, list[Minimum]()
     for number in range(options.restarts):

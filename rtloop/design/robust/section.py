@@ -90,7 +90,9 @@ def _with(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> s
     raw = tomllib.loads(text)
     names = [one.get("name") for one in raw.get("axis", [])]
     if axis not in names:
-        raise ValueError(f"axis: {axis!r} is not in the configuration, which has {', '.join(map(str, names)) or 'none'}")
+        raise ValueError(
+            f"axis: {axis!r} is not in the configuration, which has {', '.join(map(str, names)) or 'none'}"
+        )
     raw["axis"] = [{**one, **parts} if one.get("name") == axis else one for one in raw["axis"]]
     return edited(_without(text, comments[0]), raw, comments)
 

@@ -90,7 +90,9 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
             )
         taps = programme.quietest(settling, subject.overshoot)
         if taps is None:
-            raise NoDesign(f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help")
+            raise NoDesign(
+                f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help"
+            )
         judged = {one: judged_of(subject, taps, one) for one in dict.fromkeys([*scenarios, *family.swept(PROVED)])}
         worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(2)]
         new = [one for one in dict.fromkeys(worst) if one not in scenarios]
