@@ -204,7 +204,7 @@ def _load_law(loop, first, another):
 def _take_axis(law, a, staged):
     """Coefficients of one axis, from an address."""
     before, after = coefficients_of(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
-    refilled = before.tap_count == 0 and after.tap_count != 0 or before.section_count != after.section_count
+    refilled = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
     if not refilled:
         for i in range(after.section_count):
             for j in range(after.sections.shape[1]):

@@ -11,7 +11,7 @@ from rtloop.design.robust.shape import Shaped, Subject
 
 def print_robust(found: Robust) -> None:
     """The worst of everything that is certified, on stderr: stdout is for the section itself."""
-    click.echo(f"searched over {found.searched} scenarios; worst of {found.certificate.count} plants:", err=True)
+    click.echo(f"searched over {found.searched} scenarios; worst of {found.certificate.plants} plants:", err=True)
     for name, value, where in kept(found.certificate):
         click.echo(f"  {name} {value:.4g}   ({where})", err=True)
 

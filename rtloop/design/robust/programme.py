@@ -36,8 +36,8 @@ INFEASIBLE = 2
 
 
 class Bounds(NamedTuple):
-    """x ≥ −undershoot after a unit step; steps by up to `step_um` between levels of `lowest_um` … step_um, with v within
-    `low_um` … `high_um`.
+    """x ≥ −undershoot after a unit step; v within `low_um` … `high_um` for steps by up to `step_um` between levels of
+    `lowest_um` … step_um.
     """
 
     undershoot: float
