@@ -118,7 +118,7 @@ def _robust_as_dict(found: Robust, out: Path | None) -> dict[str, Any]:
         "gain": controller.gain,
         "zeros": [[root.real, root.imag] for root in controller.zeros],
         "poles": [[root.real, root.imag] for root in controller.poles],
-        "plants": proof.count,
+        "plants": proof.plants,
         "worst": {
             name: {"value": worst.value, "scenario": str(worst.scenario)}
             for name, worst in zip(proof._fields[1:], proof[1:], strict=True)

@@ -11,7 +11,7 @@ from rtloop.design.robust.shape import Shaped, Subject
 
 def print_robust(found: Robust) -> None:
     """The worst of everything that is certified, on stderr: stdout is for the section itself."""
-    click.echo(f"searched over {found.searched} scenarios; worst of {found.certificate.count} plants:", err=True)
+    click.echo(f"searched over {found.searched} scenarios; worst of {found.certificate.plants} plants:", err=True)
     for name, value, where in kept(found.certificate):
         click.echo(f"  {name} {value:.4g}   ({where})", err=True)
 
@@ -29,6 +29,8 @@ def print_shaped(found: Shaped, subject: Subject) -> None:
         f"{subject.bounds.low_um:.4g} … {subject.bounds.high_um:.4g} µm",
     ):
         click.echo(line, err=True)
+    if proof.settling_ms > found.settling_ms + 1e-6 or proof.overshoot > subject.overshoot:
+        click.echo("warning: that is more than asked for, on plants between the scenarios", err=True)
     if found.curve:
         points = ", ".join(f"{settling_ms:.3g} ms {100 * least:.2g} %" for settling_ms, least in found.curve)
         click.echo(f"least overshoot by settling time: {points}", err=True)

@@ -138,9 +138,9 @@ def test_evolution_finds_the_minimum_of_a_bent_valley_and_its_seed_decides() -> 
     assert np.array_equal(found[0].point, found[1].point)
 
 
-def test_what_is_written_is_the_controller_that_was_searched(rng=np.random.default_rng(5)) -> None:
+def test_what_is_written_is_the_controller_that_was_searched() -> None:
     """C(z) of the file, by "matched", at every frequency; its integrator stays one."""
-    z = np.exp(1j * np.linspace(0.01, 3.1, 200))
+    rng, z = np.random.default_rng(5), np.exp(1j * np.linspace(0.01, 3.1, 200))
     for _ in range(50):
         point = a_point(rng)
         numerator, denominator = written(transfer_of(point, PERIOD_S))
@@ -152,12 +152,12 @@ def test_what_is_written_is_the_controller_that_was_searched(rng=np.random.defau
         np.testing.assert_allclose(at((by_states[0][0], by_states[1]), z), at((numerator, denominator), z), rtol=1e-5)
 
 
-def test_what_is_searched_is_the_worst_of_the_closed_loops(rng=np.random.default_rng(8)) -> None:
+def test_what_is_searched_is_the_worst_of_the_closed_loops() -> None:
     """Poles from polynomials of L, |S| from their ratio: none of them stacked."""
     family = Family(STAGE, 1, RANGE, PERIOD_S)
     scenarios = [family.nominal, Scenario((8.0,), 0.5, 5.0, 1), Scenario((-8.0,), 2.0, -5.0, 3)]
     objective = Objective(family, scenarios, Walls(2.0, 3.0, 0.1, 5.0), 2)
-    judged = 0
+    rng, judged = np.random.default_rng(8), 0
     for _ in range(20):
         point = a_point(rng)
         point[:2] = rng.uniform(-8.0, -4.0), -0.5
@@ -195,7 +195,7 @@ def found(short_proofs):
 
 
 def test_a_controller_damps_the_resonance_and_keeps_its_walls_wherever_the_plant_lies(found) -> None:
-    """Plants of one's own between the scenarios: all stable, max |S| ≤ 2, the disturbance held, the resonance damped."""
+    """Plants between the scenarios: all stable, max |S| ≤ 2, the disturbance held, the resonance damped."""
     controller, random = written(found.controller), np.random.default_rng(1)
     low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
     for _ in range(20):
@@ -216,7 +216,7 @@ def test_a_proof_is_what_its_worst_plants_do(found) -> None:
 
 
 def test_a_proof_names_the_plant_that_is_worst() -> None:
-    """An integrator alone on a light mode: unstable first where the mode is lightest and lowest, and the gain highest."""
+    """An integrator alone on a light mode: nearest to instability where the mode is lightest, the gain highest."""
     family = Family(STAGE, 0, RANGE, PERIOD_S)
     controller = discretise(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
     proof = certified(controller, family, Walls(2.0, 3.0, 0.1, 5.0))

@@ -29,9 +29,9 @@ class Worst(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """The worst of `count` plants: stable or not, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
+    """The worst of `plants` plants: stable or not, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
 
-    count: int
+    plants: int
     radius: Worst
     decay_ms: Worst
     sensitivity: Worst

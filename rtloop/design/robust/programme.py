@@ -2,7 +2,7 @@
 
     least ε :   x ≤ 1 + ε always,   |x − 1| ≤ band from the settling time on,   x ≥ −undershoot,
                 low ≤ v ≤ high,   x → 1 for ever                            in every scenario, between ticks too
-    then, at the ε that is allowed:   least Σ |v[k] − v[k−1]| on the model
+    then, at the ε that is allowed:   least Σ |v[k] − v[k−1]| on the model, and modest taps
 
 A programme is solved on some of its rows; those that the answer breaks join them, until it breaks none.
 """
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linprog
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import csr_array
 
 from rtloop.design.robust.responses import Responses, columns
 from rtloop.hil.modal import Real
@@ -24,7 +24,10 @@ BAND = 0.05
 """Around the final value, for settling."""
 TOLERANCE = 1e-7
 """By which a row may be missed: 4 pm of 40 µm."""
-MOST_NEW = 400
+EVERY, MOST_NEW = 7, 400
+"""Ticks of which a programme begins with one, while taps last; how many rows join it at once."""
+MODESTY = 0.01
+"""Weight of the taps' sizes beside the variation of v: what one row does the other can undo, without end."""
 INSIDE = 0.99
 """Share of what is allowed that a programme uses, for what lies between its points and its scenarios."""
 LARGEST_TAP = 20.0
@@ -33,8 +36,8 @@ INFEASIBLE = 2
 
 
 class Bounds(NamedTuple):
-    """x ≥ −undershoot after a unit step; steps by up to `step_um` between levels of `lowest_um` … step_um, with v within
-    `low_um` … `high_um`.
+    """x ≥ −undershoot after a unit step; v within `low_um` … `high_um` for steps by up to `step_um` between levels of
+    `lowest_um` … step_um.
     """
 
     undershoot: float
@@ -72,8 +75,10 @@ class Programme:
         self.low, self.high = bounds.command(static)
         self.undershoot = bounds.undershoot
         self.active = np.zeros(self.rows.shape[0], bool)
-        self.active[: self.time.size : 7 * points] = True
-        self.active[self.time.size :: 7] = True
+        first = np.concatenate([self.time, np.tile(np.arange(self.ticks), len(found))]) <= taps
+        self.active[: self.time.size : EVERY * points] = True
+        self.active[self.time.size :: EVERY] = True
+        self.active &= first
         self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
 
     def feasible(self, settling: float, overshoot: float) -> bool:
@@ -87,9 +92,10 @@ class Programme:
 
     def quietest(self, settling: float, overshoot: float) -> Taps | None:
         """The taps of least variation of v on the model with ε ≤ `overshoot`; None where there are none."""
-        count = min(self.ticks, 2 * self.taps + 40)
-        cost = np.concatenate([np.zeros(2 * self.taps + 1), np.ones(count)])
-        solved = self._solved(settling, cost, overshoot)
+        rows = self._judged_rows()
+        weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, MODESTY)
+        cost = np.concatenate([np.zeros(2 * self.taps + 1), weights])
+        solved = self._solved(settling, cost, overshoot, rows)
         return None if solved is None else self._taps(solved)
 
     def _taps(self, solved: Real) -> Taps:
@@ -98,8 +104,8 @@ class Programme:
     def _rows(self, steps: Real, points: int) -> Real:
         return np.hstack([columns(one, self.taps, points) for one in steps])
 
-    def _solved(self, settling: float, cost: Real, overshoot: float | None) -> Real | None:
-        """Variables: taps, ε, and as many variations of v as `cost` has more."""
+    def _solved(self, settling: float, cost: Real, overshoot: float | None, sized: Real | None = None) -> Real | None:
+        """Variables: taps, ε, and the absolute value of each row of `sized` times the taps."""
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         settled = self.time >= settling - 1e-9
         low = np.concatenate([np.where(settled, 1 - INSIDE * BAND, -self.undershoot), self.low])
@@ -108,18 +114,18 @@ class Programme:
         rows = self.rows
         limits: list[tuple[float, float | None]] = [(-LARGEST_TAP, LARGEST_TAP)] * (count - 1)
         limits += [(0.0, INSIDE * (BAND if overshoot is None else overshoot)), *[(0.0, None)] * extra]
-        varied, varied_high = self._variation(extra)
         static = csr_array(np.concatenate([self.static, np.zeros(1 + extra)])[None])
         while True:
             chosen = np.flatnonzero(self.active)
-            some = np.hstack([rows[chosen], -slack[chosen, None]])
-            lower = np.hstack([-rows[chosen], np.zeros((chosen.size, 1))])
-            above = csr_array(np.vstack([some, lower]))
-            if extra:
-                above = hstack([above, csr_array((above.shape[0], extra))])
-                above = csr_array(np.vstack([above.toarray(), varied]))
-            limit = np.concatenate([high[chosen], -low[chosen], varied_high])
-            found = _optimum(cost, above, limit, static, limits)
+            above = [
+                np.hstack([rows[chosen], -slack[chosen, None]]),
+                np.hstack([-rows[chosen], np.zeros((chosen.size, 1))]),
+            ]
+            limit = np.concatenate([high[chosen], -low[chosen], np.zeros(2 * extra)])
+            matrix = np.vstack([np.hstack([part, np.zeros((chosen.size, extra))]) for part in above])
+            if sized is not None:
+                matrix = np.vstack([matrix, *_sizes(sized)])
+            found = _optimum(cost, csr_array(matrix), limit, static, limits)
             if found is None:
                 return None
             values = rows @ found[: count - 1]
@@ -130,14 +136,16 @@ class Programme:
                 return found
             self.active[_peaks(broken, new)] = True
 
-    def _variation(self, count: int) -> tuple[Real, Real]:
-        """Rows that say v[k] − v[k−1] ≤ s[k] and ≥ −s[k] on the model, for `count` ticks."""
-        v = self.command[:count]
-        changes = np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))) if count else np.zeros((0, 2 * self.taps))
-        between, sizes = np.zeros((count, 1)), -np.eye(count)
-        return np.vstack([np.hstack([changes, between, sizes]), np.hstack([-changes, between, sizes])]), np.zeros(
-            2 * count
-        )
+    def _judged_rows(self) -> Real:
+        """What should be small, times the taps: the changes of v on the model, and the taps themselves."""
+        v = self.command[: min(self.ticks, 2 * self.taps + 40)]
+        return np.vstack([np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))), np.eye(2 * self.taps)])
+
+
+def _sizes(rows: Real) -> tuple[Real, Real]:
+    """Rows that say −s ≤ rows·taps ≤ s, of variables taps, ε, s."""
+    between, sizes = np.zeros((rows.shape[0], 1)), -np.eye(rows.shape[0])
+    return np.hstack([rows, between, sizes]), np.hstack([-rows, between, sizes])
 
 
 def _optimum(

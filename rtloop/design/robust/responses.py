@@ -2,7 +2,7 @@
 
     v[k] = w[k] + C(z)·(q[k] − x[k])          q: the filtered reference, w: straight into the command
 
-The plant's input is held over a tick, so that x between ticks follows exactly from a discretisation at a fraction of it.
+The plant's input is held over a tick: x between ticks follows exactly from a discretisation at a fraction of it.
 """
 
 from __future__ import annotations

@@ -50,9 +50,11 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
     walls = walls_of(design)
     scenarios = family.corners()
     random = np.random.default_rng(options.seed)
-    for number in range(ROUNDS):
+    best, rounds = None, 0
+    while True:
+        rounds += 1
         objective = Objective(family, scenarios, walls, options.biquads)
-        if number == 0:
+        if best is None:
             best = _searched(objective, design, random, progress)
         else:
             best = evolve(objective, best.point, 0.05, options.generations, random, POPULATION)
@@ -66,9 +68,9 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
         controller = transfer_of(point, period_s)
         proof = certified(discretise(controller, period_s, "matched"), family, walls, options.seed)
         missed = proof.missed(walls, options.decay_ms)
-        progress(f"proof over {proof.count} plants: " + ("; ".join(missed) or "everything is kept"))
+        progress(f"proof over {proof.plants} plants: " + ("; ".join(missed) or "everything is kept"))
         new = [one for one in proof.worst() if one not in scenarios]
-        if not missed or not new:
+        if not missed or not new or rounds == ROUNDS:
             break
         scenarios = [*scenarios, *new]
     if missed:

@@ -81,7 +81,7 @@ def _provenance(found: Robust, design: DesignOptions, source: str, text: str) ->
     return [
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
         f"plant: {formula(design.plant.transfer())}",
-        f"worst of {found.certificate.count} plants:",
+        f"worst of {found.certificate.plants} plants:",
         *(f"  {name} {value:.4g} ({where})" for name, value, where in kept(found.certificate)),
     ]
 

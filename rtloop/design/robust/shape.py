@@ -20,7 +20,7 @@ from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
 PLACES, PROVED, ROUNDS = 7, 41, 6
-"""Of each resonance in a programme, and in the proof of its answer; how often the worst of a proof joins a programme."""
+"""Of each resonance in a programme, and in the proof of its answer; how often the worst of a proof may join it."""
 PROOF_POINTS = 10
 LONGEST = 0.9
 """Settling beyond this part of the taps' length is not looked for."""
@@ -45,7 +45,7 @@ class Subject:
 
 
 class Judged(NamedTuple):
-    """Of a step: settling to ±5 % in ms, overshoot, undershoot, least and largest v, per unit; and where (the worst)."""
+    """Of a step: settling to ±5 % in ms, overshoot, undershoot, least and largest v, per unit."""
 
     settling_ms: float
     overshoot: float
@@ -73,14 +73,15 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
     """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none."""
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.swept(PLACES)]))
-    fastest = 0.0
-    for _ in range(ROUNDS):
+    fastest, rounds = 0.0, 0
+    while True:
+        rounds += 1
         programme = programme_of(subject, scenarios)
         fastest = fastest_settling(programme, subject.overshoot, fastest)
         if fastest is None:
             raise NoDesign(_no_taps(subject, programme))
         progress(
-            f"fastest of {len(scenarios)} scenarios: {fastest * tick_ms:.4g} ms, overshoot {100 * subject.overshoot:g} %"
+            f"{len(scenarios)} scenarios: fastest {fastest * tick_ms:.4g} ms, overshoot {100 * subject.overshoot:g} %"
         )
         settling = fastest if options.settling_ms is None else options.settling_ms / tick_ms
         if settling < fastest - 1e-9:
@@ -97,7 +98,8 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
         worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(2)]
         new = [one for one in dict.fromkeys(worst) if one not in scenarios]
         kept = _worst(judged.values())
-        if not new or (kept.settling_ms <= settling * tick_ms + 1e-9 and kept.overshoot <= subject.overshoot):
+        good = kept.settling_ms <= settling * tick_ms + 1e-9 and kept.overshoot <= subject.overshoot
+        if good or not new or rounds == ROUNDS:
             break
         scenarios += new
     time, position, command = _steps(subject, taps, family.nominal)
@@ -172,14 +174,13 @@ def _steps(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real
     family, count = subject.family(), taps.reference.size
     ticks = horizon(subject.controller, family, [scenario], count)
     found = _answered(subject, family, scenario, PROOF_POINTS, ticks)
-    q, w = np.cumsum(taps.reference), np.cumsum(taps.command)
-    changes = np.diff(q, prepend=0.0), np.diff(w, prepend=0.0)
-    position, command = np.zeros(ticks * PROOF_POINTS), np.zeros(ticks)
-    for part, change in enumerate(changes):
-        spread = np.zeros((change.size - 1) * PROOF_POINTS + 1)
-        spread[::PROOF_POINTS] = change
-        position += np.convolve(spread, found.position[part])[: position.size]
-        command += np.convolve(change, found.command[part])[: command.size]
+    position: Real = np.zeros(ticks * PROOF_POINTS)
+    command: Real = np.zeros(ticks)
+    for part, row in enumerate((taps.reference, taps.command)):
+        spread = np.zeros((count - 1) * PROOF_POINTS + 1)
+        spread[::PROOF_POINTS] = row
+        position = position + np.convolve(spread, found.position[part])[: position.size].real
+        command = command + np.convolve(row, found.command[part])[: command.size].real
     time = np.arange(1, position.size + 1) / PROOF_POINTS * subject.controller.period_s
     return time, position, command
 

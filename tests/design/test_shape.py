@@ -1,0 +1,243 @@
+"""Taps by linear programming, against steps that scipy simulates by itself, between ticks too."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy import signal
+
+from rtloop.cli import main
+from rtloop.design.robust import shape as shape_module
+from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
+from rtloop.design.robust.programme import Bounds
+from rtloop.design.robust.responses import responses
+from rtloop.design.robust.shape import Subject, fastest_settling, programme_of, shaped
+from rtloop.errors import NoDesign
+from rtloop.linear.discretise import discretise
+from rtloop.linear.transfer import Transfer
+
+PERIOD_S, FINE = 1e-4, 10
+OMEGA, RATIO = 2 * np.pi * 600.0, 0.15
+STAGE = Transfer.from_factors(OMEGA**2, [], [[1.0, 2 * RATIO * OMEGA, OMEGA**2]])
+CONTROLLER = discretise(Transfer.from_zpk([], [0.0], 500.0), PERIOD_S, "matched")
+BOUNDS = Bounds(0.05, 40.0, -40.0, -46.0, 46.0)
+OPTIONS = ShapeOptions(
+    taps=20, points_per_tick=4, scenarios=ScenarioOptions(resonance_percent=4.0, damping=(1.0,), gain_percent=0.0)
+)  # fmt: skip
+SUBJECT = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS)
+
+
+def simulated(taps, command_taps, shift_percent: float, delay_ticks: int, ticks: int = 300):
+    """x at FINE points a tick and v at ticks after a unit step: the loop's equations, one point after the other."""
+    omega = OMEGA * (1 + shift_percent / 100)
+    plant = signal.tf2ss([omega**2], [1.0, 2 * RATIO * omega, omega**2])
+    a, b, c, _, _ = signal.cont2discrete(plant, PERIOD_S / FINE, method="zoh")
+    z, p, k = CONTROLLER.zeros, CONTROLLER.poles, CONTROLLER.gain
+    above, below = k * np.real(np.poly(z)), np.real(np.poly(p))
+    above = np.concatenate([np.zeros(below.size - above.size), above])
+    q = np.concatenate([np.cumsum(taps), np.full(ticks, np.sum(taps))])
+    w = np.concatenate([np.cumsum(command_taps), np.full(ticks, np.sum(command_taps))])
+    state, errors, answers = np.zeros(2), np.zeros(below.size), np.zeros(below.size - 1)
+    position, command = [], []
+    for tick in range(ticks):
+        x = float((c @ state)[0])
+        errors = np.concatenate([[q[tick] - x], errors[:-1]])
+        answer = float(above @ errors - below[1:] @ answers)
+        answers = np.concatenate([[answer], answers[:-1]])
+        command.append(answer + w[tick])
+        held = command[tick - delay_ticks] if tick >= delay_ticks else 0.0
+        for _ in range(FINE):
+            state = a @ state + b[:, 0] * held
+            position.append(float((c @ state)[0]))
+    return np.array(position), np.array(command)
+
+
+@pytest.mark.parametrize("delay_ticks", [0, 1, 2])
+def test_responses_are_those_of_the_loop_between_ticks_too(delay_ticks) -> None:
+    found = responses(CONTROLLER, STAGE, delay_ticks, FINE, 150)
+    for part, rows in enumerate([([1.0], [0.0]), ([0.0], [1.0])]):
+        x, v = simulated(*rows, 0.0, delay_ticks, 150)
+        np.testing.assert_allclose(found.position[part], x, atol=1e-9)
+        np.testing.assert_allclose(found.command[part], v, atol=1e-9)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_places():
+    """Of each resonance: the tests' own simulation looks between them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shape_module, "PLACES", 3)
+        patch.setattr(shape_module, "PROVED", 9)
+        patch.setattr(shape_module, "CURVE", (0.95, 1.1, 6))
+        yield
+
+
+@pytest.fixture(scope="module")
+def found(few_places):
+    return shaped(SUBJECT)
+
+
+def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is(found) -> None:
+    time_ms = np.arange(1, 300 * FINE + 1) / FINE * PERIOD_S * 1e3
+    for shift in np.linspace(-4, 4, 9):
+        x, v = simulated(found.taps.reference, found.taps.command, shift, 1)
+        assert np.all(np.abs(x[time_ms >= found.settling_ms] - 1) <= 0.05)
+        assert x.max() <= 1 + found.proof.overshoot + 1e-6
+        assert x.min() >= -0.05
+        assert v.min() >= 1 - 46 / 40 - 1e-3
+        assert v.max() <= 46 / 40 + 1e-3
+        assert x[-1] == pytest.approx(1.0, abs=1e-4)
+    assert found.proof.overshoot <= 0.0042
+    assert found.taps.reference.sum() == pytest.approx(1.0, abs=1e-9)
+    assert found.fastest_ms == found.settling_ms < 2.0
+    alone, _ = simulated([1.0], [0.0], 0.0, 1)
+    outside = time_ms[np.abs(alone - 1) > 0.05].max()
+    assert outside > 2 * found.settling_ms  # what the taps are for
+
+
+def test_nothing_faster_exists_and_less_overshoot_costs_time(found) -> None:
+    """A point below the fastest there are no taps; the least overshoot never rises with the settling time."""
+    family = SUBJECT.family()
+    programme = programme_of(SUBJECT, [family.nominal, *family.swept(3)])
+    fastest = fastest_settling(programme, 0.004)
+    assert fastest * 0.1 <= found.fastest_ms + 1e-9
+    assert not programme.feasible(fastest - 0.25, 0.004)
+    least = [programme.least_overshoot(fastest + more).overshoot for more in (0.0, 1.0, 3.0)]
+    assert least[0] >= least[1] - 1e-9 >= least[2] - 2e-9
+    assert least[0] <= 0.004
+
+
+def test_more_time_makes_a_quieter_command(found) -> None:
+    later = OPTIONS.model_copy(update={"settling_ms": found.fastest_ms + 0.3})
+    calm = shaped(Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, later))
+    assert calm.settling_ms == pytest.approx(found.fastest_ms + 0.3)
+    assert calm.variation < found.variation
+    x, _ = simulated(calm.taps.reference, calm.taps.command, 4.0, 1)
+    assert np.all(np.abs(x[round(calm.settling_ms * FINE * 10) :] - 1) <= 0.05)
+
+
+def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
+    asked = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS.model_copy(update={"settling_ms": 0.4}))
+    with pytest.raises(
+        NoDesign, match=r"settling_ms: 0.4 ms cannot be .* the fastest is .*no limit on v .* relaxed by"
+    ):
+        shaped(asked)
+    wide = OPTIONS.scenarios.model_copy(update={"gain_percent": 4.0})
+    with pytest.raises(NoDesign, match=r"overshoot_percent: 0.0001 % cannot be kept .* the least is"):
+        shaped(Subject(CONTROLLER, STAGE, 1, BOUNDS, 1e-6, OPTIONS.model_copy(update={"scenarios": wide})))
+
+
+def test_bounds_let_every_step_between_allowed_levels_stay_within_the_drive() -> None:
+    """v = a·s + h·w for every level a, step h, and w at its bounds; at one end or another it reaches the drive."""
+    for bounds, static in ((BOUNDS, 0.97), (Bounds(0.05, 40.0, 0.0, 0.0, 44.0), 1.02)):
+        low, high = (float(value) for value in bounds.command(np.array(static)))
+        starts = np.linspace(bounds.lowest_um, bounds.step_um, 41)
+        reached = []
+        for w in (low, high):
+            for a in starts:
+                for b in starts:
+                    if abs(b - a) <= bounds.step_um:
+                        reached.append(a * static + (b - a) * w)
+        assert min(reached) >= bounds.low_um - 1e-9
+        assert max(reached) <= bounds.high_um + 1e-9
+        assert min(abs(min(reached) - bounds.low_um), abs(max(reached) - bounds.high_um)) < 1e-9
+
+
+CONFIG = """# my stage
+[loop]
+rate_hz = 10000
+[driver]
+kind = "sim"
+latency_ticks = 1
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.6]       # my actuator
+[axis.controller]
+form = "zpk"
+gain = 500.0
+poles = [[0.0, 0.0]]
+[axis.model]
+form = "factors"
+gain = GAIN
+denominator = [[1.0, MIDDLE, GAIN]]
+delay_ticks = 1
+[axis.limits]
+command_um = 60.0
+""".replace("GAIN", repr(OMEGA**2)).replace("MIDDLE", repr(2 * RATIO * OMEGA))
+SPEC = """[specification]
+overshoot_percent = 0.4
+[specification.command]
+reference_um = 40.0
+command_um = 46.0
+[shape]
+taps = 20
+points_per_tick = 4
+[shape.scenarios]
+resonance_percent = 4.0
+damping = [1.0]
+gain_percent = 0.0
+"""
+
+
+def shape(folder, config: str = CONFIG, spec: str = SPEC, *more: str):
+    (folder / "mine.toml").write_text(config)
+    (folder / "spec.toml").write_text(spec)
+    arguments = ["design", "shape", str(folder / "mine.toml"), "--spec", str(folder / "spec.toml"), *more]
+    return CliRunner().invoke(main, arguments)
+
+
+def test_the_command_writes_both_rows_and_keeps_the_rest(tmp_path, found) -> None:
+    """±10 V and 4.6 µm/V are the ±46 µm of the subject above: the same taps, in a file that keeps its comments."""
+    out, plot = tmp_path / "made.toml", tmp_path / "taps.png"
+    result = shape(tmp_path, CONFIG, SPEC, "--out", str(out), "--plot", str(plot), "--json")
+    assert result.exit_code == 0, result.stderr
+    report, written = json.loads(result.stdout), tomllib.loads(out.read_text())["axis"][0]
+    assert written["prefilter"]["taps"] == report["taps"]
+    assert written["prefilter"]["command_taps"] == pytest.approx(found.taps.command.tolist(), abs=1e-6)
+    assert written["specification"] == "spec.toml"
+    assert "# my actuator" in out.read_text()
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert len(report["trade_off"]) > 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code", "said"),
+    [
+        ("overshoot_percent = 0.4", "", 78, "overshoot_percent: None; above 0 and at most 5"),
+        ("overshoot_percent = 0.4", "overshoot_percent = 0.0", 78, "overshoot_percent: 0.0; above 0"),
+        ("[specification.command]\nreference_um = 40.0\ncommand_um = 46.0\n", "", 78, "reference_um: missing"),
+        ("taps = 20", "taps = 1", 78, "greater than or equal to 2"),
+        ("reference_um = 40.0", "reference_um = 46.5", 1, "nothing settles within"),
+        ("resonance_percent = 4.0", "resonance_percent = nan", 78, "resonance_percent"),
+    ],
+)
+def test_a_specification_that_cannot_be_met_or_read_is_said(tmp_path, old, new, code, said) -> None:
+    result = shape(tmp_path, CONFIG, SPEC.replace(old, new))
+    assert result.exit_code == code, result.output
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("command_um = 60.0", "command_um = 60.0\nslew_v_per_s = 1e4", "limits.slew_v_per_s"),
+        (
+            "[axis.limits]",
+            "[axis.prefilter]\nsections = [[1.0, 0.0, 0.0, 0.0, 0.0]]\n[axis.limits]",
+            "prefilter.sections",
+        ),
+        (CONFIG[CONFIG.index("[axis.model]") : CONFIG.index("[axis.limits]")], "", "model: missing"),
+    ],
+)
+def test_a_configuration_that_taps_cannot_be_made_for_is_said(tmp_path, old, new, said) -> None:
+    result = shape(tmp_path, CONFIG.replace(old, new))
+    assert result.exit_code == 78, result.output
+    assert said in result.stderr
