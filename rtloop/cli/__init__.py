@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from rtloop import __version__
-from rtloop.cli import design, doctor, experiment, identify, laws, loop, recordings, service
+from rtloop.cli import adapt, design, doctor, experiment, identify, laws, loop, recordings, response, service
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -24,6 +24,6 @@ def main() -> None:
     """
 
 
-for module in (loop, laws, doctor, recordings, service, identify, design, experiment):
+for module in (loop, laws, doctor, recordings, service, identify, response, design, experiment):
     for command in module.COMMANDS:
         main.add_command(command)

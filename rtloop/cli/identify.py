@@ -15,7 +15,6 @@ from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
 RUNS = click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
 AXIS = click.option("--axis", help="Name of the axis [the only one].")
 OUT = click.option("--out", type=OUTPUT, help="The TOML file to write, never over an existing one.")
-OUT_JSON = click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
 PLOT = click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
 
 
@@ -115,47 +114,6 @@ def dynamics(
     )  # fmt: skip
     _show(report, as_json, print_dynamics)
     return 0
-
-
-NEAR = click.option(
-    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
-)
-
-
-@identify.command()
-@click.argument("run", type=OUTPUT)
-@AXIS
-@NEAR
-@OUT_JSON
-@PLOT
-@JSON
-@fails_clearly
-def response(
-    run: Path, axis: str | None, near_hz: float | None, out: Path | None, plot: Path | None, as_json: bool
-) -> int:
-    """Loop, margins and light mode of a closed loop that was moved by a multisine.
-
-    RUN is the recording of a service that was asked by `rtloop ctl response`, or of the experiment `response`.
-    """
-    from rtloop.commands.response import show_recorded
-
-    return show_recorded(run, axis, near_hz, out, plot, as_json)
-
-
-@identify.command()
-@click.argument("run", type=OUTPUT)
-@AXIS
-@NEAR
-@JSON
-@fails_clearly
-def resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> int:
-    """The light mode of a plant in closed loop, with its uncertainty.
-
-    RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures it on a loop that runs.
-    """
-    from rtloop.commands.response import show_recorded
-
-    return show_recorded(run, axis, near_hz, None, None, as_json, resonance_only=True)
 
 
 @design.command()

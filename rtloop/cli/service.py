@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
 
 
 @click.command()
@@ -64,7 +64,8 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None) -> N
     context.obj = (name, socket_path)
 
 
-def _client(context: click.Context) -> Any:
+def client_of(context: click.Context) -> Any:
+    """Of the service that `ctl` was asked to talk to. Raises UnavailableError."""
     from rtloop.errors import UnavailableError
     from rtloop.service.client import Client
     from rtloop.supervision.paths import client_folders
@@ -90,7 +91,7 @@ def _post(name: str, help_text: str) -> None:
     @click.pass_context
     @fails_clearly
     def command(context: click.Context) -> int:
-        click.echo(json.dumps(_client(context).post(f"/{name}")))
+        click.echo(json.dumps(client_of(context).post(f"/{name}")))
         return 0
 
 
@@ -109,7 +110,7 @@ for _name, _help in (
 @fails_clearly
 def status(context: click.Context) -> int:
     """State, rate, lateness, faults and the newest signals."""
-    click.echo(json.dumps(_client(context).get("/status"), indent=2))
+    click.echo(json.dumps(client_of(context).get("/status"), indent=2))
     return 0
 
 
@@ -118,7 +119,7 @@ def status(context: click.Context) -> int:
 @fails_clearly
 def metrics(context: click.Context) -> int:
     """Metrics in Prometheus' text format."""
-    click.echo(_client(context).get("/metrics"), nl=False)
+    click.echo(client_of(context).get("/metrics"), nl=False)
     return 0
 
 
@@ -128,7 +129,7 @@ def metrics(context: click.Context) -> int:
 @fails_clearly
 def watch(context: click.Context, count: int | None) -> int:
     """Newest signals, a line of JSON 20 times a second."""
-    for number, line in enumerate(_client(context).watch(), start=1):
+    for number, line in enumerate(client_of(context).watch(), start=1):
         click.echo(json.dumps(line))
         if number == count:
             break
@@ -141,7 +142,7 @@ def watch(context: click.Context, count: int | None) -> int:
 @fails_clearly
 def mode(context: click.Context, mode: str) -> int:
     """Change the mode of all axes, bumplessly."""
-    click.echo(json.dumps(_client(context).post("/mode", {"mode": mode})))
+    click.echo(json.dumps(client_of(context).post("/mode", {"mode": mode})))
     return 0
 
 
@@ -152,7 +153,7 @@ def mode(context: click.Context, mode: str) -> int:
 @fails_clearly
 def setpoint(context: click.Context, axis: str, value: float) -> int:
     """Hold the reference of AXIS at VALUE, in µm (V in raw mode)."""
-    click.echo(json.dumps(_client(context).post("/setpoint", {"axis": axis, "value": value})))
+    click.echo(json.dumps(client_of(context).post("/setpoint", {"axis": axis, "value": value})))
     return 0
 
 
@@ -167,7 +168,7 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
     As in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
     """
     body = {"axis": axis, "reference": _inline_table(reference)}
-    click.echo(json.dumps(_client(context).post("/reference", body)))
+    click.echo(json.dumps(client_of(context).post("/reference", body)))
     return 0
 
 
@@ -180,144 +181,12 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
 @fails_clearly
 def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repeat: bool) -> int:
     """Play the numbers in FILE, one to a line, on AXIS; a second one is added to the command, in µm."""
-    columns = [list(column) for column in zip(*_numbers(file), strict=True)] or [[]]
+    columns = [list(column) for column in zip(*numbers_in(file), strict=True)] or [[]]
     body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
     if len(columns) > 1:
         body["command_um"] = columns[1]
-    click.echo(json.dumps(_client(context).post("/waveform", body)))
+    click.echo(json.dumps(client_of(context).post("/waveform", body)))
     return 0
-
-
-@ctl.command()
-@click.argument("axis")
-@click.argument("file", type=click.File())
-@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Of learning.")
-@click.option(
-    "--resonance-percent",
-    default=2.0,
-    show_default=True,
-    type=click.FloatRange(0, 50, max_open=True),
-    help="Only if the error shrinks with the resonance anywhere within so much of the model's.",
-)
-@click.option("--out", type=OUTPUT, help="The table that was learned, for `ctl waveform`; never over an existing file.")
-@JSON
-@click.pass_context
-@fails_clearly
-def learn(
-    context: click.Context, axis: str, file: Any, cycles: int, resonance_percent: float, out: Path | None, as_json: bool
-) -> int:  # fmt: skip
-    """Learn the scan of AXIS whose period is in FILE.
-
-    A number to a line and tick, in µm. It is played, and corrected by its error from cycle to cycle: the reference, and
-    what is added to the command. The best table goes on playing. At Ctrl-C what was held is held again.
-    """
-    from rtloop.commands.learn import learn as learn_scan
-
-    samples = [number for numbers in _numbers(file) for number in numbers[:1]]
-    body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
-    return learn_scan(_client(context), body, out, as_json)
-
-
-AMPLITUDE = click.option(
-    "--amplitude-um", default=0.5, show_default=True, type=click.FloatRange(0, min_open=True),
-    help="The position is moved by no more than this.",
-)  # fmt: skip
-DURATION = click.option(
-    "--duration",
-    "duration_s",
-    default=6.0,
-    show_default=True,
-    type=click.FloatRange(1, 60),
-    help="Of the largest multisine, in s; smaller ones go before it.",
-)
-PERIOD = click.option(
-    "--period", "period_s", type=click.FloatRange(0.05, 10), help="Of the multisine, in s [by the light mode's width]."
-)
-NEAR = click.option(
-    "--near-hz", type=click.FloatRange(0, min_open=True), help="Where a light mode is expected [model]."
-)
-
-
-@ctl.command()
-@click.argument("axis")
-@AMPLITUDE
-@click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [two lines].")
-@click.option("--to-hz", type=click.FloatRange(0, min_open=True), help="Highest frequency [0.45 of the rate].")
-@DURATION
-@PERIOD
-@NEAR
-@click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
-@click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
-@JSON
-@click.pass_context
-@fails_clearly
-def response(
-    context: click.Context, axis: str, out: Path | None, plot: Path | None, as_json: bool, **asked: Any
-) -> int:
-    """Measure the closed loop of AXIS: L, S, margins.
-
-    A multisine about the reference that is held, which comes back afterwards, also at Ctrl-C and at any error.
-    """
-    from rtloop.commands.response import show_measured
-
-    return show_measured(_client(context), {"axis": axis, **asked}, out, plot, as_json)
-
-
-@ctl.command()
-@click.argument("axis")
-@AMPLITUDE
-@DURATION
-@PERIOD
-@NEAR
-@JSON
-@click.pass_context
-@fails_clearly
-def resonance(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
-    """Measure the light mode of AXIS in closed loop: frequency and damping."""
-    from rtloop.commands.response import show_measured
-
-    return show_measured(_client(context), {"axis": axis, "resonance_only": True, **asked}, None, None, as_json)
-
-
-@ctl.command()
-@click.argument("axis")
-@click.option(
-    "--amplitude-um",
-    default=0.5,
-    show_default=True,
-    type=click.FloatRange(0, min_open=True),
-    help="The position is moved by no more than this while the resonance is measured.",
-)
-@click.option(
-    "--bound-percent",
-    default=15.0,
-    show_default=True,
-    type=click.FloatRange(0, 50, min_open=True),
-    help="A resonance further from the model's changes nothing.",
-)
-@click.option(
-    "--within-percent",
-    default=1.0,
-    show_default=True,
-    type=click.FloatRange(0, 50),
-    help="The taps are made for resonances so near the measured one.",
-)
-@click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
-@click.option("--yes", is_flag=True, help="Swap without asking.")
-@JSON
-@click.pass_context
-@fails_clearly
-def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
-    """Make the taps of AXIS anew for its resonance as it is now.
-
-    It is measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in at
-    a tick, after a look at a step before and after. With --json and without --yes nothing is swapped. Exit 1 where the
-    taps stayed.
-    """
-    from rtloop.commands.retune import Asked
-    from rtloop.commands.retune import retune as retune_axis
-
-    return retune_axis(_client(context), Asked(axis=axis, **asked), as_json)
 
 
 @ctl.command()
@@ -332,7 +201,7 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
     For example 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'.
     """
     body = {"axis": axis, "section": section, "values": _inline_table(values)}
-    click.echo(json.dumps(_client(context).post("/tune", body)))
+    click.echo(json.dumps(client_of(context).post("/tune", body)))
     return 0
 
 
@@ -355,11 +224,11 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
     section = axes[axis].controller
     assert section is not None
     body = {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
-    click.echo(json.dumps(_client(context).post("/controller", body)))
+    click.echo(json.dumps(client_of(context).post("/controller", body)))
     return 0
 
 
-def _numbers(file: Any) -> list[list[float]]:
+def numbers_in(file: Any) -> list[list[float]]:
     """One to a line, or two; empty lines are left out. Raises a usage error."""
     found: list[list[float]] = []
     for number, line in enumerate(file, start=1):

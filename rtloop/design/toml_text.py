@@ -91,9 +91,13 @@ def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table
 
 
 def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
+    items = [_within(value) for value in values]
     array = tomlkit.array()
-    for value in values:
-        array.append(_within(value))
+    if len(items) > WIDTH:  # appended one by one they take a time that grows with its square
+        array.add_line(*items, indent="", newline=False)
+        return array.multiline(True)
+    for one in items:
+        array.append(one)
     return array.multiline(len(array.as_string()) > WIDTH)
 
 

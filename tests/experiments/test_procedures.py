@@ -10,13 +10,14 @@ import pytest
 from scipy import signal
 
 from rtloop.configuration.axis import ModelOptions
-from rtloop.configuration.file import load
+from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import ClaimOptions, DisturbanceOptions, SpecificationOptions
 from rtloop.design.verification.judgement import Limit
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import about, derived, keep_tables
 from rtloop.experiments.procedures.harmonic import bandwidth
+from rtloop.experiments.procedures.response import ResponseOptions
 from rtloop.experiments.procedures.robustness import Outcome, range_about_zero, stable_range, to_next
 from rtloop.experiments.procedures.step_response import fitted_ringing
 from rtloop.experiments.registry import EXPERIMENTS, chosen, parameters
@@ -24,6 +25,7 @@ from rtloop.experiments.report import report, take
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.verdict import Row
 from rtloop.hil.options import Options
+from rtloop.recording.load import load as load_recording
 from tests.recording.real_loop import record
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -256,3 +258,23 @@ def test_what_was_clipped_is_not_judged(tmp_path: Path) -> None:
     assert problems[1] is None
     assert "the command was clipped in" in problems[0]
     assert "not judged" in problems[0]
+
+
+def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_model(tmp_path: Path) -> None:
+    """The actuator of the inverse, all of its dead band taken off: what is left is the linear loop."""
+    text = PAPER.text.replace('truth = "residual"', 'truth = "nominal"')
+    base = parse(text.replace('dead_band = "none"', 'dead_band = "exact"'), "linear", PAPER.folder, "test")
+    experiment = EXPERIMENTS["response"]
+    options = ResponseOptions(period_s=0.5, periods=3)
+    (run,) = experiment.runs(options, Setting(RATE_HZ, base.axes[0], virgin=True))
+    derived_text = derived(base, "x", "response", options.model_dump(mode="json"), run, 1, {}).text
+    (path,) = record(tmp_path / "response.mcap", derived_text, run.timeline.ticks)
+    (section,) = report(take([path])).content["experiments"]
+    assert section["problem"] is None
+    found = {row["quantity"]: row["run"] for row in section["rows"]}
+    assert found["gain margin"] == pytest.approx(2.566, rel=0.02)
+    assert found["phase margin"] == pytest.approx(73.05, abs=2.0)
+    assert found["resonance"] == pytest.approx(595.50, rel=0.0006)
+    assert found["largest |S|"] == pytest.approx(1.654, rel=0.02)
+    position_um = load_recording(path)["x_true_position_um"]
+    assert 0.1 < np.abs(position_um).max() <= options.amplitude_um

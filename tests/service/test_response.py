@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -197,6 +200,27 @@ def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: Bench) -
     assert (code, "somebody else has set a reference" in text["error"]) == (409, True), text
     assert reference_um(bench) == 4.0
     bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+
+
+def test_after_ctrl_c_what_was_held_is_held_again(bench: Bench) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "rtloop",
+        "ctl",
+        "--socket",
+        bench.client.path,
+        "response",
+        "x",
+        "--duration",
+        "30",
+    ]
+    asking = subprocess.Popen(command, env=bench.environment, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    asking.send_signal(signal.SIGINT)
+    _, said = asking.communicate(timeout=60)
+    assert (asking.returncode, "holds 5 µm as before" in said) == (1, True), said
+    assert reference_um(bench) == HELD_UM
 
 
 def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:

@@ -164,7 +164,7 @@ def measured(case: Case, body: dict[str, Any]) -> tuple[dict[str, Any], float]:
     return found, float(np.abs(position_um[first:last] - rest_um).max())
 
 
-def margins_on(case: Case) -> bool:
+def margins_on(case: Case, *, promised: bool = True) -> bool:
     """Whether margins and motion are as promised; a line."""
     found, moved_um = measured(case, {"amplitude_um": AMPLITUDE_UM})
     true = margins_of(case.loop, found["from_hz"], found["to_hz"])
@@ -176,7 +176,7 @@ def margins_on(case: Case) -> bool:
     print(
         f"{case.name}: gain margin {gain['value']:.4g} ± {gain['std']:.2g} ({gain_off:+.2f} %), phase margin "
         f"{phase['value']:.2f} ± {phase['std']:.2g} ° ({phase_off:+.2f}°), modulus margin {modulus['value']:.4f} "
-        f"({modulus_off:+.2f} %), moved {moved_um:.3f} µm{'' if good else '  BAD'}",
+        f"({modulus_off:+.2f} %), moved {moved_um:.3f} µm{'' if good or not promised else '  BAD'}",
         flush=True,
     )
     return good
@@ -207,7 +207,7 @@ def main() -> int:
     good += [resonance_on(shift, noise_um) for noise_um in NEEDED_PERCENT for shift in SHIFTS]
     for case in (of_the_paper("residual", "none"), of_the_paper("nominal", "none")):
         print("not promised:", end=" ")
-        margins_on(case)
+        margins_on(case, promised=False)
     print(f"{len(good)} measurements, {good.count(False)} bad")
     return int(not all(good))
 

@@ -78,9 +78,10 @@ def _grid(options: ResponseOptions, setting: Setting) -> Grid:
 def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     """Margins, the resonance, and every line."""
     (taken,) = recordings
-    names = ("reference_um", "error_um", "command_um", "position_um")
+    names: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
     near_hz, loop = (taken.model.resonance_hz, taken.model.loop) if taken.model else (None, None)
-    signals, taps = dict(zip(names, taken.read(*names), strict=True)), taken.axis_options.prefilter.command_taps
+    signals: dict[str, Real] = dict(zip(names, taken.read(*names), strict=True))
+    taps = taken.axis_options.prefilter.command_taps
     found = measurement(signals, taken.rate_hz, near_hz, loop, taps)
     if (moved_um := found.response.moved_um) > options.amplitude_um:
         raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")

@@ -1,0 +1,86 @@
+"""Commands of `ctl` that make a running loop better: scans that it learns, taps for its resonance as it is now."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtloop.cli.options import JSON, OUTPUT, fails_clearly
+from rtloop.cli.service import client_of, ctl, numbers_in
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("file", type=click.File())
+@click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Of learning.")
+@click.option(
+    "--resonance-percent",
+    default=2.0,
+    show_default=True,
+    type=click.FloatRange(0, 50, max_open=True),
+    help="Only if the error shrinks with the resonance anywhere within so much of the model's.",
+)
+@click.option("--out", type=OUTPUT, help="The table that was learned, for `ctl waveform`; never over an existing file.")
+@JSON
+@click.pass_context
+@fails_clearly
+def learn(
+    context: click.Context, axis: str, file: Any, cycles: int, resonance_percent: float, out: Path | None, as_json: bool
+) -> int:  # fmt: skip
+    """Learn the scan of AXIS whose period is in FILE.
+
+    A number to a line and tick, in µm. It is played, and corrected by its error from cycle to cycle: the reference, and
+    what is added to the command. The best table goes on playing. At Ctrl-C what was held is held again.
+    """
+    from rtloop.commands.learn import learn as learn_scan
+
+    samples = [number for numbers in numbers_in(file) for number in numbers[:1]]
+    body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
+    return learn_scan(client_of(context), body, out, as_json)
+
+
+@ctl.command()
+@click.argument("axis")
+@click.option(
+    "--amplitude-um",
+    default=0.5,
+    show_default=True,
+    type=click.FloatRange(0, min_open=True),
+    help="The position is moved by no more than this while the resonance is measured.",
+)
+@click.option(
+    "--bound-percent",
+    default=15.0,
+    show_default=True,
+    type=click.FloatRange(0, 50, min_open=True),
+    help="A resonance further from the model's changes nothing.",
+)
+@click.option(
+    "--within-percent",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(0, 50),
+    help="The taps are made for resonances so near the measured one.",
+)
+@click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
+@click.option("--yes", is_flag=True, help="Swap without asking.")
+@JSON
+@click.pass_context
+@fails_clearly
+def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
+    """Make the taps of AXIS anew for its resonance as it is now.
+
+    It is measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in at
+    a tick, after a look at a step before and after. With --json and without --yes nothing is swapped. Exit 1 where the
+    taps stayed.
+    """
+    from rtloop.commands.retune import Asked
+    from rtloop.commands.retune import retune as retune_axis
+
+    return retune_axis(client_of(context), Asked(axis=axis, **asked), as_json)
+
+
+COMMANDS: tuple[click.Command, ...] = ()
+"""All of them belong to `ctl`."""
