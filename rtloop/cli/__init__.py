@@ -24,6 +24,6 @@ def main() -> None:
     """
 
 
-for module in (loop, laws, doctor, recordings, service, identify, response, design, experiment):
+for module in (loop, laws, doctor, recordings, service, identify, response, adapt, design, experiment):
     for command in module.COMMANDS:
         main.add_command(command)
