@@ -73,8 +73,8 @@ def transfer_of(point: Real, period_s: float) -> Transfer:
     sections = point[2:].reshape(-1, 4)
     above = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
     below = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]
-    zeros: Complex = np.array([math.log1p(-math.exp(point[1])), *above], dtype=complex) / period_s
-    poles: Complex = np.array([0.0, *below], dtype=complex) / period_s
+    zeros: Complex = np.array([math.log1p(-math.exp(point[1])), *above]) / complex(period_s)
+    poles: Complex = np.array([0.0, *below]) / complex(period_s)
     image = discretised(Transfer(zeros, poles, 1.0), period_s, "matched")
     return Transfer(zeros, poles, math.exp(point[0]) / image.gain)
 
