@@ -24,6 +24,8 @@ from rtloop.errors import ConfigError, LoopFault
 from rtloop.service.client import Client
 from rtloop.terminal.table import console, table
 
+STAGES = 4
+"""In which new taps take over from old ones, so that a scan that goes on meanwhile feels none of them."""
 MEASURED_S, MEASUREMENT_S = 1.0, 120.0
 """How long the loop is excited at most amplitude, and how long an answer may take."""
 
@@ -76,9 +78,8 @@ def retune(client: Client, asked: Asked, as_json: bool) -> int:
         swapped = asked.yes or click.confirm("swap the taps in?", err=True)
     tick = None
     if swapped:
-        values = {"taps": found.taps.reference.tolist(), "command_taps": found.taps.command.tolist()}
-        change = {"axis": asked.axis, "section": "prefilter", "values": values}
-        tick = client.post("/tune", change, MEASUREMENT_S)["tick"]
+        for part in np.arange(1, STAGES + 1) / STAGES:
+            tick = _swapped(client, asked.axis, _between(_taps_of(axis), found.taps, part))
     if as_json:
         said = {"resonance": mode, "percent_from_model": percent, "before": before._asdict(), "after": after._asdict()}
         click.echo(json.dumps({**said, "settling_ms": found.settling_ms, "tick": tick}))
@@ -103,6 +104,23 @@ def _subject(running: dict[str, Any], asked: Asked) -> tuple[AxisOptions, Subjec
         return axis, subject_of(axis, check, load_specification(spec).design)
     except ValueError as error:
         raise ConfigError("retune", [f"axis.{axis.name}: {error}"]) from None
+
+
+def _swapped(client: Client, axis: str, taps: Taps) -> int:
+    values = {"taps": taps.reference.tolist(), "command_taps": taps.command.tolist()}
+    change = {"axis": axis, "section": "prefilter", "values": values}
+    return int(client.post("/tune", change, MEASUREMENT_S)["tick"])
+
+
+def _between(old: Taps, new: Taps, part: float) -> Taps:
+    """Old ones with so much of the new ones in them."""
+    count = max(old.reference.size, new.reference.size)
+    rows = (
+        (1 - part) * np.pad(one, (0, count - one.size)) + part * np.pad(other, (0, count - other.size))
+        for one, other in ((old.reference, new.reference), (old.command, new.command))
+    )
+    reference, command = rows
+    return Taps(reference, command, new.overshoot)
 
 
 def _taps_of(axis: AxisOptions) -> Taps:

@@ -173,6 +173,18 @@ class MarginOptions(Options):
     """Refuse to start where the delay that was measured of this host takes the loop's delay margin, or none was."""
 
 
+class AdaptOptions(Options):
+    """`rtloop ctl retune` on a schedule, while the service holds a reference in closed loop."""
+
+    every_s: float = Field(ge=10)
+    amplitude_um: float = Field(default=0.5, gt=0)
+    """The position is moved by no more than this."""
+    bound_percent: float = Field(default=10.0, gt=0, le=50)
+    """A resonance further from the model's changes nothing."""
+    within_percent: float = Field(default=1.0, ge=0, le=50)
+    """The taps are made for resonances so near the measured one."""
+
+
 class AxisOptions(Options):
     """One axis of the law."""
 
@@ -187,3 +199,5 @@ class AxisOptions(Options):
     limits: LimitsOptions = LimitsOptions()
     interlocks: InterlockOptions = InterlockOptions()
     reference: ReferenceOptions = HoldOptions()
+    adapt: AdaptOptions | None = None
+    """Taps made anew on a schedule, by consent."""

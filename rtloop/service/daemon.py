@@ -17,6 +17,7 @@ import uvicorn
 
 from rtloop.errors import UnavailableError
 from rtloop.hil.trusted import Untrusted, open_folder
+from rtloop.service.adaptation import adapting
 from rtloop.service.api.application import application
 from rtloop.service.api.connections import BACKLOG, settings
 from rtloop.service.building import builder_ended
@@ -36,7 +37,8 @@ def serve(config: Path) -> int:
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
     try:
-        with builder_ended(), _listening(service), supervised_by_can(service):
+        adapts = adapting(service, socket_path(service.configuration))
+        with builder_ended(), _listening(service), supervised_by_can(service), adapts:
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()

@@ -1,0 +1,70 @@
+"""Retuning on a schedule: when it is due, when it is not, and what the journal says of it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtloop.configuration.axis import AdaptOptions
+from rtloop.service.adaptation import Schedule
+from rtloop.service.service import State
+
+TUNED = {"resonance": {"hz": 643.125}, "percent_from_model": 8.0, "tick": 523005}
+
+
+class Desk:
+    """A service with two axes, of which one adapts, and whoever runs commands for it."""
+
+    def __init__(self, code: int = 0, stderr: str = "") -> None:
+        adapts = AdaptOptions(every_s=60.0, bound_percent=7.0)
+        axes = [SimpleNamespace(name="x", adapt=adapts), SimpleNamespace(name="y", adapt=None)]
+        self.service: Any = SimpleNamespace(state=State.RUNNING, configuration=SimpleNamespace(axes=axes))
+        self.ran: list[list[str]] = []
+        self._answer = subprocess.CompletedProcess([], code, json.dumps(TUNED), stderr)
+        self.schedule = Schedule(self.service, Path("/run/lab.sock"), self._run)
+
+    def _run(self, command: Any) -> subprocess.CompletedProcess[str]:
+        self.ran.append(list(command))
+        return self._answer
+
+    def looks(self, *times_s: float) -> int:
+        """How often it was retuned so far."""
+        for time_s in times_s:
+            self.schedule.look(time_s)
+        return len(self.ran)
+
+
+def test_it_is_due_after_the_loop_has_run_for_so_long():
+    desk = Desk()
+    assert desk.looks(1000.0, 1030.0, 1059.9) == 0
+    assert desk.looks(1060.0, 1061.0, 1119.0) == 1
+    assert desk.looks(1120.0) == 2
+    said = " ".join(desk.ran[0])
+    assert "ctl --socket /run/lab.sock retune x --yes --json" in said
+    assert "--bound-percent 7.0" in said
+
+
+@pytest.mark.parametrize("state", [one for one in State if one is not State.RUNNING])
+def test_never_while_it_does_not_run_and_a_trip_begins_the_waiting_anew(state: State):
+    desk = Desk()
+    assert desk.looks(0.0, 50.0) == 0
+    desk.service.state = state
+    assert desk.looks(60.0, 600.0) == 0
+    desk.service.state = State.RUNNING
+    assert desk.looks(601.0, 660.0) == 0
+    assert desk.looks(661.0) == 1
+
+
+def test_the_journal_has_what_was_done_and_what_was_refused(caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.INFO):
+        Desk().looks(0.0, 60.0)
+        Desk(1, "rtloop: reference of axis x: a sine; a hold is needed\n").looks(0.0, 60.0)
+    done, refused = (record.getMessage() for record in caplog.records)
+    assert done == "axis x retuned: resonance 643.12 Hz, +8.00 % from the model's, at tick 523005"
+    assert refused == "axis x is not retuned: reference of axis x: a sine; a hold is needed"
