@@ -51,8 +51,8 @@ overshoot_percent = 1.0
 reference_um = 10.0
 command_um = 43.0
 [shape]
-taps = 32
-points_per_tick = 2
+taps = 30
+points_per_tick = 1
 """
 
 

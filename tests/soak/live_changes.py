@@ -64,8 +64,10 @@ class EveryChange(Changes):
         count, sections = self._chance.choice((0, 1, 2, 7, 48, 127, 128)), self._chance.choice((0, 0, 1, 3, 12))
         taps = [self._chance.uniform(0, 1) for _ in range(count)]
         poles = [self._chance.uniform(0.05, 0.9) for _ in range(sections)]
+        command_taps = [self._chance.uniform(-0.2, 0.2) for _ in range(self._chance.choice((0, 0, 1, 31, 128)))]
         values = {
             "taps": [tap / sum(taps) for tap in taps],
+            "command_taps": command_taps,
             "sections": [[(1 - p) ** 2, 0.0, 0.0, -2 * p, p * p] for p in poles],
         }
         self._live.tune(self._axis, "prefilter", values)
@@ -111,7 +113,8 @@ class EveryChange(Changes):
 
     def _waveform(self) -> None:
         count = self._chance.choice((1, 2, 1000, SPARE_SAMPLES // 4))
-        samples = [self._chance.uniform(-9.0, 9.0)] * count
+        columns = [self._chance.uniform(-9.0, 9.0) for _ in range(self._chance.choice((1, 2)))]
+        samples = np.tile(columns, (count, 1))
         self._live.set_waveform(self._axis, samples, self._chance.randrange(1, 5), self._chance.random() < 0.5)
 
     def _tare(self) -> None:

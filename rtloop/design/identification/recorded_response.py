@@ -27,12 +27,14 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     recording = load(path)
     axis = axis_of(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])
-    signals: dict[str, Real] = dict(zip(SIGNALS, recording.read(*(f"{axis}_{name}" for name in SIGNALS)), strict=True))
+    names = {name: f"{axis}_{name}" for name in SIGNALS}
     if recording.header["driver"]["kind"] != IN_STEP:
-        signals["periods_missed"] = recording["periods_missed"]
-    described = next(one for one in tomllib.loads(recording.configuration)["axis"] if one["name"] == axis)
+        names["periods_missed"] = "periods_missed"
     if f"{axis}_feed_um" in recording:
-        signals["feed_um"] = recording[f"{axis}_feed_um"]
+        names["feed_um"] = f"{axis}_feed_um"
+    # all in one pass: a recording may still be growing
+    signals: dict[str, Real] = dict(zip(names, recording.read(*names.values()), strict=True))
+    described = next(one for one in tomllib.loads(recording.configuration)["axis"] if one["name"] == axis)
     model, known, taps = None, None, described.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
         options = AxisOptions.model_validate(described)
