@@ -14,7 +14,7 @@ from rtloop.analysis.reference import ReferencePath
 from rtloop.linear.discretise import discretise
 from rtloop.linear.transfer import Transfer
 
-PERIOD_S, TICKS, SETTLED = 1e-4, 200, 25
+PERIOD_S, TICKS, SETTLED = 1e-4, 200, 40
 TAPS, COMMAND_TAPS = np.array([0.5, 0.3, 0.2]), np.array([0.1, 0.05])
 WANTED_UM = 20 * signal.sawtooth(2 * np.pi * np.arange(TICKS) / TICKS, 0.5)
 

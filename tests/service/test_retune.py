@@ -52,7 +52,7 @@ reference_um = 10.0
 command_um = 43.0
 [shape]
 taps = 30
-points_per_tick = 1
+points_per_tick = 2
 """
 
 
