@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from tests.soak.flagship import looped, rigs, scanned, stepped
 from tests.soak.flagship.pictures import draw
@@ -33,12 +34,11 @@ def main() -> int:
         print(f"[{time.monotonic() - began_s:5.0f} s] {line}", file=sys.stderr, flush=True)
 
     paper, ours = loop("paper"), loop("robust")
-    found, curves = [], {}
-    rows, _ = stepped.as_configured(paper, ours)
+    curves = dict[str, Any]()
+    found = stepped.as_configured(paper, ours)
+    rows, shifts = stepped.over_shift(paper, ours, say)
     found += rows
-    rows, curves["steps"], wide = stepped.over_shift(paper, ours, say)
-    found += rows
-    curves["shift"] = curves["steps"]
+    curves["steps"], curves["shift"] = shifts.traces, shifts.steps
     rows, curves["loops"] = looped.linear_rows(paper, ours)
     found += [*rows, *looped.rig_rows(paper, ours)]
     say("loops: done")
@@ -48,7 +48,7 @@ def main() -> int:
     curves["scans"] = {**scans, "goals": scanned.GOALS}
     say("scans: done")
     if given.draws:
-        loops = {"paper": paper, "ours": ours, "wide": wide}
+        loops = {"paper": paper, "ours": ours, "wide": shifts.wide}
         rows, curves["draws"] = stepped.drawn(loops, given.draws, given.seed, say)
         found += rows
     if given.rigs:

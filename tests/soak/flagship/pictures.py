@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from rtloop.experiments.theme import Ink, pictures
-from tests.soak.flagship.stage import DWELL_S, LEVELS_UM, Steps
-from tests.soak.flagship.stepped import RETUNED, SHIFTS
+from rtloop.hil.modal import Real
+from tests.soak.flagship.stage import Steps
+from tests.soak.flagship.stepped import RETUNED, SHIFTS, TRACED, TRACED_UM
 
-SHOWN_MS = 12.0
+SHOWN_MS = 20.0
 LABELS = {"ours": "taps made for ±5 %", "wide": "taps made for ±10 %", "retuned": "retuned"}
 
 
@@ -34,25 +35,25 @@ def _colours(ink: Ink) -> dict[str, str]:
     return {"paper": ink.error, "ours": ink.measured, "wide": ink.other, "retuned": ink.drive}
 
 
-def _steps(figure: Any, runs: Mapping[str, Mapping[float, Steps]], ink: Ink) -> None:
-    """The step 0 → 40 → 0 µm laid over, with the resonance where it is and 10 % beside."""
-    at_ms = 1e3 * DWELL_S * (LEVELS_UM.index(40.0) + 1)
-    panels = figure.subplots(2, 3, sharex=True)
-    for column, percent in enumerate((-10.0, 0.0, 10.0)):
+def _steps(figure: Any, traces: Mapping[str, Mapping[float, tuple[Real, Real]]], ink: Ink) -> None:
+    """One step of every loop, with the resonance where it is and 10 % beside."""
+    panels = figure.subplots(2, 3, sharex=True, sharey="row")
+    labels = {"paper": "the paper's C", "ours": "rtloop's own", "retuned": "its taps retuned"}
+    for column, percent in enumerate(TRACED):
         wide, near = panels[:, column]
-        for name in ("paper", "ours", "retuned"):
-            ms, um = runs[name][percent].trace
-            chosen = (ms >= at_ms - 0.5) & (ms < at_ms + SHOWN_MS)
-            label = {"paper": "the paper's C", "ours": "rtloop's own"}.get(name, LABELS.get(name, name))
+        for part, label in ((0.05, "±5 %"), (0.001, "±0.1 %")):
+            band = (1 - part) * TRACED_UM, (1 + part) * TRACED_UM
+            near.axhspan(*band, color=ink.faint, alpha=0.25, linewidth=0, label=label)
+        for name, words in labels.items():
+            ms, um = traces[name][percent]
+            shown = ms < SHOWN_MS
             for panel in (wide, near):
-                panel.plot(ms[chosen] - at_ms, 40 - um[chosen], color=_colours(ink)[name], label=label, linewidth=1.1)
-        wide.set_ylim(-8.0, 62.0)
-        near.set_ylim(39.2, 40.8)
-        near.axhspan(40 - 0.04, 40 + 0.04, color=ink.faint, alpha=0.3, linewidth=0, label="±0.1 %")
-        ink.label(wide, "", "way / µm" if not column else "", f"40 µm, resonance {percent:+g} %" if percent
-                  else "40 µm, resonance as modelled")  # fmt: skip
-        ink.label(near, "time since the step / ms", "way / µm, enlarged" if not column else "")
-    ink.legend(panels[0, 0], loc="lower right")
+                panel.plot(ms[shown], um[shown], color=_colours(ink)[name], label=words, linewidth=1.1)
+        wide.set_ylim(-0.2 * TRACED_UM, 1.5 * TRACED_UM)
+        near.set_ylim(0.94 * TRACED_UM, 1.06 * TRACED_UM)
+        ink.label(wide, "", "" if column else "x / µm", f"resonance {f'{percent:+g} %' if percent else 'as modelled'}")
+        ink.label(near, "time since the step / ms", "" if column else "x / µm, enlarged")
+    ink.legend(panels[0, 1], loc="lower right")
     ink.legend(panels[1, 1], loc="lower right")
 
 
@@ -93,10 +94,17 @@ def _shift(figure: Any, runs: Mapping[str, Mapping[float, Steps]], ink: Ink) -> 
         settling.plot(places, [_finite(one.settling_ms) for one in some], **style)
         over.plot(places, [_finite(one.overshoot(40.0)) for one in some], **style)
     settling.set_yscale("log")
+    _plain(settling.yaxis, (3, 4, 5, 6, 8, 10))
     over.set_yscale("log")
     ink.label(settling, "shift of the resonance / %", "settling to 5 % / ms, worst of eight steps", "Settling")
     ink.label(over, "shift of the resonance / %", "overshoot of 40 µm / %", "Overshoot")
     ink.legend(settling)
+
+
+def _plain(axis: Any, ticks: tuple[int, ...]) -> None:
+    """Numbers on a logarithmic axis as they are said."""
+    axis.set_ticks(ticks, [f"{tick}" for tick in ticks])
+    axis.set_ticks([], minor=True)
 
 
 def _finite(value: float) -> float:
@@ -131,4 +139,5 @@ def _draws(figure: Any, found: Mapping[str, Any], ink: Ink) -> None:
         panel.set_xscale("log")
         panel.set_ylim(0.0, 102.0)
         ink.label(panel, words, "rigs that do no worse / %" if panel is panels[0] else "")
-    ink.legend(panels[0], loc="lower right")
+    _plain(panels[0].xaxis, (3, 4, 5, 6, 8, 10))
+    ink.legend(panels[1], loc="lower right")

@@ -41,14 +41,13 @@ TRUTH = Family(Transfer(*zeros_poles_gain(DynamicsOptions())), 0, ScenarioOption
 
 class Steps(NamedTuple):
     """Of each step its height in µm, settling in ms, overshoot and static error in %; over all the largest |u| in V,
-    what limited and what tripped; `trace` is (ms, µm) of the run, between ticks too.
+    what limited and what tripped.
     """
 
     table: Real
     peak_v: float
     limited: tuple[str, ...]
     trips: tuple[str, ...]
-    trace: tuple[Real, Real]
 
     @property
     def settling_ms(self) -> float:
@@ -137,8 +136,14 @@ def steps(on: Bench, dwell_s: float = DWELL_S) -> Steps:
     return Steps(
         np.array(rows), float(np.abs(run["x_drive_v"]).max()),
         tuple(name for flag, name in LIMITED.items() if ever & flag), tuple(trip_causes(ever)),
-        (np.arange(position.size) * (1e3 / (POINTS * RATE_HZ)), position),
     )  # fmt: skip
+
+
+def trace(on: Bench, height_um: float) -> tuple[Real, Real]:
+    """Time since it in ms, and the position in µm, between ticks too, of one step from rest."""
+    run = on.run("x", (0.0, height_um), DWELL_S)
+    position = between_ticks(on.rig, run, "x", RATE_HZ)[round(DWELL_S * RATE_HZ) * POINTS :]
+    return np.arange(position.size) / np.float64(POINTS * RATE_HZ / 1e3), position
 
 
 def subject(configuration: Configuration) -> Subject:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from rtloop.analysis.measured.measurement import measurement
 from rtloop.analysis.perturbation import resonance_hz, with_resonance_shifted
 from rtloop.configuration.file import Configuration
 from rtloop.design.robust.options import ScenarioOptions
-from rtloop.design.robust.scenarios import Family, Scenario
+from rtloop.design.robust.scenarios import Family
 from rtloop.experiments.procedures import response
 from rtloop.experiments.setting import Setting
 from rtloop.hil.modal import Real
@@ -30,6 +30,7 @@ from tests.soak.flagship.stage import (
     steps,
     subject,
     taps_for,
+    trace,
     with_taps,
 )
 from tests.soak.flagship.table import Row
@@ -38,6 +39,7 @@ SEEDS = (1, 2, 3)
 """Of the sensor's noise; the worst is said."""
 SHIFTS = tuple(float(percent) for percent in range(-10, 11))
 RETUNED = (-10.0, -5.0, 0.0, 5.0, 10.0)
+TRACED, TRACED_UM = (-10.0, 0.0, 10.0), 40.0
 RETUNED_WITHIN, RETUNED_OVERSHOOT = 0.5, 0.0005
 """Percent around the measured resonance that taps are made for; overshoot that they may have on the model."""
 WIDE, WIDE_OVERSHOOT, WIDE_MS = 10.0, 0.002, 3.2
@@ -65,7 +67,7 @@ def worst(runs: Sequence[Steps]) -> Worst:
     )  # fmt: skip
 
 
-def as_configured(paper: Configuration, ours: Configuration) -> tuple[list[Row], dict[str, Any]]:
+def as_configured(paper: Configuration, ours: Configuration) -> list[Row]:
     """Eight steps, every seed; also with a worse sensor, and without an identification of one's own."""
     runs = {name: [steps(bench(one, seed=seed)) for seed in SEEDS] for name, one in (("paper", paper), ("ours", ours))}
     theirs, mine = worst(runs["paper"]), worst(runs["ours"])
@@ -89,10 +91,18 @@ def as_configured(paper: Configuration, ours: Configuration) -> tuple[list[Row],
         Row("eq (4) in place of an identification: settling", "ms", None, theirs.settling_ms, other.settling_ms),
         Row("  overshoot, 40 µm", "%", None, theirs.overshoot, other.overshoot),
     ]
-    return rows, {name: some[0].trace for name, some in runs.items()}
+    return rows
 
 
-def over_shift(paper: Configuration, ours: Configuration, say: Say) -> tuple[list[Row], dict[str, Any], Configuration]:
+class Shifted(NamedTuple):
+    """Steps by loop and shift of the resonance in %; traces of one step, the same way; the loop with taps for ±10 %."""
+
+    steps: Mapping[str, Mapping[float, Steps]]
+    traces: Mapping[str, Mapping[float, tuple[Real, Real]]]
+    wide: Configuration
+
+
+def over_shift(paper: Configuration, ours: Configuration, say: Say) -> tuple[list[Row], Shifted]:
     """The resonance anywhere: taps as they are, made for ±10 %, made for where it was measured."""
     about = subject(ours)
     wide = with_taps(ours, taps_for(about, about.plant, WIDE, WIDE_OVERSHOOT, WIDE_MS))
@@ -100,13 +110,19 @@ def over_shift(paper: Configuration, ours: Configuration, say: Say) -> tuple[lis
         name: {percent: steps(bench(one, shifted(percent)), DWELL_S) for percent in SHIFTS}
         for name, one in (("paper", paper), ("ours", ours), ("wide", wide))
     }
+    traces = {name: {percent: trace(bench(one, shifted(percent)), TRACED_UM) for percent in TRACED}
+              for name, one in (("paper", paper), ("ours", ours))}  # fmt: skip
+    traces["retuned"] = {}
     say("resonance shifted: done; taps are made anew")
     found["retuned"], errors = {}, []
     for percent in RETUNED:
         seen = measured_percent(ours, percent)
         errors.append(abs(seen - percent))
         taps = taps_for(about, with_resonance_shifted(about.plant, seen), RETUNED_WITHIN, RETUNED_OVERSHOOT)
-        found["retuned"][percent] = steps(bench(with_taps(ours, taps), shifted(percent)))
+        retuned = with_taps(ours, taps)
+        found["retuned"][percent] = steps(bench(retuned, shifted(percent)))
+        if percent in TRACED:
+            traces["retuned"][percent] = trace(bench(retuned, shifted(percent)), TRACED_UM)
         say(f"resonance at {percent:+g} %, measured {seen:+.3f} %")
     rows = []
     for name, title, limits in (
@@ -123,7 +139,7 @@ def over_shift(paper: Configuration, ours: Configuration, say: Say) -> tuple[lis
                 Row("  overshoot, 40 µm", "%", overshoot, theirs.overshoot, some.overshoot),
                 Row("  overshoot, 10 µm", "%", None, theirs.overshoot_small, some.overshoot_small),
             ]  # fmt: skip
-    return rows, found, wide
+    return rows, Shifted(found, traces, wide)
 
 
 def measured_percent(configuration: Configuration, truth_percent: float) -> float:

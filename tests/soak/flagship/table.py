@@ -10,7 +10,8 @@ HEADINGS = ("", "goal", "paper", "ours", "met")
 
 
 class Row(NamedTuple):
-    """A quantity; without a goal it is said and not judged. Infinite stands for a loop that is unstable or trips."""
+    """A quantity; without a goal it is said and not judged. Infinite stands for a loop that is unstable or trips,
+    nan for a search that found none."""
 
     name: str
     unit: str
@@ -46,6 +47,8 @@ class Row(NamedTuple):
 def _said(value: float | None, unit: str) -> str:
     if value is None:
         return "–"
+    if math.isnan(value):
+        return "none found"
     return f"{value:.3g} {unit}".strip() if math.isfinite(value) else "unstable"
 
 
