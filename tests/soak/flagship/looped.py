@@ -40,7 +40,7 @@ def family_loops(controller: DiscreteController, family: Family) -> list[Loop]:
 
 
 def slowest_ringing_ms(loops: Iterable[Loop]) -> float:
-    """Time constant of the slowest pair of modes that turns faster than it decays, at any frequency below half the rate."""
+    """Time constant of the slowest pair of modes that turns faster than it decays, at any frequency."""
     found = 0.0
     for loop in loops:
         if not loop.is_stable:

@@ -14,7 +14,7 @@ from tests.soak.flagship.stage import Steps
 from tests.soak.flagship.stepped import RETUNED, SHIFTS, TRACED, TRACED_UM
 
 SHOWN_MS = 20.0
-LABELS = {"ours": "taps made for ±5 %", "wide": "taps made for ±10 %", "retuned": "retuned"}
+LABELS = {"ours": "taps of robust.toml", "wide": "taps made for ±10 %", "retuned": "retuned"}
 
 
 def draw(folder: Path, found: Mapping[str, Any]) -> None:
@@ -41,9 +41,9 @@ def _steps(figure: Any, traces: Mapping[str, Mapping[float, tuple[Real, Real]]],
     labels = {"paper": "the paper's C", "ours": "rtloop's own", "retuned": "its taps retuned"}
     for column, percent in enumerate(TRACED):
         wide, near = panels[:, column]
-        for part, label in ((0.05, "±5 %"), (0.001, "±0.1 %")):
+        for part, label, alpha in ((0.05, "±5 %", 0.2), (0.001, "±0.1 %", 0.7)):
             band = (1 - part) * TRACED_UM, (1 + part) * TRACED_UM
-            near.axhspan(*band, color=ink.faint, alpha=0.25, linewidth=0, label=label)
+            near.axhspan(*band, color=ink.faint, alpha=alpha, linewidth=0, label=label)
         for name, words in labels.items():
             ms, um = traces[name][percent]
             shown = ms < SHOWN_MS
