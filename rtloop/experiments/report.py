@@ -117,7 +117,7 @@ def _analysed(experiment: Experiment, takings: Sequence[Taken]) -> Analysis:
 
 def _name(taken: Taken) -> str:
     """Of the configuration that the run was derived from."""
-    return taken.recording.header["name"].split(f"-{taken.experiment}")[0]
+    return taken.recording.header["name"].rsplit(f"-{taken.experiment}", 1)[0]
 
 
 def _table(table: Table) -> dict[str, Any]:
