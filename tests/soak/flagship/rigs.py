@@ -16,7 +16,7 @@ from tests.soak.flagship.table import Row
 
 RIGS = ((150.0, 0.004, 0), (320.0, 0.02, 1), (700.0, 0.008, 0), (1500.0, 0.02, 1))
 """Resonance in Hz, damping ratio, samples of delay beside the one that every loop has."""
-RESTARTS, GENERATIONS = 4, 400
+RESTARTS, GENERATIONS = 6, 800
 
 
 def rows(say: Say) -> list[Row]:
