@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -71,6 +71,11 @@ soak-chain: $(READY)
 # What `design verify` predicts beside what 200 recorded runs show: a quarter of an hour; `DRAWS=20` for fewer.
 soak-verify: $(READY)
 	$(BIN)/python -m tests.soak.believed --draws $(or $(DRAWS),200)
+
+# The paper's loop and rtloop's own on one rig, every figure beside its goal, with pictures, in recordings/flagship: about ten
+# minutes; `DRAWS=0` for four, `FLAGS=--rigs` for other stages too.
+flagship: $(READY)
+	$(BIN)/python -m tests.soak.flagship --draws $(or $(DRAWS),500) $(FLAGS)
 
 # A service measures its own loop on rigs of known transfer function: about six minutes.
 soak-response: $(READY)

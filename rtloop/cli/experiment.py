@@ -17,6 +17,12 @@ SET = click.option(
 )
 AXIS = click.option("--axis", help="Name of the axis [the only one]; every other one rests.")
 PACED = click.option("--paced", is_flag=True, help="In real time even where virtual time would do; hardware always is.")
+BESIDE = click.option(
+    "--beside",
+    metavar="CONFIG",
+    type=OUTPUT,
+    help="Another configuration, which does the same; its figures stand beside, and its steps in the same picture.",
+)
 OUT = click.option("--out", type=OUTPUT, help="Folder for recordings and report [a new one with the recordings].")
 
 
@@ -44,12 +50,13 @@ def list_experiments() -> int:
 @SET
 @AXIS
 @PACED
+@BESIDE
 @OUT
 @JSON
 @fails_clearly
 def run(
-    names: tuple[str, ...], config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None,
-    as_json: bool,
+    names: tuple[str, ...], config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, beside: Path | None,
+    out: Path | None, as_json: bool,
 ) -> int:  # fmt: skip
     """Run experiments on the driver of CONFIG, and report.
 
@@ -59,7 +66,7 @@ def run(
     """
     from rtloop.commands.experiment import run_experiments
 
-    return run_experiments(names, config, settings, axis, paced, out, as_json)
+    return run_experiments(names, config, settings, axis, paced, out, as_json, beside)
 
 
 @experiment.command(name="all")
@@ -67,17 +74,19 @@ def run(
 @SET
 @AXIS
 @PACED
+@BESIDE
 @OUT
 @JSON
 @fails_clearly
 def run_all(
-    config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, out: Path | None, as_json: bool
-) -> int:
+    config: Path, settings: tuple[str, ...], axis: str | None, paced: bool, beside: Path | None, out: Path | None,
+    as_json: bool,
+) -> int:  # fmt: skip
     """Run every experiment that the driver of CONFIG allows."""
     from rtloop.commands.experiment import run_experiments
     from rtloop.experiments.registry import EXPERIMENTS
 
-    return run_experiments(tuple(EXPERIMENTS), config, settings, axis, paced, out, as_json)
+    return run_experiments(tuple(EXPERIMENTS), config, settings, axis, paced, out, as_json, beside)
 
 
 @experiment.command()

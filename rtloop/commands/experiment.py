@@ -27,7 +27,7 @@ from rtloop.experiments.procedure import Experiment, Run, Unsuited
 from rtloop.experiments.registry import chosen, parameters
 from rtloop.experiments.report import Report, report, take
 from rtloop.experiments.setting import Setting
-from rtloop.hil.options import RigOptions
+from rtloop.hil.options import Options, RigOptions
 from rtloop.recording.errors import RecordingError
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.naming import recording_path
@@ -36,10 +36,19 @@ from rtloop.terminal.experiments import Progress, print_report
 from rtloop.terminal.progress import StatusLine
 
 
+class Stage(NamedTuple):
+    """A configuration, and what experiments may know of it."""
+
+    base: Configuration
+    prepared: Prepared
+    setting: Setting
+
+
 class Planned(NamedTuple):
     """One run with the configuration that it is made with; `further` is what follows from recordings, if anything."""
 
     experiment: Experiment
+    options: Options
     run: Run
     configuration: Configuration
     further: Callable[[Sequence[Path]], Planned | None] | None = None
@@ -52,27 +61,25 @@ class Planned(NamedTuple):
 
 def run_experiments(
     names: Sequence[str], config: Path, settings: Sequence[str], axis: str | None, paced: bool, out: Path | None,
-    as_json: bool,
+    as_json: bool, beside: Path | None = None,
 ) -> int:  # fmt: skip
-    """Run, record, report; returns the exit code. Raises ConfigError and what `rtloop run` raises."""
+    """Run, record, report; returns the exit code. Raises ConfigError and what `rtloop run` raises.
+
+    `beside` is another configuration that does the same experiments with the same parameters.
+    """
     experiments = chosen(names)
-    options = parameters(experiments, settings)
-    base = load(config)
-    prepared = prepare(base)
-    for warning in prepared.warnings:
-        click.echo(f"warning: {warning}", err=True)
-    about = _axis(base, axis)
-    skipped = _unsuitable(experiments, prepared, about)
-    setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real, asked=_asked(base, about))
-    folder = out or Path(base.recording.folder) / f"{base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
-    planned: list[Planned] = []
-    for experiment in experiments:
-        if experiment.name in skipped:
-            continue
-        try:
-            planned += _planned(experiment, options[experiment.name], base, setting, folder)
-        except Unsuited as reason:
-            skipped[experiment.name] = str(reason)
+    stage = _stage(config, axis)
+    folder = (
+        out or Path(stage.base.recording.folder) / f"{stage.base.name}-experiments-{time.strftime('%Y%m%dT%H%M%S')}"
+    )
+    planned, skipped = _plan(experiments, parameters(experiments, settings), stage, folder, beside=False)
+    if beside is not None:
+        fixed = {one.experiment.name: one.options for one in planned}
+        compared = [one for one in experiments if one.name in fixed]
+        other, without = _plan(compared, fixed, _stage(beside, stage.setting.axis.name), folder, beside=True)
+        planned += other
+        skipped |= {f"{name} with {beside.name}": reason for name, reason in without.items()}
+    prepared = stage.prepared
     if not planned:
         raise LoopFault("\n  ".join(["no experiment can be done", *(f"{n}: {why}" for n, why in skipped.items())]))
     with Interruption() as interruption:
@@ -109,6 +116,33 @@ def take_and_report(paths: Sequence[Path]) -> tuple[Report, dict[str, Path]]:
     return made, {path.name: path for taken in takings for path in taken.paths}
 
 
+def _stage(config: Path, axis: str | None) -> Stage:
+    """What is configured; warnings are said. Raises ConfigError."""
+    base = load(config)
+    prepared = prepare(base)
+    for warning in prepared.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    about = _axis(base, axis)
+    setting = Setting(base.loop.rate_hz, about, virgin=not prepared.facts.real, asked=_asked(base, about))
+    return Stage(base, prepared, setting)
+
+
+def _plan(
+    experiments: Sequence[Experiment], options: Mapping[str, Options], stage: Stage, folder: Path, *, beside: bool
+) -> tuple[list[Planned], dict[str, str]]:
+    """Runs, and why there are none by experiment."""
+    skipped = _unsuitable(experiments, stage.prepared, stage.setting.axis)
+    planned: list[Planned] = []
+    for experiment in experiments:
+        if experiment.name in skipped:
+            continue
+        try:
+            planned += _planned(experiment, options[experiment.name], stage, folder, beside)
+        except Unsuited as reason:
+            skipped[experiment.name] = str(reason)
+    return planned, skipped
+
+
 def _axis(base: Configuration, name: str | None) -> AxisOptions:
     names = [axis.name for axis in base.axes]
     if name is None and len(names) > 1:
@@ -125,22 +159,24 @@ def _unsuitable(experiments: Sequence[Experiment], prepared: Prepared, axis: Axi
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
-def _planned(
-    experiment: Experiment, options: Any, base: Configuration, setting: Setting, folder: Path
-) -> list[Planned]:
+def _planned(experiment: Experiment, asked_for: Options, stage: Stage, folder: Path, beside: bool) -> list[Planned]:
     """The runs of an experiment; the last one goes on where the experiment does."""
-    options = experiment.fitted(options, setting)
+    base, setting = stage.base, stage.setting
+    options = experiment.fitted(asked_for, setting)
+    if beside and options != asked_for:
+        raise Unsuited(f"axis.{setting.axis.name}: its limits allow less than what it is to be compared with does")
     runs = experiment.runs(options, setting)
     values, asked = options.model_dump(mode="json"), setting.asked.model_dump(mode="json", exclude_defaults=True)
 
     def made(run: Run, last: bool) -> Planned:
-        keep_tables(run, folder)
-        configuration = derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked)
-        return Planned(experiment, run, configuration, further if last and experiment.go_on else None)
+        keep_tables(run, folder / base.name)
+        configuration = derived(base, setting.axis.name, experiment.name, values, run, len(runs), asked, beside)
+        return Planned(experiment, options, run, configuration, further if last and experiment.go_on else None)
 
     def further(paths: Sequence[Path]) -> Planned | None:
         assert experiment.go_on is not None
-        run = experiment.go_on([one for one in take(paths) if one.experiment == experiment.name], options, setting)
+        mine = [one for one in take(paths) if (one.experiment, one.beside) == (experiment.name, beside)]
+        run = experiment.go_on(mine, options, setting)
         return None if run is None else made(run, True)
 
     return [made(run, run is runs[-1]) for run in runs]

@@ -24,10 +24,11 @@ MARK = "rtloop experiment "
 
 def derived(
     base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, runs: int,
-    asked: dict[str, Any],
+    asked: dict[str, Any], beside: bool = False,
 ) -> Configuration:  # fmt: skip
     """`base`, doing what `run`, one of `runs`, asks of `axis`, every other axis at rest; `asked` is its specification.
 
+    `beside`: it is what another configuration is to be compared with.
     Raises ConfigError.
     """
     raw = tomllib.loads(base.text)
@@ -47,6 +48,7 @@ def derived(
         "ticks": timeline.ticks,
         "parameters": parameters,
         "asked": asked,
+        "beside": beside,
         "segments": timeline.segments,
     }
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))

@@ -22,7 +22,7 @@ def page(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]]
         title=f"{content['name']}: experiments",
         when=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(content["created_unix_ns"] / 1e9)),
         content=content, pictures=pictures, links=links, skipped=skipped, headings=HEADINGS,
-        compared=compared, compared_cell=compared_cell, number=number,
+        compared=compared, compared_cell=compared_cell, beside_cell=beside_cell, number=number,
     )  # fmt: skip
 
 
@@ -35,6 +35,12 @@ def compared_cell(row: Mapping[str, Any], key: str) -> str:
     """A row's cell in such a column."""
     value = row[key]
     return "–" if value is None else f"{number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
+
+
+def beside_cell(row: Mapping[str, Any]) -> str:
+    """What the configuration that stands beside gave of a row's quantity."""
+    value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
+    return "–" if value is None else number(value) + unit
 
 
 def number(value: float) -> str:

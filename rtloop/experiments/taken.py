@@ -40,6 +40,7 @@ class Taken:
         self.ticks_planned: int = said["ticks"]
         self.segments = [Segment(*values) for values in said["segments"]]
         self.asked = SpecificationOptions.model_validate(said.get("asked", {}))
+        self.beside: bool = said.get("beside", False)
         self._may_trip: bool = said["may_trip"]
 
     @property

@@ -8,7 +8,7 @@ from typing import IO, Any
 
 from rich.markup import escape
 
-from rtloop.experiments.page import HEADINGS, compared, compared_cell, number
+from rtloop.experiments.page import HEADINGS, beside_cell, compared, compared_cell, number
 from rtloop.experiments.registry import EXPERIMENTS
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
@@ -67,14 +67,15 @@ def print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None
             shown.print(f"  [red]{escape(section['problem'])}[/]")
             continue
         keys = compared(section["rows"])
-        rows = table("", *(HEADINGS[key] for key in keys), "this run gave", "verdict")
+        second = [f"{content['beside']} gave"] if content["beside"] else []
+        rows = table("", *(HEADINGS[key] for key in keys), "this run gave", *second, "verdict")
         rows.columns[-1].justify = "left"
         for row in section["rows"]:
             unit = "" if row["unit"] == "1" else f" {row['unit']}"
             run = "–" if row["run"] is None else number(row["run"]) + unit
             beside = (escape(compared_cell(row, key)) for key in keys)
             verdict = f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]"
-            rows.add_row(f"  {row['quantity']}", *beside, run, verdict)
+            rows.add_row(f"  {row['quantity']}", *beside, run, *([beside_cell(row)] if second else []), verdict)
         shown.print(rows)
     for name, reason in skipped.items():
         shown.print(f"[bold]{name}[/] skipped: {escape(reason)}")

@@ -115,3 +115,30 @@ def test_what_cannot_be_done_is_said(tmp_path: Path) -> None:
 def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path) -> None:
     after_s = float(np.random.default_rng(1).uniform(0.0, 4.0))
     check(abort(tmp_path, after_s, "paper", str(PAPER)), tmp_path)
+
+
+def test_what_stands_beside_is_what_it_gives_alone(tmp_path: Path) -> None:
+    """Virtual time: the same run to the last bit, whatever it stands beside, and again from the recordings."""
+    robust = PAPER.with_name("robust.toml")
+    short = ("--set", "steps.levels_um=[10.0, 0.0]", "--set", "steps.dwell_s=0.1", "--json", "--out")
+    both, alone = (
+        command("run", "steps", *configurations, *short, tmp_path / name)
+        for name, configurations in (("both", (PAPER, "--beside", robust)), ("alone", (robust,)))
+    )
+    assert (both.exit_code, alone.exit_code) == (0, 0), both.output + alone.output
+    content, own = json.loads(both.stdout), rows(json.loads(alone.stdout), "steps")
+    found = rows(content, "steps")
+    assert content["beside"] == "robust"
+    assert {name: row["beside"] for name, row in found.items()} == {name: row["run"] for name, row in own.items()}
+    assert all(row["run"] != row["beside"] for row in found.values())
+    assert all(row["beside"] is None for row in own.values())
+    again = command("report", tmp_path / "both", "--json")
+    assert rows(json.loads(again.stdout), "steps") == found
+    assert "<th>robust gave</th>" in (tmp_path / "both" / "report.html").read_text(encoding="utf-8")
+
+
+def test_what_stands_beside_must_have_the_axis() -> None:
+    two = PAPER.with_name("two-axis.toml")
+    refused = command("run", "steps", two, "--axis", "y", "--beside", PAPER)
+    assert refused.exit_code != 0
+    assert "--axis y: there is no such axis; there are x" in refused.output

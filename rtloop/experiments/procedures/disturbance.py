@@ -174,6 +174,9 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
         step.plot(curves["time_ms"], curves["step"], color=ink.measured, label="position x")
         if curves["model"] is not None:
             step.plot(curves["time_ms"], curves["model"], color=ink.model, linewidth=0.9, label="model")
+    if (other := curves.get("beside")) is not None and "step" in other:
+        label = f"the same with {other['name']}"
+        step.plot(other["time_ms"], other["step"], color=ink.other, linewidth=0.9, label=label)
     step.margins(x=0)
     ink.label(step, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm")
     ink.legend(step)
@@ -183,6 +186,8 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
         left.plot(curves["hz"], curves["model_nm"], color=ink.model, linewidth=0.9, label="model, S·P")
     if curves["sines"]:
         left.plot(*zip(*curves["sines"], strict=True), "o", color=ink.measured, label="measured")
+    if other is not None and other["sines"]:
+        left.plot(*zip(*other["sines"], strict=True), "o", color=ink.other, label=other["name"])
     ink.label(left, "frequency of Ω / Hz", "amplitude of x / nm", f"sines of {curves['amplitude_um']:g} µm")
     ink.legend(left)
 

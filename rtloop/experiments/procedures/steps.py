@@ -158,6 +158,10 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     for number, one in enumerate(curves["zooms"]):
         label = "each step, divided by its height" if number == 0 else None
         zoom.plot(curves["zoom_ms"], one, color=ink.measured, linewidth=1.0, alpha=0.6, label=label)
+    if (other := curves.get("beside")) is not None:
+        for number, one in enumerate(other["zooms"]):
+            label = f"the same with {other['name']}" if number == 0 else None
+            zoom.plot(other["zoom_ms"], one, color=ink.other, linewidth=1.0, alpha=0.8, label=label)
     if curves["model"] is not None:
         zoom.plot(curves["zoom_ms"], curves["model"], color=ink.model, linewidth=1.2, label="model")
     zoom.set_xlim(0, curves["zoom_ms"][-1])

@@ -1,0 +1,59 @@
+"""Other stages: a controller is searched for each, and certified; minutes."""
+
+from __future__ import annotations
+
+import math
+
+from rtloop.configuration.axis import ModelOptions
+from rtloop.design.robust.search import robust_controller
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.linear.discretise import discretise
+from tests.soak.flagship.looped import family_loops, slowest_ringing_ms
+from tests.soak.flagship.stage import PERIOD_S, specification
+from tests.soak.flagship.stepped import Say
+from tests.soak.flagship.table import Row
+
+RIGS = ((150.0, 0.004, 0), (320.0, 0.02, 1), (700.0, 0.008, 0), (1500.0, 0.02, 1))
+"""Resonance in Hz, damping ratio, samples of delay beside the one that every loop has."""
+RESTARTS, GENERATIONS = 6, 800
+
+
+def rows(say: Say) -> list[Row]:
+    """τ and max |S| of each, over resonance ±10 %, damping × 0.5 … 2, gain ±5 %."""
+    found = []
+    for hz, damping, delay_ticks in RIGS:
+        name = f"{hz:g} Hz, damping {damping:g}, {1 + delay_ticks} samples of delay"
+        try:
+            made = robust_controller(asked(hz, damping, delay_ticks))
+            proof, loops = made.certificate, family_loops(discretise(made.controller, PERIOD_S, "matched"), made.family)
+            decay_ms, ringing_ms, peak, why = (
+                proof.decay_ms.value,
+                slowest_ringing_ms(loops),
+                proof.sensitivity.value,
+                "",
+            )
+        except NoController as error:
+            decay_ms, ringing_ms, peak, why = math.nan, math.nan, math.nan, str(error)
+        say(f"{name}: τ {decay_ms:.3g} ms, anywhere {ringing_ms:.3g} ms, max |S| {peak:.3g} {why}")
+        found += [Row(f"{name}: slowest resonance mode", "ms", 2.0, None, decay_ms, note=why),
+                  Row("  slowest oscillation anywhere", "ms", None, None, ringing_ms),
+                  Row("  largest |S|", "", 2.0, None, peak)]  # fmt: skip
+    return found
+
+
+def asked(hz: float, damping: float, delay_ticks: int) -> DesignOptions:
+    """The specification of the paper's stage, for another one: its disturbance is held up to Hz in proportion."""
+    design, omega = specification(), 2 * math.pi * hz
+    plant = ModelOptions.model_validate(
+        {"form": "factors", "gain": omega**2, "numerator": [[1.0]],
+         "denominator": [[1.0, 2 * damping * omega, omega**2]], "delay_ticks": delay_ticks}
+    )  # fmt: skip
+    specified = design.specification
+    assert specified.disturbance is not None
+    disturbance = specified.disturbance.model_copy(update={"up_to_hz": 10.0 * min(1.0, hz / 595.5)})
+    effort = {"restarts": RESTARTS, "generations": GENERATIONS, "decay_ms": None}
+    return design.model_copy(
+        update={"plant": plant, "specification": specified.model_copy(update={"disturbance": disturbance}),
+                "robust": design.robust.model_copy(update=effort)}
+    )  # fmt: skip
