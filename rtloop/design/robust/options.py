@@ -10,6 +10,8 @@ from rtloop.hil.options import Numbers, Options
 
 Ticks = Annotated[tuple[int, ...], Field(strict=False)]
 MOST_DELAY = 16
+MOST_TAPS = 128
+"""Of a row."""
 
 
 class ScenarioOptions(Options):
@@ -53,7 +55,7 @@ class RobustOptions(Options):
 class ShapeOptions(Options):
     """Taps for the reference, and the plants that they are to fit."""
 
-    taps: int = Field(default=48, ge=2, le=128)
+    taps: int = Field(default=48, ge=2, le=MOST_TAPS)
     """Of each row."""
     settling_ms: float | None = Field(default=None, gt=0)
     """Settle by then, with the least variation of v; none: as fast as can be."""
