@@ -35,6 +35,8 @@ TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
 """Of the resonance that taps fit, where [shape.scenarios] is left out."""
 PERIODS = 2.9
 """Of the slowest leading mode, that the taps last where their number is left out."""
+FEWEST_POINTS = 3
+"""Of a tick, in the programme of many taps; the proof looks at as many as ever."""
 HELD, SLOWER = 0.1, 100.0
 """Where a specification has no disturbance, |S| at the slowest leading mode's frequency divided by SLOWER."""
 
@@ -71,6 +73,7 @@ def designed_robustly(
         subject = subject_of(chosen, check, _with_taps(asked, found.family))
     except ValueError as error:
         raise NoDesign(f"axis.{chosen.name}.{error}") from None
+    subject = _within_command(subject, asked)
     subject, taps = _taps(subject, "scenarios" in design.shape.model_fields_set, progress)
     comments += taps_provenance(taps, subject, spec_name)
     text = text_with(stage, {**parts, "prefilter": taps_values(taps)}, comments, axis, spec_name)
@@ -132,19 +135,34 @@ def _with_disturbance(asked: DesignOptions) -> DesignOptions:
 
 
 def _with_taps(asked: DesignOptions, family: Family) -> DesignOptions:
-    """`asked` with as many taps as the slowest leading mode needs."""
+    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are."""
     shape: ShapeOptions = asked.shape
     if "taps" in shape.model_fields_set:
         return asked
     lasting = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
     taps = min(max(lasting, shape.taps), MOST_TAPS)
-    return asked.model_copy(update={"shape": shape.model_copy(update={"taps": taps})})
+    points = max(FEWEST_POINTS, shape.points_per_tick * shape.taps // taps)
+    given = {"taps": taps, "points_per_tick": points}
+    if "points_per_tick" in shape.model_fields_set:
+        given.pop("points_per_tick")
+    return asked.model_copy(update={"shape": shape.model_copy(update=given)})
 
 
 def _slowest_hz(family: Family) -> float:
     """Of the leading modes; a tenth of the rate where there is none."""
     leading = np.abs(family.modes[list(family.leading)]) / (2 * np.pi)
     return float(np.min(leading, initial=0.1 / family.period_s))
+
+
+def _within_command(subject: Subject, asked: DesignOptions) -> Subject:
+    """v no larger than the specification says that a step may need, where that is more than the step."""
+    command, bounds = asked.specification.command, subject.bounds
+    if command is None or command.command_um <= command.reference_um:
+        return subject
+    limited = bounds._replace(
+        low_um=max(bounds.low_um, -command.command_um), high_um=min(bounds.high_um, command.command_um)
+    )
+    return replace(subject, bounds=limited)
 
 
 def _taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject, Shaped]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
-from rtloop.design.robust.programme import BAND, Bounds, Programme, Taps
+from rtloop.design.robust.programme import BAND, INSIDE, Bounds, Programme, Taps
 from rtloop.design.robust.responses import Responses, horizon, responses
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.errors import NoDesign
@@ -104,7 +104,8 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
         if rounds == ROUNDS:
             raise NoDesign(_unproved(subject, settling * tick_ms, kept, len(judged)))
         scenarios += new
-        aim *= min(1.0, subject.overshoot / max(kept.overshoot, 1e-12))
+        if kept.overshoot > subject.overshoot:
+            aim *= INSIDE * subject.overshoot / kept.overshoot
     time, position, command = _steps(subject, taps, family.nominal)
     drawn = trade_off(programme, fastest, tick_ms) if curve else ()
     variation = float(np.sum(np.abs(np.diff(command, prepend=0.0))))

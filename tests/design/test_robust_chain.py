@@ -1,0 +1,163 @@
+"""`design auto --robust`: from two recordings to a loop with taps; what is refused, and what a stage of many modes gets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy import signal
+
+from rtloop.cli import main
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
+from rtloop.design.identification.identify_dynamics import identify_dynamics
+from rtloop.design.identification.prediction_error import Excitation
+from rtloop.design.robust import certificate
+from rtloop.design.robust import shape as shape_module
+from rtloop.design.robust.options import ScenarioOptions
+from rtloop.design.robust.scenarios import Family
+from rtloop.linear.transfer import Transfer
+from tests.recording.real_loop import record
+from tests.soak.chain import run
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+PERIOD_S = 1e-4
+SPEC = """
+[specification]
+overshoot_percent = 4.0
+[specification.command]
+reference_um = 18.0
+command_um = 19.5
+[scenarios]
+resonance_percent = {percent}
+[robust]
+biquads = 1
+restarts = 2
+generations = 60
+[shape]
+taps = 30
+points_per_tick = 3
+[shape.scenarios]
+resonance_percent = 1.0
+damping = [1.0]
+gain_percent = 0.0
+[simulation]
+steps_um = [10.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recorded")
+    return [
+        str(record(folder / f"{name}.mcap", (DEPLOY / f"{name}.toml").read_text(encoding="utf-8"), ticks)[0])
+        for name, ticks in (("own-stage-sine", 25_000), ("own-stage", 10_000))
+    ]
+
+
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch) -> None:
+    """In the proofs: those of the search and of the taps have tests of their own."""
+    monkeypatch.setattr(certificate, "SWEPT", 3)
+    monkeypatch.setattr(certificate, "DRAWN", 10)
+    monkeypatch.setattr(shape_module, "PLACES", 3)
+    monkeypatch.setattr(shape_module, "PROVED", 5)
+
+
+def automatically(recordings, folder, text: str):
+    (folder / "spec.toml").write_text(text, encoding="utf-8")
+    arguments = [*recordings, "--robust", "--specs", folder / "spec.toml", "--out", folder / "made.toml", "--json"]
+    return CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
+
+
+def test_two_recordings_become_a_loop_with_taps_that_keeps_its_promise(recordings, tmp_path) -> None:
+    """The step on the rig is the one that is promised; the interlocks are armed; progress is on stderr alone."""
+    result = automatically(recordings, tmp_path, SPEC.format(percent=3.0))
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["meets"]
+    (axis,) = load(tmp_path / "made.toml").axes
+    assert sum(axis.prefilter.taps) == pytest.approx(1.0, abs=1e-9)
+    assert len(axis.prefilter.taps) == len(axis.prefilter.command_taps) == 30
+    assert axis.interlocks.oscillation_swings > 0
+    assert axis.model is not None
+    assert axis.model.delay_ticks == 1
+    promised = prepare(load(tmp_path / "made.toml")).checks[0].running
+    trips, distances = run(tmp_path / "made.toml", promised)
+    assert trips == []
+    assert abs(distances["overshoot_percent"]) < 1.0
+    assert abs(distances["settling_ms"]) < 0.15 * 1e3 * promised.settling_time_s + 0.1
+
+
+def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_path) -> None:
+    wide = automatically(recordings, tmp_path, SPEC.format(percent=45.0).replace("generations = 60", "generations = 5"))
+    assert wide.exit_code == 1
+    assert "would help" in wide.stderr
+    assert "Traceback" not in wide.output
+    assert not (tmp_path / "made.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [("overshoot_percent = 4.0", "overshoot_percent"), ("reference_um = 18.0\ncommand_um = 19.5", "reference_um")],
+)
+def test_a_specification_that_says_too_little_is_refused_first(recordings, tmp_path, line, key) -> None:
+    text = SPEC.format(percent=3.0).replace(line, "").replace("[specification.command]\n\n", "")
+    result = automatically(recordings, tmp_path, text)
+    assert result.exit_code == 78
+    assert key in result.stderr
+    assert "search" not in result.stderr
+
+
+def modal(hz, damping, gain) -> Transfer:
+    """Σ g ω²/(s² + 2ζω s + ω²), by scipy's polynomials."""
+    omega = 2 * np.pi * np.array(hz)
+    below = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(damping, omega, strict=True)]
+    above = np.poly1d([0.0])
+    for i, w in enumerate(omega):
+        above += np.prod([one for k, one in enumerate(below) if k != i], axis=0) * np.poly1d([gain[i] * w**2])
+    poles = np.concatenate([one.roots for one in below])
+    return Transfer.from_zpk(above.roots, poles, above.coeffs[0])
+
+
+def test_of_many_light_modes_those_that_stand_out_move_by_themselves() -> None:
+    hz, damping, gain = [200.0, 500.0, 900.0, 1500.0], [0.02, 0.02, 0.003, 0.02], [0.9, 0.02, 0.06, 0.02]
+    family = Family(modal(hz, damping, gain), 1, ScenarioOptions(), PERIOD_S)
+    assert family.leading == (0, 2)  # g/2ζ: 22, 0.5, 10, 0.5
+    shifts = {one.resonance for one in family.corners()}
+    assert {(10.0, 0.0, -10.0, 0.0), (-10.0, 0.0, 10.0, 0.0), (10.0,) * 4, (-10.0,) * 4} <= shifts
+    assert all(one[1] == one[3] == 0 or len(set(one)) == 1 for one in shifts)
+    assert np.all([len(set(one.resonance)) == 4 for one in family.drawn(20, 0)])  # the proof moves each
+    bands = family.bands / (2 * np.pi)
+    expected = [[110.0, np.sqrt(200 * 500)], [np.sqrt(500 * 900), np.sqrt(900 * 1500)]]
+    np.testing.assert_allclose(bands, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.6])
+def test_a_delay_by_a_part_of_a_tick_leaves_a_model_of_finite_poles(fraction) -> None:
+    """What a pole at z ≈ 0 says is in the model, which answers as the plant between 10 Hz and 2 kHz."""
+    omega, ratio, over = 2 * np.pi * 800.0, 0.02, 10
+    late = round(fraction * over)
+    above, below, _ = signal.cont2discrete(([omega**2], [1, 2 * ratio * omega, omega**2]), PERIOD_S / over, "zoh")
+
+    def measured(drive):
+        fine = np.concatenate([np.zeros(late), np.repeat(drive, over)])[: drive.size * over]
+        return signal.lfilter(above.ravel(), below, fine)[::over]
+
+    drive = np.zeros(3000)
+    drive[300:1700] = 10.0
+    noise = np.random.default_rng(0).normal(0, 0.003, drive.size)
+    fit = identify_dynamics(Excitation("late", drive, measured(drive) + noise, PERIOD_S), 3)
+    assert np.all(np.isfinite(fit.transfer.poles))
+    assert np.all(-fit.transfer.poles.real < 20 / PERIOD_S)
+    impulse = measured(np.eye(1, 4000)[0])
+    hz = np.geomspace(10.0, 2000.0, 40)
+    z = np.exp(2j * np.pi * hz * PERIOD_S)
+    truth = np.array([np.sum(impulse * one ** -np.arange(4000.0)) for one in z])
+    poles, zeros = fit.transfer.poles, fit.transfer.zeros
+    a, b, c, d = signal.zpk2ss(zeros, poles, fit.transfer.gain)
+    ad, bd, cd, dd, _ = signal.cont2discrete((a, b, c, d), PERIOD_S, "zoh")
+    answer = [(cd @ np.linalg.solve(one * np.eye(ad.shape[0]) - ad, bd) + dd).item() for one in z]
+    answer = np.array(answer) * z ** -float(fit.delay_ticks)
+    assert np.max(np.abs(answer / truth - 1)) < 0.03
