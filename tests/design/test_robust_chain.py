@@ -25,7 +25,7 @@ DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PERIOD_S = 1e-4
 SPEC = """
 [specification]
-overshoot_percent = 4.0
+overshoot_percent = 1.5
 [specification.command]
 reference_um = 18.0
 command_um = 19.5
@@ -100,7 +100,7 @@ def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_pa
 
 @pytest.mark.parametrize(
     ("line", "key"),
-    [("overshoot_percent = 4.0", "overshoot_percent"), ("reference_um = 18.0\ncommand_um = 19.5", "reference_um")],
+    [("overshoot_percent = 1.5", "overshoot_percent"), ("reference_um = 18.0\ncommand_um = 19.5", "reference_um")],
 )
 def test_a_specification_that_says_too_little_is_refused_first(recordings, tmp_path, line, key) -> None:
     text = SPEC.format(percent=3.0).replace(line, "").replace("[specification.command]\n\n", "")

@@ -46,6 +46,9 @@ noise_um = {noise_um}
 [robust]
 restarts = {restarts}
 generations = {generations}
+[shape]
+taps = 40
+points_per_tick = 3
 """
 
 

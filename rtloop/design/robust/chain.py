@@ -35,6 +35,8 @@ TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
 """Of the resonance that taps fit, where [shape.scenarios] is left out."""
 PERIODS = 2.9
 """Of the slowest leading mode, that the taps last where their number is left out."""
+NARROW_PERCENT = 2.5
+"""Half of the band for settling: what the inverse leaves of hysteresis, and noise, may take the other half."""
 FEWEST_POINTS = 3
 """Of a tick, in the programme of many taps; the proof looks at as many as ever."""
 HELD, SLOWER = 0.1, 100.0
@@ -135,16 +137,14 @@ def _with_disturbance(asked: DesignOptions) -> DesignOptions:
 
 
 def _with_taps(asked: DesignOptions, family: Family) -> DesignOptions:
-    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are."""
+    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, and a
+    band that leaves room for what is not linear."""
     shape: ShapeOptions = asked.shape
-    if "taps" in shape.model_fields_set:
-        return asked
     lasting = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
     taps = min(max(lasting, shape.taps), MOST_TAPS)
     points = max(FEWEST_POINTS, shape.points_per_tick * shape.taps // taps)
-    given = {"taps": taps, "points_per_tick": points}
-    if "points_per_tick" in shape.model_fields_set:
-        given.pop("points_per_tick")
+    open_ones = {"taps": taps, "points_per_tick": points, "band_percent": NARROW_PERCENT}
+    given = {name: value for name, value in open_ones.items() if name not in shape.model_fields_set}
     return asked.model_copy(update={"shape": shape.model_copy(update=given)})
 
 

@@ -119,7 +119,7 @@ def programme_of(subject: Subject, scenarios: list[Scenario]) -> Programme:
     family, options = subject.family(), subject.options
     ticks = horizon(subject.controller, family, scenarios, options.taps)
     found = [_answered(subject, family, one, options.points_per_tick, ticks) for one in scenarios]
-    return Programme(found, options.taps, options.points_per_tick, subject.bounds)
+    return Programme(found, options.taps, options.points_per_tick, subject.bounds, options.band_percent / 100)
 
 
 def fastest_settling(programme: Programme, overshoot: float, at_least: float = 0.0) -> float | None:
