@@ -2,7 +2,7 @@
 
 Each rig is recorded under a slow sine and under steps; `design auto` designs for it in both ways; what --robust wrote
 then runs steps up and down, each many times, in virtual time, with noise on. A row says what was promised and what was
-seen, of the mean of all cycles, in which the noise is a fifth; or the refusal. Ends with 1 where an error other than a
+seen, of the mean of all cycles, in which the noise is a fifth (1 µm: of single steps); or the refusal. Ends with 1 where an error other than a
 refusal came, a loop tripped, or a run was further from its promise than LIMITS. Promised is the linear step; for steps
 of 1 µm, of which the dead band and what the inverse leaves are a large part, the simulated one.
 """
@@ -26,6 +26,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.simulated import simulate
 from rtloop.errors import RtloopError
+from rtloop.recording.views.steps import step_metrics
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, noisy_rig
@@ -119,7 +120,8 @@ def one(rig: ModalRig, folder: Path, restarts: int, generations: int) -> tuple[b
     )
     linear, small, dwell_s = promised(written)
     for height_um in (SMALL_UM, *(height for height in HEIGHTS_UM if height <= reference_um)):
-        expected, seen = small if height_um == SMALL_UM else linear, run(written, height_um, dwell_s)
+        expected = small if height_um == SMALL_UM else linear
+        seen = run(written, height_um, dwell_s, averaged=height_um != SMALL_UM)
         near = seen.near(expected) and not seen.trips
         good = good and near
         words += (
@@ -147,8 +149,10 @@ def promised(written: Path) -> tuple[Seen, Seen, float]:
     return linear, Seen(step.settling_ms, step.overshoot_percent), min(max(12 * found.slowest_s, 0.1), 1.0)
 
 
-def run(written: Path, height_um: float, dwell_s: float) -> Seen:
-    """CYCLES steps up and down under another seed than the verification's; the worse of both means."""
+def run(written: Path, height_um: float, dwell_s: float, *, averaged: bool) -> Seen:
+    """CYCLES steps up and down under another seed than the verification's; the worse of both means, or, as simulated
+    steps are judged, the worst of the first four.
+    """
     configuration = load(written)
     rig = configuration.driver_options
     levels = f'kind = "steps"\nlevels = [0.0, {height_um}]\ndwell_s = {dwell_s}'
@@ -159,6 +163,11 @@ def run(written: Path, height_um: float, dwell_s: float) -> Seen:
         old.unlink()
     recording = rtloop.load(record(written.with_name("run.mcap"), text, 2 * ticks * (CYCLES + 1))[0])
     trips = sorted({cause for value in np.unique(recording["flags"]) for cause in trip_causes(value)})
+    if not averaged:
+        first = slice(0, 5 * ticks)
+        worst = step_metrics(recording["x_reference_um"][first], recording["x_true_position_um"][first], RATE_HZ)
+        assert worst is not None
+        return Seen(worst.settling_time_ms_worst, worst.overshoot_percent_worst, tuple(trips))
     cycles = recording["x_true_position_um"].reshape(CYCLES + 1, 2, ticks)[1:]
     low, high = cycles.mean(axis=0)
     sides = [
