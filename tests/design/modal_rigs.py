@@ -37,7 +37,7 @@ poles = [[-0.6, 0.0]]
 
 
 class ModalRig(NamedTuple):
-    """`hz`, `damping`, `gain` (n,) of the modes; weights like those of eq (4); noise of the sensor, or the default's."""
+    """`hz`, `damping`, `gain` (n,) of the modes; weights like those of eq (4); the sensor's noise, or the default."""
 
     seed: int
     hz: np.ndarray[Any, Any]

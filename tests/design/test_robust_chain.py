@@ -1,4 +1,4 @@
-"""`design auto --robust`: from two recordings to a loop with taps; what is refused, and what a stage of many modes gets."""
+"""`design auto --robust`: recordings to a loop with taps; what is refused; stages of many modes, delays by parts of a tick."""
 
 import json
 from pathlib import Path

@@ -2,7 +2,8 @@
 
 Each rig is recorded under a slow sine and under steps; `design auto` designs for it in both ways; what --robust wrote
 then runs steps up and down, each many times, in virtual time, with noise on. A row says what was promised and what was
-seen, of the mean of all cycles, in which the noise is a fifth (1 µm: of single steps); or the refusal. Ends with 1 where an error other than a
+seen, of the mean of all cycles, in which the noise is a fifth (1 µm: of single steps); or the refusal.
+ Ends with 1 where an error other than a
 refusal came, a loop tripped, or a run was further from its promise than LIMITS. Promised is the linear step; for steps
 of 1 µm, of which the dead band and what the inverse leaves are a large part, the simulated one.
 """
@@ -26,8 +27,8 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.simulated import simulate
 from rtloop.errors import RtloopError
-from rtloop.recording.views.steps import step_metrics
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
+from rtloop.recording.views.steps import step_metrics
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, noisy_rig
 from tests.recording.real_loop import record

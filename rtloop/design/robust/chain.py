@@ -137,8 +137,8 @@ def _with_disturbance(asked: DesignOptions) -> DesignOptions:
 
 
 def _with_taps(asked: DesignOptions, family: Family) -> DesignOptions:
-    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, and a
-    band that leaves room for what is not linear."""
+    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, in
+    a band that leaves room for what is not linear."""
     shape: ShapeOptions = asked.shape
     lasting = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
     taps = min(max(lasting, shape.taps), MOST_TAPS)
