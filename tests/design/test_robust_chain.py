@@ -1,18 +1,17 @@
-"""`design auto --robust`: recordings to a loop with taps; what is refused; stages of many modes, delays by parts of a tick."""
+"""`design auto --robust`: recordings to a loop with taps; refusals; many modes; poles beyond reach."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy import signal
 
 from rtloop.cli import main
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from rtloop.design.identification.identify_dynamics import identify_dynamics
-from rtloop.design.identification.prediction_error import Excitation
+from rtloop.design.identification.identify_dynamics import _within_reach
 from rtloop.design.robust import certificate
 from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions
@@ -116,7 +115,8 @@ def modal(hz, damping, gain) -> Transfer:
     below = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(damping, omega, strict=True)]
     above = np.poly1d([0.0])
     for i, w in enumerate(omega):
-        above += np.prod([one for k, one in enumerate(below) if k != i], axis=0) * np.poly1d([gain[i] * w**2])
+        others = [one for k, one in enumerate(below) if k != i]
+        above += math.prod(others, start=np.poly1d([gain[i] * w**2]))
     poles = np.concatenate([one.roots for one in below])
     return Transfer.from_zpk(above.roots, poles, above.coeffs[0])
 
@@ -134,30 +134,16 @@ def test_of_many_light_modes_those_that_stand_out_move_by_themselves() -> None:
     np.testing.assert_allclose(bands, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("fraction", [0.3, 0.6])
-def test_a_delay_by_a_part_of_a_tick_leaves_a_model_of_finite_poles(fraction) -> None:
-    """What a pole at z ≈ 0 says is in the model, which answers as the plant between 10 Hz and 2 kHz."""
-    omega, ratio, over = 2 * np.pi * 800.0, 0.02, 10
-    late = round(fraction * over)
-    above, below, _ = signal.cont2discrete(([omega**2], [1, 2 * ratio * omega, omega**2]), PERIOD_S / over, "zoh")
+def test_a_pole_beyond_reach_in_s_is_a_finite_one_that_answers_alike_at_the_ticks() -> None:
+    """What identification makes of a delay by a part of a tick: a pole at z ≈ 0, here at −1e25 rad/s."""
+    rates = np.array([-1e25, complex(-100.0, 5000.0), complex(-100.0, -5000.0)])
+    residues = np.array([[0.3, 0.1 - 0.2j, 0.1 + 0.2j]])
+    reach, kept = _within_reach(rates, residues, PERIOD_S)
+    assert -20 / PERIOD_S < reach[0].real < -10 / PERIOD_S
+    np.testing.assert_array_equal(reach[1:], rates[1:])
+    z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 30) * PERIOD_S)
 
-    def measured(drive):
-        fine = np.concatenate([np.zeros(late), np.repeat(drive, over)])[: drive.size * over]
-        return signal.lfilter(above.ravel(), below, fine)[::over]
+    def answer(poles, parts):
+        return np.sum(parts[0] / (z[:, None] - np.exp(poles * PERIOD_S)), axis=1)
 
-    drive = np.zeros(3000)
-    drive[300:1700] = 10.0
-    noise = np.random.default_rng(0).normal(0, 0.003, drive.size)
-    fit = identify_dynamics(Excitation("late", drive, measured(drive) + noise, PERIOD_S), 3)
-    assert np.all(np.isfinite(fit.transfer.poles))
-    assert np.all(-fit.transfer.poles.real < 20 / PERIOD_S)
-    impulse = measured(np.eye(1, 4000)[0])
-    hz = np.geomspace(10.0, 2000.0, 40)
-    z = np.exp(2j * np.pi * hz * PERIOD_S)
-    truth = np.array([np.sum(impulse * one ** -np.arange(4000.0)) for one in z])
-    poles, zeros = fit.transfer.poles, fit.transfer.zeros
-    a, b, c, d = signal.zpk2ss(zeros, poles, fit.transfer.gain)
-    ad, bd, cd, dd, _ = signal.cont2discrete((a, b, c, d), PERIOD_S, "zoh")
-    answer = [(cd @ np.linalg.solve(one * np.eye(ad.shape[0]) - ad, bd) + dd).item() for one in z]
-    answer = np.array(answer) * z ** -float(fit.delay_ticks)
-    assert np.max(np.abs(answer / truth - 1)) < 0.03
+    np.testing.assert_allclose(answer(reach, kept), answer(rates, residues), rtol=1e-5)

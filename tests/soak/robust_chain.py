@@ -27,6 +27,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.simulated import simulate
 from rtloop.errors import RtloopError
+from rtloop.hil.options import RigOptions
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.recording.views.steps import step_metrics
 from rtloop.signals import trip_causes
@@ -156,6 +157,7 @@ def run(written: Path, height_um: float, dwell_s: float, *, averaged: bool) -> S
     """
     configuration = load(written)
     rig = configuration.driver_options
+    assert isinstance(rig, RigOptions)
     levels = f'kind = "steps"\nlevels = [0.0, {height_um}]\ndwell_s = {dwell_s}'
     text = written.read_text(encoding="utf-8").replace('kind = "hold"\nvalue = 0.0', levels)
     text = text.replace(f"seed = {rig.seed}", f"seed = {rig.seed + 1000}")
