@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -67,6 +67,10 @@ soak-identification: $(READY)
 # Recordings, identification, synthesis and a run on forty rigs drawn at random: about ten minutes.
 soak-chain: $(READY)
 	$(BIN)/python -m tests.soak.chain
+
+# The same by `design auto --robust`, promise beside run, on DRAWS rigs (20): a minute or two of one core each.
+soak-robust: $(READY)
+	$(BIN)/python -m tests.soak.robust_chain --draws $(or $(DRAWS),20)
 
 # What `design verify` predicts beside what 200 recorded runs show: a quarter of an hour; `DRAWS=20` for fewer.
 soak-verify: $(READY)

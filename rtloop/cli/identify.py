@@ -146,21 +146,26 @@ def compensation(
 @click.option("--out", type=OUTPUT, required=True, help="The configuration to write, never over an existing file.")
 @AXIS
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
+@click.option(
+    "--robust", is_flag=True, help="Damp the resonance, and make both rows of taps: minutes instead of seconds."
+)
 @JSON
 @fails_clearly
 def auto(
-    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, as_json: bool
-) -> int:
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, robust: bool,
+    as_json: bool,
+) -> int:  # fmt: skip
     """Identify, synthesise, write a configuration, verify it.
 
-    Two recordings and a specification go in; the configuration that comes out runs.
+    Two recordings and a specification go in; the configuration that comes out runs. With --robust the controller is one
+    that "design robust" finds, with the taps of "design shape", as [scenarios], [robust] and [shape] ask.
 
     HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
     the loop misses the specification; the configuration is written all the same.
     """
     from rtloop.commands.design_auto import design_from_recordings
 
-    return design_from_recordings(hysteresis, step, specs, out, axis, order, as_json)
+    return design_from_recordings(hysteresis, step, specs, out, axis, order, robust, as_json)
 
 
 def _show(report: dict[str, Any], as_json: bool, for_people: Callable[[dict[str, Any]], None]) -> None:

@@ -10,24 +10,35 @@ import click
 from rtloop.commands.design import verify_configuration
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.design.chain import Chain, configuration_text, designed
+from rtloop.design.chain import Chain, configuration_text, designed, identified
 from rtloop.design.identification.identified import write_new
 from rtloop.design.identification.measured import measured
+from rtloop.design.robust.chain import RobustChain, designed_robustly, require_enough
+from rtloop.design.robust.search import Progress
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, NoDesign
+from rtloop.terminal.robust import print_shaped
 
 
 def design_from_recordings(
-    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, as_json: bool
-) -> int:
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None, order: int | None, robust: bool,
+    as_json: bool,
+) -> int:  # fmt: skip
     """Write the configuration `out`, verify it, and return the verdict's exit code. Raises RtloopError."""
+    if robust:
+        made = write_robust_design(hysteresis, step, specs, out, axis, order, lambda line: click.echo(line, err=True))
+        print_shaped(made.taps, made.subject)
+        click.echo(
+            f"{out}: {made.stage.described()}; bears resonances within ±{made.design.scenarios.resonance_percent:g} %, "
+            f"{made.subject.options.taps} taps a row for ±{made.subject.options.scenarios.resonance_percent:g} %",
+            err=True,
+        )
+        return verify_configuration(out, None, None, as_json)
     chain = write_design(hysteresis, step, specs, out, axis, order)
-    dynamics, found = chain.dynamics, chain.synthesis
-    modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in dynamics.modes)
+    found = chain.synthesis
     click.echo(
-        f"{out}: h/H {chain.hysteresis.model_loop.percent:.2f} %; {modes}; {dynamics.delay_ticks} samples of delay; "
-        f"γ {found.achieved:.4g}, controller of order {found.controller.order}",
+        f"{out}: {chain.stage.described()}; γ {found.achieved:.4g}, controller of order {found.controller.order}",
         err=True,
     )
     return verify_configuration(out, None, None, as_json)
@@ -38,16 +49,41 @@ def write_design(
 ) -> Chain:
     """From two recordings and a specification to a configuration at `out` that `check` accepts. Raises RtloopError."""
     specification = load_specification(specs)
-    slow, fast = measured(hysteresis, axis), measured(step, axis)
+    stage = identified(measured(hysteresis, axis), measured(step, axis), order)
     try:
-        chain = designed(slow, fast, specification.design, order)
+        chain = designed(stage, specification.design)
     except NoController as error:
         raise NoDesign(f"{specs}: {error}") from None
     except ValueError as error:
         raise ConfigError(str(specs), [str(error)]) from None
-    folder = out.resolve().parent
-    name = os.path.relpath(specs.resolve(), folder)
-    text = configuration_text(chain, slow, fast, axis, name, specification.text)
-    prepare(parse(text, out.stem, folder, str(out)))
-    write_new(out, text)
+    _write(configuration_text(chain, axis, _beside(specs, out), specification.text), out)
     return chain
+
+
+def write_robust_design(
+    hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None,
+    progress: Progress = lambda _: None,
+) -> RobustChain:  # fmt: skip
+    """The same with a controller that damps the resonance, and taps. Raises RtloopError."""
+    specification = load_specification(specs)
+    require_enough(specification.design, str(specs))
+    stage = identified(measured(hysteresis, axis), measured(step, axis), order)
+    progress(stage.described())
+    try:
+        chain, text = designed_robustly(
+            stage, specification.design, axis, out.resolve().parent, _beside(specs, out), specification.text, progress
+        )
+    except NoDesign as error:
+        raise NoDesign(f"{specs}: {error}") from None
+    _write(text, out)
+    return chain
+
+
+def _beside(specs: Path, out: Path) -> str:
+    return os.path.relpath(specs.resolve(), out.resolve().parent)
+
+
+def _write(text: str, out: Path) -> None:
+    """Checked as `check` does, then written."""
+    prepare(parse(text, out.stem, out.resolve().parent, str(out)))
+    write_new(out, text)

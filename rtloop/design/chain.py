@@ -3,7 +3,8 @@
     slow sine ──► hysteresis P̂ ─┬─► [axis.feedforward] ──────────┐
     step ───────────────────────┴─► D(s), D(0) = 1 ─► [axis.model] ─► H∞, reduction ─► [axis.controller]
 
-Driver, limits and interlocks are those of the configuration that the step was recorded with.
+Driver, limits and interlocks are those of the configuration that the step was recorded with. `robust.chain` goes on
+from the model in the other way, with a controller that damps and taps that make the step.
 """
 
 from __future__ import annotations
@@ -44,31 +45,55 @@ SWINGS = 8
 
 
 @dataclass(frozen=True)
-class Chain:
-    """What every step found; `actuator` is the hysteresis with the static gain of the dynamics in it."""
+class Stage:
+    """What two recordings tell; `actuator` is the hysteresis with the static gain of the dynamics in it."""
 
+    slow: Measured
+    fast: Measured
     hysteresis: HysteresisFit
     dynamics: DynamicsFit
     actuator: PlayModel
+
+    def asked(self, design: DesignOptions) -> DesignOptions:
+        """`design` for the identified plant at the rate of its recording."""
+        plant = ModelOptions.model_validate(model_values(self.dynamics))
+        output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
+        return design.model_copy(update={"plant": plant, "controller": output})
+
+    def described(self) -> str:
+        """h/H, modes and delay, in a line."""
+        modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
+        delay = f"{self.dynamics.delay_ticks} samples of delay"
+        return f"h/H {self.hysteresis.model_loop.percent:.2f} %; {modes}; {delay}"
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What every step found."""
+
+    stage: Stage
     design: DesignOptions
     synthesis: Synthesis
 
 
-def designed(hysteresis: Measured, step: Measured, design: DesignOptions, order: int | None = None) -> Chain:
-    """Identify from two recordings and synthesise for `design`, whose plant is replaced by the identified one.
-
-    Raises UnsuitableData where a recording cannot serve, NoController and ValueError as the synthesis does.
-    """
+def identified(hysteresis: Measured, step: Measured, order: int | None = None) -> Stage:
+    """The stage of two recordings. Raises UnsuitableData where one cannot serve."""
     if not step.even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     shape = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
     _require_explained(step, dynamics)
-    plant = ModelOptions.model_validate(model_values(dynamics))
-    output = design.controller.model_copy(update={"rate_hz": 1 / step.period_s})
-    asked = design.model_copy(update={"plant": plant, "controller": output})
-    return Chain(shape, dynamics, with_gain(shape.model, dynamics.static_gain), asked, synthesise_design(asked))
+    return Stage(hysteresis, step, shape, dynamics, with_gain(shape.model, dynamics.static_gain))
+
+
+def designed(stage: Stage, design: DesignOptions) -> Chain:
+    """Synthesise for `design`, whose plant is replaced by the identified one.
+
+    Raises NoController and ValueError as the synthesis does.
+    """
+    asked = stage.asked(design)
+    return Chain(stage, asked, synthesise_design(asked))
 
 
 def _require_explained(step: Measured, dynamics: DynamicsFit) -> None:
@@ -82,35 +107,38 @@ def _require_explained(step: Measured, dynamics: DynamicsFit) -> None:
         )
 
 
-def configuration_text(
-    chain: Chain, hysteresis: Measured, step: Measured, axis: str | None, spec_name: str, spec_text: str
-) -> str:
-    """A complete configuration: that of `step` with what was found in axis `axis` (the first), in closed loop, at rest.
+def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
+    """A complete configuration: that of the step with what was found in axis `axis` (the first), in closed loop.
 
     `spec_name` is the specification's file relative to the configuration's. Raises UnsuitableData for weights without
     an inverse.
     """
-    raw = tomllib.loads(step.configuration)
-    raw["loop"] = {key: value for key, value in raw["loop"].items() if key != "mode"}
-    raw.pop("schedule", None)
     written = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
     comments = [line.removeprefix("# ") for line in written.splitlines() if line.startswith("#")]
-    parts = {
-        "feedforward": _section(feedforward_section(chain.actuator, ()), "feedforward"),
-        "controller": _section(written, "controller"),
-        "model": model_values(chain.dynamics),
+    return text_with(chain.stage, {"controller": _section(written, "controller")}, comments, axis, spec_name)
+
+
+def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str) -> str:
+    """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), at rest."""
+    raw = tomllib.loads(stage.fast.configuration)
+    raw["loop"] = {key: value for key, value in raw["loop"].items() if key != "mode"}
+    raw.pop("schedule", None)
+    found = {
+        "feedforward": _section(feedforward_section(stage.actuator, ()), "feedforward"),
+        "model": model_values(stage.dynamics),
         "specification": spec_name,
         "reference": AT_REST,
+        **parts,
     }
-    chosen = _chosen(raw["axis"], axis)
-    parts["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), chain.dynamics, step.period_s)
-    raw["axis"] = [{**one, **parts} if one is chosen else one for one in raw["axis"]]
+    chosen = next(one for one in raw["axis"] if axis in (None, one["name"]))
+    found["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
+    raw["axis"] = [{**one, **found} if one is chosen else one for one in raw["axis"]]
     heading = [
-        *hysteresis_provenance(chain.hysteresis, [hysteresis]),
-        *dynamics_provenance(chain.dynamics, step, "hysteresis"),
+        *hysteresis_provenance(stage.hysteresis, [stage.slow]),
+        *dynamics_provenance(stage.dynamics, stage.fast, "hysteresis"),
         *comments,
     ]
-    return edited(step.configuration, raw, heading)
+    return edited(stage.fast.configuration, raw, heading)
 
 
 def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
@@ -123,7 +151,3 @@ def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, peri
 
 def _section(content: str, name: str) -> Any:
     return tomllib.loads(content)["axis"][name]
-
-
-def _chosen(axes: list[Any], name: str | None) -> Any:
-    return next(one for one in axes if name in (None, one["name"]))

@@ -37,7 +37,7 @@ poles = [[-0.6, 0.0]]
 
 
 class ModalRig(NamedTuple):
-    """`hz`, `damping`, `gain` (n,) of the modes; weights of eq (4) ± 10 %, scaled."""
+    """`hz`, `damping`, `gain` (n,) of the modes; weights like those of eq (4); the sensor's noise, or the default."""
 
     seed: int
     hz: np.ndarray[Any, Any]
@@ -45,6 +45,8 @@ class ModalRig(NamedTuple):
     gain: np.ndarray[Any, Any]
     delay_ticks: int
     weights_um_per_v: np.ndarray[Any, Any]
+    noise_um: float | None = None
+    command_um: float = 20.0
 
     def configuration(self, sine: bool) -> str:
         """For the slow sine at 1 kHz, or for the steps up and down at 10 kHz."""
@@ -76,23 +78,41 @@ class ModalRig(NamedTuple):
             f"weights_um_per_v = {self.weights_um_per_v.tolist()}",
             f'[driver.plant.dynamics]\nform = "zpk"\ngain = {leading!r}',
             *dynamics,
+            "" if self.noise_um is None else f"[driver.plant.sensor]\num_per_v = 10.0\nnoise_um = {self.noise_um!r}",
             '[[axis]]\nname = "x"',
             "[axis.feedforward]\nthresholds_v = [0.0]\nweights_um_per_v = [2.0]",
-            "[axis.limits]\ncommand_um = 20.0",
+            f"[axis.limits]\ncommand_um = {self.command_um!r}",
             "[axis.interlocks]\nposition_um = 90.0",
             f"[axis.reference]\n{reference}",
         ])  # fmt: skip
 
 
+def noisy_rig(seed: int) -> ModalRig:
+    """Slower, noisier and longer than `modal_rig`: 100 Hz to 2 kHz, 10 to 100 nm, ±43 µm, weights of eq (4) ± 30 %."""
+    random = np.random.default_rng(10_000 + seed)
+    drawn = _modes(random, 100.0, 2000.0)
+    weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.7, 1.3, len(THRESHOLDS_V))
+    noise_um = float(np.exp(random.uniform(np.log(0.01), np.log(0.1))))
+    return ModalRig(seed, *drawn, weights, noise_um, command_um=43.0)
+
+
 def modal_rig(seed: int) -> ModalRig:
     """The rig of this seed."""
     random = np.random.default_rng(seed)
+    drawn = _modes(random, 150.0, 3000.0)
+    weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.9, 1.1, len(THRESHOLDS_V)) * 20 / 43
+    return ModalRig(seed, *drawn, weights)
+
+
+def _modes(
+    random: np.random.Generator, lowest_hz: float, highest_hz: float
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any], int]:
+    """Frequencies, dampings, gains, and the delay in samples."""
     count, delay_ticks = int(random.integers(1, 7)), int(random.integers(0, 4))
     hz = np.empty(0)
     while hz.size != count or np.any(np.diff(np.log(hz)) < 0.15):
-        hz = np.sort(np.exp(random.uniform(np.log(150.0), np.log(3000.0), count)))
+        hz = np.sort(np.exp(random.uniform(np.log(lowest_hz), np.log(highest_hz), count)))
     damping = np.exp(random.uniform(np.log(0.002), np.log(0.05), count))
     gain = np.append(1.0, random.uniform(0.03, 0.2, count - 1) * random.choice([-1, 1], count - 1))
     gain[1:] *= min(1.0, 0.5 / max(float(np.abs(gain[1:]).sum()), 1e-9))
-    weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.9, 1.1, len(THRESHOLDS_V)) * 20 / 43
-    return ModalRig(seed, hz, damping, gain / gain.sum(), delay_ticks, weights)
+    return hz, damping, gain / gain.sum(), delay_ticks

@@ -30,8 +30,8 @@ def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
     """Modes and delay are the rig's own; the loop meets its specification on the model, and runs on the rig."""
     rig = modal_rig(seed)
     chain, written = designed_for(rig, tmp_path)
-    assert chain.dynamics.delay_ticks == rig.delay_ticks > 0
-    light = sorted(mode.frequency_hz for mode in chain.dynamics.modes if mode.damping < 0.1)
+    assert chain.stage.dynamics.delay_ticks == rig.delay_ticks > 0
+    light = sorted(mode.frequency_hz for mode in chain.stage.dynamics.modes if mode.damping < 0.1)
     assert light == pytest.approx(rig.hz, rel=1e-3)
     assert verdict(chain) == "meets it"
     running = prepare(load(written)).checks[0].running

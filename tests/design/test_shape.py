@@ -241,3 +241,12 @@ def test_a_configuration_that_taps_cannot_be_made_for_is_said(tmp_path, old, new
     result = shape(tmp_path, CONFIG.replace(old, new))
     assert result.exit_code == 78, result.output
     assert said in result.stderr
+
+
+def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch) -> None:
+    """A plant that no programme has seen overshoots by more, whatever is tried: that is no warning."""
+    monkeypatch.setattr(shape_module, "ROUNDS", 2)
+    real = shape_module.judged_of
+    monkeypatch.setattr(shape_module, "judged_of", lambda *of: real(*of)._replace(overshoot=0.02))
+    with pytest.raises(NoDesign, match=r"overshoot by 2 % on 9 plants"):
+        shaped(SUBJECT)

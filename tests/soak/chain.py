@@ -65,7 +65,7 @@ def one(rig: ModalRig, folder: Path) -> tuple[bool, str]:
     trips, distances = run(written, running)
     far = [name for name, limit in LIMITS.items() if not abs(distances[name]) <= limit]
     found = (
-        f"{drawn} found delay {chain.dynamics.delay_ticks}, {chain.dynamics.model.order} poles; "
+        f"{drawn} found delay {chain.stage.dynamics.delay_ticks}, {chain.stage.dynamics.model.order} poles; "
         f"γ {chain.synthesis.achieved:.3f}, order {chain.synthesis.controller.order}; {verdict(chain)}; "
         + ", ".join(f"{name} {value:+.2f}" for name, value in distances.items())
     )

@@ -31,12 +31,14 @@ from rtloop.design.identification.prediction_error import (
     rms_error,
 )
 from rtloop.design.identification.residuals import ResidualTests, residual_tests
-from rtloop.hil.modal import Real
+from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import system_of
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain
 
 Criterion = Literal["aic", "held-out", "validation"]
+FASTEST = 14.0
+"""e^−14 is less than a millionth: a mode that is left with that by the next tick is over there."""
 LEAST_EXCITED = 4
 """Poles that the input must be able to tell apart where the order is searched for."""
 
@@ -152,7 +154,8 @@ def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate,
     gain = model.static_gain
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
-    modal = held_from(rates, discrete.residues / gain, discrete.direct, model.period_s)
+    rates, residues = _within_reach(rates, discrete.residues / gain, model.period_s)
+    modal = held_from(rates, residues, discrete.direct, model.period_s)
     zeros, leading = zeros_and_gain(system_of(modal))
     transfer = Transfer.from_zpk(zeros, rates, leading)
     transfer = Transfer.from_zpk(zeros, rates, leading / transfer.dc_gain)
@@ -168,6 +171,16 @@ def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate,
         model,
         delay_ticks,
     )
+
+
+def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
+    """Rates (n,) and residues (m, n) with what died away within a tick dying away FASTEST times in it, D(0) kept.
+
+    A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
+    """
+    reach = np.maximum(rates.real, -FASTEST / period_s) + 1j * rates.imag
+    static = np.expm1(reach * period_s) / np.expm1(rates * period_s)
+    return reach, residues * static
 
 
 def _modes(model: Innovations, run: Excitation, errors: Real) -> tuple[Mode, ...]:

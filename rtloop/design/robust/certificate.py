@@ -14,7 +14,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
 from rtloop.analysis.margins import highest
-from rtloop.design.robust.objective import BAND, Walls
+from rtloop.design.robust.objective import Walls
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.linear.discretise import DiscreteController
 
@@ -72,13 +72,16 @@ def certified(controller: DiscreteController, family: Family, walls: Walls, seed
     return Certificate(len(found), *worst)
 
 
-def slowest_ms(loop: Loop, bands: Iterable[float]) -> float:
-    """Time constant in ms of the slowest closed-loop mode in BAND around one of the frequencies (rad/s); 0 for none."""
-    sizes, middle = np.abs(loop.rates.imag), list(bands)
-    counted = np.zeros(sizes.shape, bool) if middle else np.ones(sizes.shape, bool)
-    for size in middle:
-        counted |= (sizes > BAND[0] * size) & (sizes < BAND[1] * size)
-    return float(np.max(-1e3 / loop.rates.real[counted], initial=0.0)) if loop.is_stable else math.inf
+def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
+    """Time constant in ms of the slowest closed-loop mode in one of the bands (rad/s), of all where one is empty."""
+    if not loop.is_stable:
+        return math.inf
+    sizes, listed = np.abs(loop.rates.imag), list(bands)
+    counted = np.full(sizes.shape, not listed)
+    for low, high in listed:
+        within = (sizes >= low) & (sizes <= high)
+        counted |= within if within.any() else True
+    return float(np.max(-1e3 / loop.rates.real[counted], initial=0.0))
 
 
 def noise_gain(loop: Loop) -> float:
@@ -97,6 +100,6 @@ def _measured(
     if not loop.is_stable:
         return radius, math.inf, math.inf, math.inf, math.inf
     disturbance = float(loop.sensitivity(walls.disturbance_hz)[0]) if walls.disturbance_hz else 0.0
-    decay = slowest_ms(loop, np.abs(family.modes))
+    decay = slowest_ms(loop, family.bands)
     peak, _ = highest(loop.sensitivity, loop.frequencies)
     return radius, decay, peak, disturbance, noise_gain(loop)

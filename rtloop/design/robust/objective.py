@@ -1,6 +1,7 @@
 """What a search minimises: the slowest decay around the resonances over all scenarios, behind walls.
 
-    cost = log(τ/T) + 10 Σ max(0, log(value/limit))        stable in every scenario
+    cost = log(τ/T) + 10 Σ max(0, log(value/limit))        stable in every scenario; with two leading modes
+                                                           half the worst, half the mean of both log(τ/T)
          = FAR·(1 + largest |pole|)                         otherwise
 
 Everything is computed for many controllers and all scenarios at once, and stays apart from what certifies.
@@ -19,8 +20,6 @@ from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import System
 
-BAND = (0.55, 1.85)
-"""Modes of the closed loop between these multiples of a light mode's frequency are judged by their decay."""
 FAR, STEEP = 100.0, 10.0
 INSIDE = 0.99
 """A search keeps a hundredth away from its walls, for what lies between its frequencies and its scenarios."""
@@ -36,7 +35,7 @@ class Walls(NamedTuple):
 
 
 class Measures(NamedTuple):
-    """The worst over all scenarios, (k,) each: largest |pole|, τ in s, max |S|, |S| at the disturbance, noise gain."""
+    """The worst over all scenarios, (k,): largest |pole|, τ in s (k, bands), max |S|, |S| at the disturbance, noise."""
 
     radius: Real
     decay_s: Real
@@ -51,7 +50,7 @@ class Objective:
     def __init__(self, family: Family, scenarios: Sequence[Scenario], walls: Walls, sections: int):
         self.walls, self.period_s = walls, family.period_s
         self.low, self.high = bounds(sections)
-        self.bands = np.abs(family.modes)[:, None] * np.array(BAND)
+        self.bands = family.bands if family.modes.size else np.array([[0.0, np.inf]])
         plants = [sampled_plant(family.plant(one), family.period_s, one.delay_ticks) for one in scenarios]
         self.plants = _alike(plants)
         hz, self.shares = _grid(family, walls)
@@ -67,7 +66,8 @@ class Objective:
             beyond.append((found.disturbance, walls.disturbance))
         with np.errstate(invalid="ignore"):
             excess = sum(np.maximum(0, np.log(value / (INSIDE * limit))) for value, limit in beyond)
-            cost = np.log(np.maximum(found.decay_s / self.period_s, 1.0)) + STEEP * excess
+            decay = np.log(np.maximum(found.decay_s / self.period_s, 1.0))
+            cost = 0.5 * (decay.max(axis=1) + decay.mean(axis=1)) + STEEP * excess
         cost = np.where((found.radius < 1) & np.isfinite(cost), cost, FAR * (1 + np.minimum(found.radius, FAR)))
         return cost + np.sum((points - within) ** 2, axis=1)
 
@@ -77,10 +77,8 @@ class Objective:
         images = self._poles(*chosen.matrices())
         rates = np.log(np.maximum(np.abs(images), 1e-300)) / self.period_s
         sizes = np.abs(np.angle(images)) / self.period_s
-        counted = np.zeros(images.shape, bool) if self.bands.size else np.ones(images.shape, bool)
-        for low, high in self.bands:
-            counted |= (sizes > low) & (sizes < high)
-        decay = np.where(counted, -1 / np.minimum(rates, -1e-9), 0.0).max(axis=(1, 2))
+        constants = -1 / np.minimum(rates, -1e-9)
+        decay = np.stack([_slowest(constants, sizes, low, high) for low, high in self.bands], axis=1)
         controller = chosen.response(self.z)
         sensitivity = 1 / np.abs(1 + controller[:, None] * self.responses)
         noise = np.sqrt((np.abs(controller[:, None]) * sensitivity) ** 2 @ self.shares)
@@ -105,6 +103,13 @@ class Objective:
         return np.linalg.eigvals(joint).astype(complex)
 
 
+def _slowest(constants: Real, sizes: Real, low: float, high: float) -> Real:
+    """The largest of time constants (k, scenarios, n) whose poles lie in a band, of all where none does, (k,)."""
+    counted = (sizes >= low) & (sizes <= high)
+    counted |= ~counted.any(axis=2, keepdims=True)
+    return np.where(counted, constants, 0.0).max(axis=(1, 2))
+
+
 def _alike(plants: Sequence[System]) -> tuple[Real, Real, Real]:
     """Matrices stacked; plants of less delay get states that nothing moves and nobody sees."""
     order = max(plant.b.size for plant in plants)
@@ -120,7 +125,7 @@ def _grid(family: Family, walls: Walls) -> tuple[Real, Real]:
     top = 0.5 / family.period_s
     grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]
     for mode in np.abs(family.modes) / (2 * np.pi):
-        grids.append(np.linspace(0.5 * mode, 2 * mode, 50))
+        grids += [np.linspace(0.5 * mode, 2 * mode, 50), np.linspace(0.85 * mode, 1.15 * mode, 60)]
     hz = np.unique(np.minimum(np.concatenate(grids), 0.999 * top))
     edges = np.concatenate([[0.0], 0.5 * (hz[1:] + hz[:-1]), [top]])
     return np.append(max(walls.disturbance_hz, hz[0]), hz), np.append(0.0, np.diff(edges) / top)

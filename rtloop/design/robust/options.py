@@ -10,6 +10,8 @@ from rtloop.hil.options import Numbers, Options
 
 Ticks = Annotated[tuple[int, ...], Field(strict=False)]
 MOST_DELAY = 16
+MOST_TAPS = 128
+"""Of a row."""
 
 
 class ScenarioOptions(Options):
@@ -53,11 +55,14 @@ class RobustOptions(Options):
 class ShapeOptions(Options):
     """Taps for the reference, and the plants that they are to fit."""
 
-    taps: int = Field(default=48, ge=2, le=128)
+    taps: int = Field(default=48, ge=2, le=MOST_TAPS)
     """Of each row."""
     settling_ms: float | None = Field(default=None, gt=0)
     """Settle by then, with the least variation of v; none: as fast as can be."""
     undershoot_percent: float = Field(default=5.0, ge=0, lt=100)
+    band_percent: float = Field(default=5.0, gt=0, le=5)
+    """Around the final value, in which a step is to stay from the settling time on: less leaves room within ±5 % for
+    what is not linear."""
     points_per_tick: int = Field(default=10, ge=1, le=20)
     """At which the position is judged, between ticks too."""
     scenarios: ScenarioOptions = ScenarioOptions(resonance_percent=5.0, damping=(1.0,), gain_percent=0.0)

@@ -64,8 +64,8 @@ class Taps(NamedTuple):
 class Programme:
     """Of scenarios' responses; the first one is the model."""
 
-    def __init__(self, found: list[Responses], taps: int, points: int, bounds: Bounds):
-        self.taps, self.points = taps, points
+    def __init__(self, found: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
+        self.taps, self.points, self.band = taps, points, band
         self.ticks = found[0].command.shape[1]
         self.time = np.tile(np.arange(1, self.ticks * points + 1) / points, len(found))
         position = np.vstack([self._rows(one.position, points) for one in found])
@@ -108,12 +108,12 @@ class Programme:
         """Variables: taps, ε, and the absolute value of each row of `sized` times the taps."""
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         settled = self.time >= settling - 1e-9
-        low = np.concatenate([np.where(settled, 1 - INSIDE * BAND, -self.undershoot), self.low])
+        low = np.concatenate([np.where(settled, 1 - INSIDE * self.band, -self.undershoot), self.low])
         high = np.concatenate([np.full(self.time.size, 1.0), self.high])
         slack = np.concatenate([np.ones(self.time.size), np.zeros(self.command.shape[0])])
         rows = self.rows
         limits: list[tuple[float, float | None]] = [(-LARGEST_TAP, LARGEST_TAP)] * (count - 1)
-        limits += [(0.0, INSIDE * (BAND if overshoot is None else overshoot)), *[(0.0, None)] * extra]
+        limits += [(0.0, INSIDE * (self.band if overshoot is None else overshoot)), *[(0.0, None)] * extra]
         static = csr_array(np.concatenate([self.static, np.zeros(1 + extra)])[None])
         while True:
             chosen = np.flatnonzero(self.active)

@@ -10,8 +10,13 @@ import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.design.robust.options import ScenarioOptions
-from rtloop.hil.modal import Complex
+from rtloop.hil.modal import Complex, Real
 from rtloop.linear.transfer import Transfer
+
+BAND = (0.55, 1.85)
+"""Modes of the closed loop between these multiples of a light mode's frequency are judged by their decay."""
+LEADING = 2
+"""Light modes that move in every combination: those that stand out most."""
 
 
 class Scenario(NamedTuple):
@@ -35,7 +40,19 @@ class Family:
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
         self.model, self.options, self.period_s = model, options, period_s
         self.modes = light_modes(model, period_s)
+        peaks = np.abs(model.response(1j * np.abs(self.modes)))
+        self.leading = tuple(sorted(np.argsort(-peaks, kind="stable")[:LEADING].tolist()))
         self.delays = options.delay_ticks or (delay_ticks,)
+
+    @property
+    def bands(self) -> Real:
+        """Least and largest |s| of closed-loop poles that count as a leading mode's, (n, 2): no nearer to another."""
+        sizes = np.abs(self.modes)
+        between = np.concatenate([[0.0], np.sqrt(sizes[1:] * sizes[:-1]), [np.inf]])
+        bands = np.column_stack([
+            np.maximum(BAND[0] * sizes, between[:-1]), np.minimum(BAND[1] * sizes, between[1:])
+        ])  # fmt: skip
+        return bands[list(self.leading)]
 
     def plant(self, scenario: Scenario) -> Transfer:
         """The model, changed; ratios of damping and D(0) stay but for the factors asked for."""
@@ -53,12 +70,15 @@ class Family:
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
     def corners(self) -> list[Scenario]:
-        """The model, every combination of the ends, and resonances in the middle and halfway to them."""
+        """The model, every combination of the ends, and resonances in the middle and halfway to them.
+
+        Beyond LEADING light modes the others stay, or move with all: what else they may do is left to the proof.
+        """
         r, g = self.options.resonance_percent, self.options.gain_percent
         ends = sorted({*self.options.damping})
         dampings = sorted({ends[0], ends[-1]})
-        shifts = [*itertools.product(sorted({-r, 0.0, r}), repeat=self.modes.size)]
-        halfway = [*itertools.product(sorted({-r / 2, r / 2}), repeat=self.modes.size)] if self.modes.size else []
+        shifts = self._shifts(-r, 0.0, r)
+        halfway = self._shifts(-r / 2, r / 2) if self.modes.size else []
         found = [self.nominal]
         for ticks in self.delays:
             found += [
@@ -66,6 +86,15 @@ class Family:
             ]  # fmt: skip
             found += [Scenario(shift, ends[0], gain, ticks) for shift in halfway for gain in sorted({-g, g})]
         return list(dict.fromkeys(found))
+
+    def _shifts(self, *places: float) -> list[tuple[float, ...]]:
+        """Every combination for the leading modes, the others as in the model; all modes moved together."""
+        found = []
+        for combined in itertools.product(sorted({*places}), repeat=len(self.leading)):
+            shift = np.zeros(self.modes.size)
+            shift[list(self.leading)] = combined
+            found.append(tuple(shift.tolist()))
+        return [*dict.fromkeys([*found, *((place,) * self.modes.size for place in sorted({*places}))])]
 
     def swept(self, count: int) -> Iterator[Scenario]:
         """All light modes moved together, `count` places, at every corner of damping, gain and delay."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from rtloop.linear.transfer import Transfer
 POPULATION, SCREENED, SHORT, TAKEN_ON, ROUNDS = 20, 300, 4, 3, 3
 """Points of a generation; points at random of which the best starts a search; the short searches' share of generations;
 how many are taken to the end; how often the worst plants of a proof may join the scenarios."""
+LEAST_TIGHTENED = 0.9
+"""A round lowers no wall by more."""
 Progress = Callable[[str], None]
 
 
@@ -45,15 +48,13 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
         raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
     options, period_s = design.robust, 1 / design.controller.rate_hz
     family = Family(plant, design.plant.delay_ticks, design.scenarios, period_s)
-    if family.modes.size > 2:
-        raise ValueError(f"plant: {family.modes.size} light modes below half the rate; at most 2 are allowed")
-    walls = walls_of(design)
+    walls = searched = walls_of(design)
     scenarios = family.corners()
     random = np.random.default_rng(options.seed)
     best, rounds = None, 0
     while True:
         rounds += 1
-        objective = Objective(family, scenarios, walls, options.biquads)
+        objective = Objective(family, scenarios, searched, options.biquads)
         if best is None:
             best = _searched(objective, design, random, progress)
         else:
@@ -69,10 +70,10 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
         proof = certified(discretise(controller, period_s, "matched"), family, walls, options.seed)
         missed = proof.missed(walls, options.decay_ms)
         progress(f"proof over {proof.plants} plants: " + ("; ".join(missed) or "everything is kept"))
-        new = [one for one in proof.worst() if one not in scenarios]
-        if not missed or not new or rounds == ROUNDS:
+        if not missed or rounds == ROUNDS:
             break
-        scenarios = [*scenarios, *new]
+        scenarios = list(dict.fromkeys([*scenarios, *proof.worst()]))
+        searched = _tightened(searched, walls, proof)
     if missed:
         raise NoController(
             "robust: the best controller found misses: "
@@ -96,6 +97,18 @@ def walls_of(design: DesignOptions) -> Walls:
     )  # fmt: skip
 
 
+def _tightened(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
+    """Walls for another round, lower by what a proof found beyond them: a peak may stand between a search's points."""
+    found = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
+             (proof.disturbance, walls.disturbance)]  # fmt: skip
+    factors = [min(1.0, limit / worst.value) if math.isfinite(worst.value) else 1.0 for worst, limit in found]
+    sensitivity, noise, disturbance = (max(factor, LEAST_TIGHTENED) for factor in factors)
+    return Walls(
+        max(1.0, sensitivity * searched.sensitivity), noise * searched.noise_gain, disturbance * searched.disturbance,
+        walls.disturbance_hz,
+    )  # fmt: skip
+
+
 def _searched(objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress) -> Minimum:
     """The best of `restarts` short searches of which some go on."""
     options, found = design.robust, list[Minimum]()
@@ -113,10 +126,16 @@ def _searched(objective: Objective, design: DesignOptions, random: np.random.Gen
 
 def _anywhere(objective: Objective, sections: int, random: np.random.Generator) -> Real:
     """Points at random around the resonance: low gains, sections near it."""
-    middle = np.log(np.mean(objective.bands) * objective.period_s) if objective.bands.size else np.log(0.3)
+    middle = (
+        np.log(np.mean(objective.bands) * objective.period_s) if np.all(np.isfinite(objective.bands)) else np.log(0.3)
+    )
     centre = np.array([np.log(0.02), np.log(0.05), *([middle, 0.0, middle, np.log(0.5)] * sections)])
     spread = np.array([1.0, 1.0, *([0.7, 0.7, 0.7, 0.5] * sections)])
     return centre + spread * random.standard_normal((SCREENED, centre.size))
+
+
+def _listed(values: Real) -> str:
+    return "/".join(f"{value:.3f}" for value in values)
 
 
 def _words(objective: Objective, found: Minimum) -> str:
@@ -124,6 +143,6 @@ def _words(objective: Objective, found: Minimum) -> str:
     if found.cost >= FAR:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"
     return (
-        f"τ {1e3 * measures.decay_s[0]:.3f} ms, max |S| {measures.sensitivity[0]:.3f}, "
+        f"τ {_listed(1e3 * measures.decay_s[0])} ms, max |S| {measures.sensitivity[0]:.3f}, "
         f"noise gain {measures.noise_gain[0]:.2f}, |S| at the disturbance {measures.disturbance[0]:.4f}"
     )

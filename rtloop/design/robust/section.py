@@ -17,7 +17,7 @@ from rtloop.design.toml_text import edited, section
 
 def robust_section(found: Robust, design: DesignOptions, source: str, text: str) -> str:
     """[axis.controller]; the same specification gives the same text."""
-    return commented_section(found.controller, _output(design), _provenance(found, design, source, text))
+    return commented_section(found.controller, _output(design), provenance(found, design, source, text))
 
 
 def robust_configuration(
@@ -25,15 +25,15 @@ def robust_configuration(
 ) -> str:
     """A whole configuration, around a simulated rig of the plant."""
     written = design.model_copy(update={"controller": _output(design)})
-    lines = _provenance(found, design, source, text)
+    lines = provenance(found, design, source, text)
     return configuration_around(found.controller, written, lines, axis, specification)
 
 
 def with_controller(text: str, found: Robust, design: DesignOptions, source: str, spec_text: str, axis: str) -> str:
     """A configuration's `text` with the controller in its axis. Raises ValueError where it has no such axis."""
     return _with(
-        text, axis, {"controller": controller_values(found.controller, _output(design))},
-        _provenance(found, design, source, spec_text),
+        text, axis, {"controller": written_values(found, design)},
+        provenance(found, design, source, spec_text),
     )  # fmt: skip
 
 
@@ -75,7 +75,13 @@ def kept(proof: Certificate) -> list[tuple[str, float, str]]:
     ]
 
 
-def _provenance(found: Robust, design: DesignOptions, source: str, text: str) -> list[str]:
+def written_values(found: Robust, design: DesignOptions) -> dict[str, Any]:
+    """[axis.controller] as plain values."""
+    return controller_values(found.controller, _output(design))
+
+
+def provenance(found: Robust, design: DesignOptions, source: str, text: str) -> list[str]:
+    """Where a controller comes from and what is certified of it, a line each."""
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     assert design.plant is not None
     return [

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
-from rtloop.design.robust.programme import BAND, Bounds, Programme, Taps
+from rtloop.design.robust.programme import BAND, INSIDE, Bounds, Programme, Taps
 from rtloop.design.robust.responses import Responses, horizon, responses
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.errors import NoDesign
@@ -73,11 +73,11 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
     """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none."""
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.swept(PLACES)]))
-    fastest, rounds = 0.0, 0
+    fastest, rounds, aim = 0.0, 0, subject.overshoot
     while True:
         rounds += 1
         programme = programme_of(subject, scenarios)
-        fastest = fastest_settling(programme, subject.overshoot, fastest)
+        fastest = fastest_settling(programme, aim, fastest)
         if fastest is None:
             raise NoDesign(_no_taps(subject, programme))
         progress(
@@ -89,7 +89,7 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
                 f"shape.settling_ms: {options.settling_ms:g} ms cannot be reached in all scenarios with overshoot ≤ "
                 f"{100 * subject.overshoot:g} %; the fastest is {fastest * tick_ms:.4g} ms. {_binding(subject)}"
             )
-        taps = programme.quietest(settling, subject.overshoot)
+        taps = programme.quietest(settling, aim)
         if taps is None:
             raise NoDesign(
                 f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help"
@@ -98,10 +98,14 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
         worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(2)]
         new = [one for one in dict.fromkeys(worst) if one not in scenarios]
         kept = _worst(judged.values())
-        good = kept.settling_ms <= settling * tick_ms + 1e-9 and kept.overshoot <= subject.overshoot
-        if good or not new or rounds == ROUNDS:
+        settled = kept.settling_ms <= (settling + 1 / options.points_per_tick) * tick_ms
+        if settled and kept.overshoot <= subject.overshoot:
             break
+        if rounds == ROUNDS:
+            raise NoDesign(_unproved(subject, settling * tick_ms, kept, len(judged)))
         scenarios += new
+        if kept.overshoot > subject.overshoot:
+            aim *= INSIDE * subject.overshoot / kept.overshoot
     time, position, command = _steps(subject, taps, family.nominal)
     drawn = trade_off(programme, fastest, tick_ms) if curve else ()
     variation = float(np.sum(np.abs(np.diff(command, prepend=0.0))))
@@ -115,7 +119,7 @@ def programme_of(subject: Subject, scenarios: list[Scenario]) -> Programme:
     family, options = subject.family(), subject.options
     ticks = horizon(subject.controller, family, scenarios, options.taps)
     found = [_answered(subject, family, one, options.points_per_tick, ticks) for one in scenarios]
-    return Programme(found, options.taps, options.points_per_tick, subject.bounds)
+    return Programme(found, options.taps, options.points_per_tick, subject.bounds, options.band_percent / 100)
 
 
 def fastest_settling(programme: Programme, overshoot: float, at_least: float = 0.0) -> float | None:
@@ -203,6 +207,15 @@ def _no_taps(subject: Subject, programme: Programme) -> str:
             "More of it, a smaller [shape.scenarios] or more taps would help"
         )
     return f"shape: nothing settles within {longest * tick_ms:g} ms. {_binding(subject)}"
+
+
+def _unproved(subject: Subject, settling_ms: float, kept: Judged, plants: int) -> str:
+    """What the proof misses."""
+    return (
+        f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
+        f"{kept.settling_ms:.4g} ms and overshoot by {100 * kept.overshoot:.4g} % on {plants} plants between the "
+        "scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
+    )
 
 
 def _binding(subject: Subject) -> str:

@@ -1,0 +1,184 @@
+"""From an identified stage to a loop that damps its resonance, and taps that make its steps: one call.
+
+    stage ──► C(z) over [scenarios] ──► taps over [shape.scenarios] ──► configuration
+
+What a specification says is kept, or refused. What it leaves open begins with the best and gives way to the stage: for
+how wide a range of resonances C(z) is, and the taps; how many taps; how slow a disturbance C(z) is to hold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.configuration.checks import Findings, check_axes
+from rtloop.configuration.file import parse
+from rtloop.design.chain import Stage, text_with
+from rtloop.design.robust.options import MOST_TAPS, ScenarioOptions, ShapeOptions
+from rtloop.design.robust.scenarios import Family
+from rtloop.design.robust.search import Progress, Robust, robust_controller
+from rtloop.design.robust.section import provenance, taps_provenance, taps_values, written_values
+from rtloop.design.robust.shape import Shaped, Subject, shaped
+from rtloop.design.robust.subject import subject_of
+from rtloop.design.synthesis.hinf.assumptions import NoController
+from rtloop.design.synthesis.specification import DesignOptions, DisturbanceOptions
+from rtloop.errors import ConfigError, NoDesign
+
+RANGES_PERCENT = (10.0, 5.0, 2.0)
+"""Of the resonance that a controller bears, where [scenarios] is left out."""
+TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
+"""Of the resonance that taps fit, where [shape.scenarios] is left out."""
+PERIODS = 2.9
+"""Of the slowest leading mode, that the taps last where their number is left out."""
+NARROW_PERCENT = 2.5
+"""Half of the band for settling: what the inverse leaves of hysteresis, and noise, may take the other half."""
+FEWEST_POINTS = 3
+"""Of a tick, in the programme of many taps; the proof looks at as many as ever."""
+HELD, SLOWER = 0.1, 100.0
+"""Where a specification has no disturbance, |S| at the slowest leading mode's frequency divided by SLOWER."""
+
+
+class RobustChain(NamedTuple):
+    """What every step found; `design` and `subject` as they were taken at last."""
+
+    stage: Stage
+    design: DesignOptions
+    robust: Robust
+    subject: Subject
+    taps: Shaped
+
+
+def designed_robustly(
+    stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str, spec_text: str,
+    progress: Progress = lambda _: None,
+) -> tuple[RobustChain, str]:  # fmt: skip
+    """A controller, its taps, and the configuration that has both in axis `axis` (the first).
+
+    `spec_name` is the specification's file relative to `folder`, where the configuration is to stand. Raises NoDesign
+    with what is missed. The specification is one that `require_enough` lets through.
+    """
+    asked = stage.asked(design)
+    asked, found = _controller(asked, progress)
+    comments = provenance(found, asked, spec_name, spec_text)
+    parts = {"controller": written_values(found, asked)}
+    plain = text_with(stage, parts, comments, axis, spec_name)
+    configuration, findings = parse(plain, "designed", folder, spec_name), Findings()
+    checks = check_axes(configuration, findings)
+    chosen = next(one for one in configuration.axes if axis in (None, one.name))
+    check = next(one for one in checks if one.name == chosen.name)
+    try:
+        subject = subject_of(chosen, check, _with_taps(asked, found.family))
+    except ValueError as error:
+        raise NoDesign(f"axis.{chosen.name}.{error}") from None
+    subject = _within_command(subject, asked)
+    subject, taps = _taps(subject, "scenarios" in design.shape.model_fields_set, progress)
+    comments += taps_provenance(taps, subject, spec_name)
+    text = text_with(stage, {**parts, "prefilter": taps_values(taps)}, comments, axis, spec_name)
+    return RobustChain(stage, asked, found, subject, taps), text
+
+
+def require_enough(design: DesignOptions, source: str) -> None:
+    """Before minutes are spent. Raises ConfigError."""
+    asked, faults = design.specification, list[str]()
+    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
+        faults.append(
+            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
+            "for settling is ±5 %"
+        )
+    if asked.command is None:
+        faults.append("specification.command.reference_um: missing; the largest step decides what v may do")
+    if asked.disturbance is not None and asked.disturbance.up_to_hz is None:
+        faults.append("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
+    if faults:
+        raise ConfigError(source, faults)
+
+
+def _controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions, Robust]:
+    """The controller for the widest range that has one. Raises NoDesign."""
+    asked = _with_disturbance(asked)
+    *wider, last = _ranges(asked)
+    for one in wider:
+        try:
+            return one, robust_controller(one, progress)
+        except NoController as error:
+            progress(f"±{one.scenarios.resonance_percent:g} % is too wide: {error}")
+    try:
+        return last, robust_controller(last, progress)
+    except (NoController, ValueError) as error:
+        tried = "" if not wider else f"not even for resonances within ±{last.scenarios.resonance_percent:g} %: "
+        raise NoDesign(f"{tried}{error}") from None
+
+
+def _ranges(asked: DesignOptions) -> Iterator[DesignOptions]:
+    """What is asked for, or one range after the other."""
+    if "scenarios" in asked.model_fields_set:
+        yield asked
+        return
+    for percent in RANGES_PERCENT:
+        scenarios = asked.scenarios.model_copy(update={"resonance_percent": percent})
+        yield asked.model_copy(update={"scenarios": scenarios})
+
+
+def _with_disturbance(asked: DesignOptions) -> DesignOptions:
+    """`asked` with a disturbance: without any the slowest integrator would do."""
+    specification = asked.specification
+    if specification.disturbance is not None or asked.plant is None:
+        return asked
+    period_s = 1 / asked.controller.rate_hz
+    family = Family(asked.plant.transfer(), asked.plant.delay_ticks, asked.scenarios, period_s)
+    slowest_hz = _slowest_hz(family)
+    held = DisturbanceOptions(largest_um=1.0, error_um=HELD, up_to_hz=slowest_hz / SLOWER)
+    return asked.model_copy(update={"specification": specification.model_copy(update={"disturbance": held})})
+
+
+def _with_taps(asked: DesignOptions, family: Family) -> DesignOptions:
+    """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, in
+    a band that leaves room for what is not linear."""
+    shape: ShapeOptions = asked.shape
+    lasting = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
+    taps = min(max(lasting, shape.taps), MOST_TAPS)
+    points = max(FEWEST_POINTS, shape.points_per_tick * shape.taps // taps)
+    open_ones = {"taps": taps, "points_per_tick": points, "band_percent": NARROW_PERCENT}
+    given = {name: value for name, value in open_ones.items() if name not in shape.model_fields_set}
+    return asked.model_copy(update={"shape": shape.model_copy(update=given)})
+
+
+def _slowest_hz(family: Family) -> float:
+    """Of the leading modes; a tenth of the rate where there is none."""
+    leading = np.abs(family.modes[list(family.leading)]) / (2 * np.pi)
+    return float(np.min(leading, initial=0.1 / family.period_s))
+
+
+def _within_command(subject: Subject, asked: DesignOptions) -> Subject:
+    """v no larger than the specification says that a step may need, where that is more than the step."""
+    command, bounds = asked.specification.command, subject.bounds
+    if command is None or command.command_um <= command.reference_um:
+        return subject
+    limited = bounds._replace(
+        low_um=max(bounds.low_um, -command.command_um), high_um=min(bounds.high_um, command.command_um)
+    )
+    return replace(subject, bounds=limited)
+
+
+def _taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject, Shaped]:
+    """The taps for the widest range that has some. Raises NoDesign."""
+    if is_asked:
+        return subject, shaped(subject, progress=progress)
+    *wider, last = [_around(subject, percent) for percent in TAPS_RANGES_PERCENT]
+    for one in wider:
+        try:
+            return one, shaped(one, progress=progress)
+        except NoDesign as error:
+            progress(f"taps for ±{one.options.scenarios.resonance_percent:g} %: {error}")
+    return last, shaped(last, progress=progress)
+
+
+def _around(subject: Subject, percent: float) -> Subject:
+    """Taps for resonances within `percent`."""
+    scenarios = ScenarioOptions(resonance_percent=percent, damping=(1.0,), gain_percent=0.0)
+    return replace(subject, options=subject.options.model_copy(update={"scenarios": scenarios}))

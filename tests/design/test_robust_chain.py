@@ -1,0 +1,152 @@
+"""`design auto --robust`: recordings to a loop with taps; refusals; many modes; poles beyond reach."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli import main
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
+from rtloop.design.identification.identify_dynamics import _within_reach
+from rtloop.design.robust import certificate
+from rtloop.design.robust import shape as shape_module
+from rtloop.design.robust.options import ScenarioOptions
+from rtloop.design.robust.scenarios import Family
+from rtloop.linear.transfer import Transfer
+from tests.recording.real_loop import record
+from tests.soak.chain import run
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+PERIOD_S = 1e-4
+SPEC = """
+[specification]
+overshoot_percent = 1.5
+[specification.command]
+reference_um = 18.0
+command_um = 19.5
+[scenarios]
+resonance_percent = {percent}
+[robust]
+biquads = 1
+restarts = 2
+generations = 60
+[shape]
+taps = 30
+points_per_tick = 3
+[shape.scenarios]
+resonance_percent = 1.0
+damping = [1.0]
+gain_percent = 0.0
+[simulation]
+steps_um = [10.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recorded")
+    return [
+        str(record(folder / f"{name}.mcap", (DEPLOY / f"{name}.toml").read_text(encoding="utf-8"), ticks)[0])
+        for name, ticks in (("own-stage-sine", 25_000), ("own-stage", 10_000))
+    ]
+
+
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch) -> None:
+    """In the proofs: those of the search and of the taps have tests of their own."""
+    monkeypatch.setattr(certificate, "SWEPT", 3)
+    monkeypatch.setattr(certificate, "DRAWN", 10)
+    monkeypatch.setattr(shape_module, "PLACES", 3)
+    monkeypatch.setattr(shape_module, "PROVED", 5)
+
+
+def automatically(recordings, folder, text: str):
+    (folder / "spec.toml").write_text(text, encoding="utf-8")
+    arguments = [*recordings, "--robust", "--specs", folder / "spec.toml", "--out", folder / "made.toml", "--json"]
+    return CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
+
+
+def test_two_recordings_become_a_loop_with_taps_that_keeps_its_promise(recordings, tmp_path) -> None:
+    """The step on the rig is the one that is promised; the interlocks are armed; progress is on stderr alone."""
+    result = automatically(recordings, tmp_path, SPEC.format(percent=3.0))
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["meets"]
+    (axis,) = load(tmp_path / "made.toml").axes
+    assert sum(axis.prefilter.taps) == pytest.approx(1.0, abs=1e-9)
+    assert len(axis.prefilter.taps) == len(axis.prefilter.command_taps) == 30
+    assert axis.interlocks.oscillation_swings > 0
+    assert axis.model is not None
+    assert axis.model.delay_ticks == 1
+    promised = prepare(load(tmp_path / "made.toml")).checks[0].running
+    trips, distances = run(tmp_path / "made.toml", promised)
+    assert trips == []
+    assert abs(distances["overshoot_percent"]) < 1.0
+    assert abs(distances["settling_ms"]) < 0.15 * 1e3 * promised.settling_time_s + 0.1
+
+
+def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_path) -> None:
+    """No mode of 800 Hz dies away in a thousandth of a millisecond."""
+    few = "restarts = 2\ngenerations = 60"
+    text = SPEC.format(percent=3.0).replace(few, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
+    refused = automatically(recordings, tmp_path, text)
+    assert refused.exit_code == 1, refused.output
+    assert "at most 0.001 is asked for" in refused.stderr
+    assert "would help" in refused.stderr
+    assert not (tmp_path / "made.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [("overshoot_percent = 1.5", "overshoot_percent"), ("reference_um = 18.0\ncommand_um = 19.5", "reference_um")],
+)
+def test_a_specification_that_says_too_little_is_refused_first(recordings, tmp_path, line, key) -> None:
+    text = SPEC.format(percent=3.0).replace(line, "").replace("[specification.command]\n\n", "")
+    result = automatically(recordings, tmp_path, text)
+    assert result.exit_code == 78
+    assert key in result.stderr
+    assert "search" not in result.stderr
+
+
+def modal(hz, damping, gain) -> Transfer:
+    """Σ g ω²/(s² + 2ζω s + ω²), by scipy's polynomials."""
+    omega = 2 * np.pi * np.array(hz)
+    below = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(damping, omega, strict=True)]
+    above = np.poly1d([0.0])
+    for i, w in enumerate(omega):
+        others = [one for k, one in enumerate(below) if k != i]
+        above += math.prod(others, start=np.poly1d([gain[i] * w**2]))
+    poles = np.concatenate([one.roots for one in below])
+    return Transfer.from_zpk(above.roots, poles, above.coeffs[0])
+
+
+def test_of_many_light_modes_those_that_stand_out_move_by_themselves() -> None:
+    hz, damping, gain = [200.0, 500.0, 900.0, 1500.0], [0.02, 0.02, 0.003, 0.02], [0.9, 0.02, 0.06, 0.02]
+    family = Family(modal(hz, damping, gain), 1, ScenarioOptions(), PERIOD_S)
+    assert family.leading == (0, 2)  # g/2ζ: 22, 0.5, 10, 0.5
+    shifts = {one.resonance for one in family.corners()}
+    assert {(10.0, 0.0, -10.0, 0.0), (-10.0, 0.0, 10.0, 0.0), (10.0,) * 4, (-10.0,) * 4} <= shifts
+    assert all(one[1] == one[3] == 0 or len(set(one)) == 1 for one in shifts)
+    assert np.all([len(set(one.resonance)) == 4 for one in family.drawn(20, 0)])  # the proof moves each
+    bands = family.bands / (2 * np.pi)
+    expected = [[110.0, np.sqrt(200 * 500)], [np.sqrt(500 * 900), np.sqrt(900 * 1500)]]
+    np.testing.assert_allclose(bands, expected, rtol=1e-9)
+
+
+def test_a_pole_beyond_reach_in_s_is_a_finite_one_that_answers_alike_at_the_ticks() -> None:
+    """What identification makes of a delay by a part of a tick: a pole at z ≈ 0, here at −1e25 rad/s."""
+    rates = np.array([-1e25, complex(-100.0, 5000.0), complex(-100.0, -5000.0)])
+    residues = np.array([[0.3, 0.1 - 0.2j, 0.1 + 0.2j]])
+    reach, kept = _within_reach(rates, residues, PERIOD_S)
+    assert -20 / PERIOD_S < reach[0].real < -10 / PERIOD_S
+    np.testing.assert_array_equal(reach[1:], rates[1:])
+    z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 30) * PERIOD_S)
+
+    def answer(poles, parts):
+        return np.sum(parts[0] / (z[:, None] - np.exp(poles * PERIOD_S)), axis=1)
+
+    np.testing.assert_allclose(answer(reach, kept), answer(rates, residues), rtol=1e-5)
