@@ -178,7 +178,8 @@ def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[C
 
     A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """
-    reach = np.maximum(rates.real, -FASTEST / period_s) + 1j * rates.imag
+    reach: Complex = rates.copy()
+    reach.real = np.maximum(rates.real, -FASTEST / period_s)
     static = np.expm1(reach * period_s) / np.expm1(rates * period_s)
     return reach, residues * static
 
