@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import click
 
 from rtloop.design.identification.identified import write_new
-from rtloop.errors import LoopFault, RtloopError
 from rtloop.service.client import Client
 from rtloop.terminal.table import console, table
 
@@ -21,14 +19,7 @@ LONGEST_S = 360.0
 
 def learn(client: Client, body: Mapping[str, Any], out: Path | None, as_json: bool) -> int:
     """Have a running service learn; at Ctrl-C what was held is held again. Raises RtloopError."""
-    held = client.get("/status").get("axes", {}).get(body["axis"], {}).get("reference_um")
-    try:
-        content = client.post("/learn", body, LONGEST_S)
-    except KeyboardInterrupt:
-        if held is not None:
-            with suppress(RtloopError):
-                client.post("/setpoint", {"axis": body["axis"], "value": held})
-        raise LoopFault(f"interrupted; axis {body['axis']} holds what it held") from None
+    content = client.move("/learn", body, LONGEST_S)
     if out is not None:
         rows = zip(content["reference_um"], content["command_um"], strict=True)
         write_new(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))

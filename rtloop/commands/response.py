@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from rtloop.design.identification.identified import write_new
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.identification.plot_response import plot_response
 from rtloop.design.identification.recorded_response import recorded_measurement
-from rtloop.errors import LoopFault, RtloopError
 from rtloop.service.client import Client
 from rtloop.terminal.response import print_resonance, print_response
 
@@ -25,14 +23,7 @@ TIMES, MORE_S = 3.0, 60.0
 def show_measured(client: Client, body: Mapping[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> int:
     """Have a running service measure; at Ctrl-C what was held is held again. Raises RtloopError."""
     asked = {name: value for name, value in body.items() if value is not None}
-    held = client.get("/status").get("axes", {}).get(body["axis"], {}).get("reference_um")
-    try:
-        content = client.post("/response", asked, TIMES * body["duration_s"] + MORE_S)
-    except KeyboardInterrupt:
-        if held is not None:
-            with suppress(RtloopError):
-                client.post("/setpoint", {"axis": body["axis"], "value": held})
-        raise LoopFault(f"interrupted; axis {body['axis']} holds {held:g} µm as before") from None
+    content = client.move("/response", asked, TIMES * body["duration_s"] + MORE_S)
     return _show(content, bool(body.get("resonance_only")), out, plot, as_json)
 
 

@@ -14,7 +14,6 @@ from rtloop.analysis.perturbation import resonance_hz, with_resonance_shifted
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
-from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.shape import Judged, Subject, judged_of, shaped
 from rtloop.design.robust.subject import subject_of
@@ -60,15 +59,7 @@ def retune(client: Client, asked: Asked, as_json: bool) -> int:
             f"retune: the resonance is at {mode['hz']:.2f} Hz, {percent:+.2f} % from the model's; within "
             f"±{asked.bound_percent:g} % is allowed, and the taps stay as they are"
         )
-    there = replace(
-        subject,
-        plant=with_resonance_shifted(subject.plant, percent),
-        options=subject.options.model_copy(
-            update={
-                "scenarios": ScenarioOptions(resonance_percent=asked.within_percent, damping=(1.0,), gain_percent=0.0)
-            }
-        ),
-    )
+    there = replace(subject.around(asked.within_percent), plant=with_resonance_shifted(subject.plant, percent))
     found = shaped(there)
     nominal = there.family().nominal
     before, after = judged_of(there, _taps_of(axis), nominal), judged_of(there, found.taps, nominal)

@@ -7,10 +7,11 @@ import json
 import socket
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import HostRefused, RtloopError, UnavailableError
+from rtloop.errors import HostRefused, LoopFault, RtloopError, UnavailableError
 from rtloop.hil.trusted import Untrusted, owners
 from rtloop.supervision.paths import refusal
 
@@ -67,6 +68,19 @@ class Client:
     def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
         """The answer. Raises UnavailableError, or RtloopError with what the service says against it."""
         return self._request("POST", resource, json.dumps(body or {}), timeout_s)
+
+    def move(self, resource: str, body: Mapping[str, Any], timeout_s: float) -> Any:
+        """As `post`, of what moves an axis from what it holds; at Ctrl-C that is held again. Raises LoopFault then."""
+        axis = body["axis"]
+        held = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
+        try:
+            return self.post(resource, body, timeout_s)
+        except KeyboardInterrupt:
+            if held is None:
+                raise LoopFault("interrupted") from None
+            with suppress(RtloopError):
+                self.post("/setpoint", {"axis": axis, "value": held})
+            raise LoopFault(f"interrupted; axis {axis} holds {held:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
         """Newest signals, about 20 times a second. Raises UnavailableError."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.analysis.measured import excitation
-from rtloop.analysis.measured.measurement import Measurement, measurement
+from rtloop.analysis.measured.measurement import IN_STEP, Measurement, measurement
 from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
 from rtloop.analysis.measured.response import Signals
 from rtloop.analysis.perturbation import resonance_hz
@@ -41,8 +41,6 @@ LOWEST_LINES = 2
 """The lowest frequency, in lines, where none is given."""
 EXCITED = 0.3
 """Part of a light mode's frequency, to both sides, that is excited for it alone."""
-IN_STEP = "sim"
-"""The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 REST_MARGIN = 1.2
 """Of what the position moves by at rest: so much is allowed on top of the stated amplitude."""
 NAMES = {"reference_um": signals.REFERENCE, "error_um": signals.ERROR, "command_um": signals.COMMAND,

@@ -22,6 +22,8 @@ from rtloop.values import fields_of, plain
 
 CERTAIN = 0.1
 """Relative uncertainty up to which a line is compared with the model's."""
+IN_STEP = "sim"
+"""The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 
 
 @dataclass(frozen=True)

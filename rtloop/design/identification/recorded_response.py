@@ -6,7 +6,7 @@ import tomllib
 from contextlib import suppress
 from pathlib import Path
 
-from rtloop.analysis.measured.measurement import Measurement, measurement
+from rtloop.analysis.measured.measurement import IN_STEP, Measurement, measurement
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import promised_loop
@@ -15,8 +15,6 @@ from rtloop.hil.modal import Real
 from rtloop.recording.load import load
 
 SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
-IN_STEP = "sim"
-"""The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 
 
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> Measurement:

@@ -19,7 +19,7 @@ import numpy as np
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
 from rtloop.design.chain import Stage, text_with
-from rtloop.design.robust.options import MOST_TAPS, ScenarioOptions, ShapeOptions
+from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.robust.search import Progress, Robust, robust_controller
 from rtloop.design.robust.section import provenance, taps_provenance, taps_values, written_values
@@ -169,16 +169,10 @@ def _taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject
     """The taps for the widest range that has some. Raises NoDesign."""
     if is_asked:
         return subject, shaped(subject, progress=progress)
-    *wider, last = [_around(subject, percent) for percent in TAPS_RANGES_PERCENT]
+    *wider, last = [subject.around(percent) for percent in TAPS_RANGES_PERCENT]
     for one in wider:
         try:
             return one, shaped(one, progress=progress)
         except NoDesign as error:
             progress(f"taps for ±{one.options.scenarios.resonance_percent:g} %: {error}")
     return last, shaped(last, progress=progress)
-
-
-def _around(subject: Subject, percent: float) -> Subject:
-    """Taps for resonances within `percent`."""
-    scenarios = ScenarioOptions(resonance_percent=percent, damping=(1.0,), gain_percent=0.0)
-    return replace(subject, options=subject.options.model_copy(update={"scenarios": scenarios}))

@@ -39,6 +39,11 @@ class Subject:
     overshoot: float
     options: ShapeOptions
 
+    def around(self, percent: float) -> Subject:
+        """For taps that fit resonances within so much of the model's, and nothing else that may change."""
+        scenarios = ScenarioOptions(resonance_percent=percent, damping=(1.0,), gain_percent=0.0)
+        return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
+
     def family(self) -> Family:
         """The plants around its model."""
         return Family(self.plant, self.delay_ticks, self.options.scenarios, self.controller.period_s)
