@@ -10,6 +10,7 @@ error in each of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,27 @@ LARGEST_CONTRACTION = 0.8
 """Of a harmonic's error from one cycle to the next, in the worst of all loops, that is still learned."""
 LEAST_RESPONSE = 0.1
 """Of the position to reference and command: of less, noise would be learned, and large commands for little."""
+
+SETTLE_S, MEASURED_S = 0.1, 0.2
+"""Of a cycle at least so long, in whole periods, to settle and to be judged."""
+GROWN = 1.1
+"""An error larger by this factor than the least so far is not learned from: the table goes back to that one's."""
+
+
+def periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
+    """Of a cycle: how many to settle, and how many are judged."""
+    period_s = period_ticks / rate_hz
+    return math.ceil(SETTLE_S / period_s), math.ceil(MEASURED_S / period_s)
+
+
+def untaught(wanted_um: Real) -> Real:
+    """The table (period, 2) of which nothing is learned: it adds nothing to the command."""
+    return np.column_stack([wanted_um, np.zeros_like(wanted_um)])
+
+
+def rms(values: Real) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 @dataclass(frozen=True, eq=False)

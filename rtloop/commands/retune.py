@@ -12,12 +12,11 @@ import numpy as np
 
 from rtloop.analysis.perturbation import resonance_hz, with_resonance_shifted
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
 from rtloop.design.robust.programme import Taps
-from rtloop.design.robust.shape import Judged, Subject, judged_of, shaped
-from rtloop.design.robust.subject import subject_of
-from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.robust.section import taps_values
+from rtloop.design.robust.shape import Judged, judged_of, shaped
+from rtloop.design.robust.subject import subject_in
 from rtloop.design.toml_text import section
 from rtloop.errors import ConfigError, LoopFault
 from rtloop.service.client import Client
@@ -45,7 +44,9 @@ class Asked(NamedTuple):
 def retune(client: Client, asked: Asked, as_json: bool) -> int:
     """Measure, redesign, show, swap; 0 where the taps in force are the new ones. Raises RtloopError."""
     running = client.get("/configuration")
-    axis, subject = _subject(running, asked)
+    text, folder = section("", running["values"]), Path(running["folder"])
+    configuration = parse(text, "running", folder, "the running configuration")
+    axis, subject, _ = subject_in(configuration, asked.axis, asked.spec)
     model_hz = resonance_hz(subject.plant)
     if model_hz is None:
         raise ConfigError("retune", [f"axis.{asked.axis}.model: no light mode; there is no resonance to measure"])
@@ -79,27 +80,8 @@ def retune(client: Client, asked: Asked, as_json: bool) -> int:
     return 0 if swapped else LoopFault.exit_code
 
 
-def _subject(running: dict[str, Any], asked: Asked) -> tuple[AxisOptions, Subject]:
-    """What taps are made for, from the configuration as it runs. Raises ConfigError."""
-    text = section("", running["values"])
-    configuration = parse(text, "running", Path(running["folder"]), "the running configuration")
-    axis = next((one for one in configuration.axes if one.name == asked.axis), None)
-    if axis is None:
-        names = ", ".join(one.name for one in configuration.axes)
-        raise ConfigError("retune", [f"axis {asked.axis!r}: there are {names}"])
-    spec = asked.spec or (configuration.folder / axis.specification if axis.specification else None)
-    if spec is None:
-        raise ConfigError("retune", [f"axis.{axis.name}.specification: missing; --spec names one"])
-    check = next(one for one in check_axes(configuration, Findings()) if one.name == axis.name)
-    try:
-        return axis, subject_of(axis, check, load_specification(spec).design)
-    except ValueError as error:
-        raise ConfigError("retune", [f"axis.{axis.name}: {error}"]) from None
-
-
 def _swapped(client: Client, axis: str, taps: Taps) -> int:
-    values = {"taps": taps.reference.tolist(), "command_taps": taps.command.tolist()}
-    change = {"axis": axis, "section": "prefilter", "values": values}
+    change = {"axis": axis, "section": "prefilter", "values": taps_values(taps)}
     return int(client.post("/tune", change, MEASUREMENT_S)["tick"])
 
 

@@ -9,14 +9,13 @@ from typing import Any
 
 import click
 
-from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.configuration.text_files import read_text
 from rtloop.design.robust.search import Robust, robust_controller
 from rtloop.design.robust.section import robust_configuration, robust_section, taps_section, with_controller, with_taps
 from rtloop.design.robust.shape import Shaped, shaped
-from rtloop.design.robust.subject import subject_of
+from rtloop.design.robust.subject import subject_in
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, NoDesign, OutputError
@@ -64,22 +63,7 @@ def shape_configuration(
     Raises ConfigError, NoDesign, OutputError, MissingExtra.
     """
     configuration = load(config)
-    options = next((one for one in configuration.axes if one.name == axis), None)
-    if options is None:
-        names = ", ".join(one.name for one in configuration.axes)
-        raise ConfigError(str(config), [f"axis: {axis!r} is not there; the configuration has {names}"])
-    findings = Findings()
-    check = next(one for one in check_axes(configuration, findings) if one.name == axis)
-    if findings.faults:
-        raise ConfigError(str(config), findings.faults)
-    if spec is None and options.specification is not None:
-        spec = configuration.folder / options.specification
-    if spec is None:
-        raise ConfigError(str(config), [f"axis.{axis}.specification: missing; --spec names one"])
-    try:
-        subject = subject_of(options, check, load_specification(spec).design)
-    except ValueError as error:
-        raise ConfigError(str(config), [f"axis.{axis}: {error}"]) from None
+    _, subject, spec = subject_in(configuration, axis, spec)
     try:
         found = shaped(subject, curve=plot is not None, progress=lambda line: click.echo(line, err=True))
     except NoDesign as error:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.learning import Learning, learning
+from rtloop.analysis.learning import GROWN, Learning, learning, periods, rms, untaught
 from rtloop.analysis.perturbation import around
 from rtloop.configuration.checks import promised_loop
 from rtloop.errors import ConfigError, RtloopError
@@ -19,11 +19,9 @@ from rtloop.service.playing import Player
 from rtloop.signals import FEED, POSITION, REFERENCE
 from rtloop.supervision.supervisor import Supervisor
 
-GLIDE_S, SETTLE_S, MEASURED_S = 0.5, 0.1, 0.2
-"""From what is held to the first sample; and of a cycle at least so long, in whole periods."""
+GLIDE_S = 0.5
+"""From what is held to the first sample."""
 LONGEST_S = 300.0
-GROWN = 1.1
-"""An error larger by this factor than the least so far ends the learning, at the best table."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ def learn(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Lea
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
     ticks = asked.wanted_um.size
-    settle, judged = (int(np.ceil(seconds * rate_hz / ticks)) for seconds in (SETTLE_S, MEASURED_S))
+    settle, judged = periods(ticks, rate_hz)
     if (took_s := (asked.cycles + 1) * (settle + judged) * ticks / rate_hz) > LONGEST_S:
         raise _unsuitable(f"{asked.cycles} cycles take {took_s:.0f} s; at most {LONGEST_S:g} s are allowed")
     teacher = _teacher(live, number, asked)
@@ -99,7 +97,7 @@ class _Tried:
     def note(self, table: Real, error_um: Real) -> None:
         """Another one."""
         self.tables.append(table)
-        self.cycles.append(Cycle(float(np.sqrt(np.mean(error_um**2))), float(np.abs(error_um).max())))
+        self.cycles.append(Cycle(rms(error_um), float(np.abs(error_um).max())))
 
     @property
     def number(self) -> int:
@@ -114,7 +112,7 @@ class _Tried:
 
 def _taught(player: Player, teacher: Learning, asked: Asked, settle: int, judged: int, tried: _Tried) -> str:
     """Cycle after cycle; why it ended."""
-    table = np.column_stack([asked.wanted_um, np.zeros_like(asked.wanted_um)])
+    table = untaught(asked.wanted_um)
     for cycle in range(asked.cycles + 1):
         error_um = _error(player, asked.wanted_um, table, settle, judged)
         tried.note(table, error_um)

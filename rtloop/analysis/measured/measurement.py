@@ -22,6 +22,8 @@ from rtloop.values import fields_of, plain
 
 CERTAIN = 0.1
 """Relative uncertainty up to which a line is compared with the model's."""
+SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
+"""Of an axis, that a measurement is made of."""
 IN_STEP = "sim"
 """The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 

@@ -6,15 +6,13 @@ import tomllib
 from contextlib import suppress
 from pathlib import Path
 
-from rtloop.analysis.measured.measurement import IN_STEP, Measurement, measurement
+from rtloop.analysis.measured.measurement import IN_STEP, SIGNALS, Measurement, measurement
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import promised_loop
 from rtloop.design.identification.measured import UnsuitableData, axis_of
 from rtloop.hil.modal import Real
 from rtloop.recording.load import load
-
-SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
 
 
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> Measurement:

@@ -24,7 +24,7 @@ from rtloop.design.robust.scenarios import Family
 from rtloop.design.robust.search import Progress, Robust, robust_controller
 from rtloop.design.robust.section import provenance, taps_provenance, taps_values, written_values
 from rtloop.design.robust.shape import Shaped, Subject, shaped
-from rtloop.design.robust.subject import subject_of
+from rtloop.design.robust.subject import lacking, subject_of
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions, DisturbanceOptions
 from rtloop.errors import ConfigError, NoDesign
@@ -78,20 +78,14 @@ def designed_robustly(
     subject = _within_command(subject, asked)
     subject, taps = _taps(subject, "scenarios" in design.shape.model_fields_set, progress)
     comments += taps_provenance(taps, subject, spec_name)
-    text = text_with(stage, {**parts, "prefilter": taps_values(taps)}, comments, axis, spec_name)
+    text = text_with(stage, {**parts, "prefilter": taps_values(taps.taps)}, comments, axis, spec_name)
     return RobustChain(stage, asked, found, subject, taps), text
 
 
 def require_enough(design: DesignOptions, source: str) -> None:
     """Before minutes are spent. Raises ConfigError."""
-    asked, faults = design.specification, list[str]()
-    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
-        faults.append(
-            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
-            "for settling is ±5 %"
-        )
-    if asked.command is None:
-        faults.append("specification.command.reference_um: missing; the largest step decides what v may do")
+    asked = design.specification
+    faults = lacking(asked)
     if asked.disturbance is not None and asked.disturbance.up_to_hz is None:
         faults.append("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
     if faults:

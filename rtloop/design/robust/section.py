@@ -8,6 +8,7 @@ from typing import Any
 
 from rtloop import __version__
 from rtloop.design.robust.certificate import Certificate
+from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.search import Robust
 from rtloop.design.robust.shape import Shaped, Subject
 from rtloop.design.synthesis.section import commented_section, configuration_around, controller_values, formula
@@ -39,19 +40,19 @@ def with_controller(text: str, found: Robust, design: DesignOptions, source: str
 
 def with_taps(text: str, found: Shaped, subject: Subject, source: str, axis: str, specification: str | None) -> str:
     """A configuration's `text` with both rows of taps in its axis, whose specification stands at `specification`."""
-    values = taps_values(found)
+    values = taps_values(found.taps)
     beside = {} if specification is None else {"specification": specification}
     return _with(text, axis, {"prefilter": values, **beside}, taps_provenance(found, subject, source))
 
 
 def taps_section(found: Shaped, subject: Subject, source: str) -> str:
     """[axis.prefilter] alone."""
-    return section("axis.prefilter", taps_values(found), taps_provenance(found, subject, source))
+    return section("axis.prefilter", taps_values(found.taps), taps_provenance(found, subject, source))
 
 
-def taps_values(found: Shaped) -> dict[str, Any]:
+def taps_values(taps: Taps) -> dict[str, Any]:
     """[axis.prefilter] as plain values."""
-    return {"taps": found.taps.reference.tolist(), "command_taps": found.taps.command.tolist()}
+    return {"taps": taps.reference.tolist(), "command_taps": taps.command.tolist()}
 
 
 def taps_provenance(found: Shaped, subject: Subject, source: str) -> list[str]:

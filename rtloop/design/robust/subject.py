@@ -2,13 +2,55 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.checks import AxisCheck, Findings, check_axes
+from rtloop.configuration.file import Configuration
 from rtloop.design.robust.programme import Bounds
 from rtloop.design.robust.shape import Subject
-from rtloop.design.synthesis.specification import DesignOptions
+from rtloop.design.synthesis.specification import DesignOptions, SpecificationOptions
+from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.errors import ConfigError
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+
+
+def subject_in(configuration: Configuration, name: str, spec: Path | None) -> tuple[AxisOptions, Subject, Path]:
+    """Of the axis `name`, which specification it goes by (`spec`, else the axis's own) along with it.
+
+    Raises ConfigError.
+    """
+    axis = next((one for one in configuration.axes if one.name == name), None)
+    if axis is None:
+        names = ", ".join(one.name for one in configuration.axes)
+        fault = f"axis: {name!r} is not there; the configuration has {names}"
+        raise ConfigError(configuration.source, [fault])
+    findings = Findings()
+    check = next(one for one in check_axes(configuration, findings) if one.name == name)
+    if findings.faults:
+        raise ConfigError(configuration.source, findings.faults)
+    if spec is None and axis.specification is not None:
+        spec = configuration.folder / axis.specification
+    if spec is None:
+        raise ConfigError(configuration.source, [f"axis.{name}.specification: missing; --spec names one"])
+    try:
+        return axis, subject_of(axis, check, load_specification(spec).design), spec
+    except ValueError as error:
+        raise ConfigError(configuration.source, [f"axis.{name}: {error}"]) from None
+
+
+def lacking(asked: SpecificationOptions) -> list[str]:
+    """What a specification does not say, or not well enough, that taps need."""
+    faults = []
+    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
+        faults.append(
+            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
+            "for settling is ±5 %"
+        )
+    if asked.command is None:
+        faults.append("specification.command.reference_um: missing; the largest step decides what v may do")
+    return faults
 
 
 def subject_of(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
@@ -18,13 +60,10 @@ def subject_of(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Su
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
     if model is None:
         raise ValueError("model: missing; there is no plant to make taps for")
-    if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
-        raise ValueError(
-            f"specification.overshoot_percent: {asked.overshoot_percent}; above 0 and at most 5 is needed, as the band "
-            "for settling is ±5 %"
-        )
-    if asked.command is None:
-        raise ValueError("specification.command.reference_um: missing; the largest step decides what v may do")
+    if faults := lacking(asked):
+        raise ValueError(faults[0])
+    assert asked.overshoot_percent is not None
+    assert asked.command is not None
     if axis.prefilter.sections:
         raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
     if axis.limits.slew_v_per_s is not None:

@@ -15,7 +15,7 @@ from pydantic import Field
 from rtloop.analysis.margins import margins
 from rtloop.analysis.measured.excitation import first, fitting
 from rtloop.analysis.measured.margins import Uncertain
-from rtloop.analysis.measured.measurement import measurement
+from rtloop.analysis.measured.measurement import SIGNALS, measurement
 from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment, Run, hold
@@ -78,9 +78,8 @@ def _grid(options: ResponseOptions, setting: Setting) -> Grid:
 def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     """Margins, the resonance, and every line."""
     (taken,) = recordings
-    names: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
     near_hz, loop = (taken.model.resonance_hz, taken.model.loop) if taken.model else (None, None)
-    signals: dict[str, Real] = dict(zip(names, taken.read(*names), strict=True))
+    signals: dict[str, Real] = dict(zip(SIGNALS, taken.read(*SIGNALS), strict=True))
     taps = taken.axis_options.prefilter.command_taps
     found = measurement(signals, taken.rate_hz, near_hz, loop, taps)
     if (moved_um := found.response.moved_um) > options.amplitude_um:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.analysis.learning import Learning, learning
+from rtloop.analysis.learning import GROWN, Learning, learning, periods, rms, untaught
 from rtloop.analysis.perturbation import around
 from rtloop.errors import ConfigError
 from rtloop.experiments.procedure import Experiment, Run, Unsuited, hold
@@ -19,10 +19,7 @@ from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.hil.modal import Real
 from rtloop.hil.options import Numbers, Options
 
-REST_S, SETTLE_S, MEASURED_S = 0.1, 0.1, 0.2
-"""At least so long; whole periods."""
-GROWN = 1.1
-"""An error larger by this factor than the least so far is not learned from: the table goes back."""
+REST_S = 0.1
 
 
 class ScanOptions(Options):
@@ -45,10 +42,10 @@ def triangle(period_ticks: int, amplitude_um: float) -> Real:
 
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
     """The first one: the triangles as they are. Raises Unsuited where learning would not converge."""
-    periods = [_period(hz, setting.rate_hz) for hz in options.frequencies_hz]
-    for ticks in periods:
+    lengths = [_period(hz, setting.rate_hz) for hz in options.frequencies_hz]
+    for ticks in lengths:
         _learning(setting, options, ticks)
-    return [_run(0, options, setting, [_untaught(triangle(ticks, options.amplitude_um)) for ticks in periods])]
+    return [_run(0, options, setting, [untaught(triangle(ticks, options.amplitude_um)) for ticks in lengths])]
 
 
 def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> Run | None:
@@ -58,7 +55,7 @@ def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> R
     tables = []
     for number in range(len(options.frequencies_hz)):
         errors = [_error(taken, number) for taken in takings]
-        sizes = [_rms(error) for error in errors]
+        sizes = [rms(error) for error in errors]
         best = int(np.argmin(sizes))
         table = _table(takings[best], number)
         if sizes[-1] <= GROWN * sizes[best]:
@@ -72,7 +69,7 @@ def _run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Re
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
-        settle, measured = int(np.ceil(SETTLE_S / period_s)), int(np.ceil(MEASURED_S / period_s))
+        settle, measured = periods(len(table), setting.rate_hz)
         kept[name] = table
         timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, (settle + measured) * period_s,
                      frequency_hz=hz, period_ticks=len(table), periods=measured)  # fmt: skip
@@ -85,11 +82,6 @@ def _period(hz: float, rate_hz: float) -> int:
         faults = [f"scan.frequencies_hz: {hz:g} Hz is not a whole number of periods of {1 / rate_hz:g} s"]
         raise ConfigError("parameters of the experiments", faults)
     return ticks
-
-
-def _untaught(wanted_um: Real) -> Real:
-    """A table (period, 2) that adds nothing to the command."""
-    return np.column_stack([wanted_um, np.zeros_like(wanted_um)])
 
 
 def _learning(setting: Setting, options: ScanOptions, period_ticks: int) -> Learning:
@@ -126,10 +118,6 @@ def _error(taken: Taken, number: int) -> Real:
     return triangle(ticks, float(taken.parameters["amplitude_um"])) - position
 
 
-def _rms(values: Real) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def analyse(recordings: Sequence[Taken], options: ScanOptions) -> Analysis:
     """Rms and largest error of every frequency, cycle by cycle, as parts of peak to peak."""
     rows: list[Row] = []
@@ -137,7 +125,7 @@ def analyse(recordings: Sequence[Taken], options: ScanOptions) -> Analysis:
     extent_um = 2 * options.amplitude_um
     for number, hz in enumerate(options.frequencies_hz):
         errors = [_error(taken, number) for taken in recordings]
-        percent = [100 * _rms(error) / extent_um for error in errors]
+        percent = [100 * rms(error) / extent_um for error in errors]
         rows += [
             recordings[0].row("", f"rms error at {hz:g} Hz, {what}", "%", percent[at])
             for what, at in (("nothing learned", 0), (f"after {len(errors) - 1} cycles", -1))
