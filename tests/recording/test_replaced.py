@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.capture.session import Options, Session
-from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.events import RECORDER
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.file.recover import recover
@@ -59,22 +58,18 @@ class Run:
 
     def session(self) -> Session:
         """Of the next recorder, whose files are numbered after those that are there."""
-        options = Options(min_free_bytes=0, rotate_s=ROTATE_S, sequence=1 + len(list(self.folder.iterdir())))
+        files = [path for path in self.folder.iterdir() if path.suffix in (".mcap", ".part")]
+        options = Options(min_free_bytes=0, rotate_s=ROTATE_S, sequence=1 + len(files))
         return Session(self.loop.block, self.folder / "run.mcap", make_header(), options)
 
     def found(self) -> Found:
         """What is recorded, once what a killed recorder left is completed."""
-        absent = []
         for part in self.folder.glob("*.part"):
-            try:
-                recover(part)
-            except RecordingError:  # nothing is in it, not even a header; but its number is gone
-                absent.append(f"part {int(part.name[4:8])} of the run is missing")
+            recover(part)
         recording = load(list(self.folder.glob("*.mcap")))
         events = [event for event in recording.events if event["who"] != RECORDER]
         ticks, snapshots = recording["tick"].tolist(), list(recording.snapshots())
-        problems = [problem for problem in recording.problems if problem not in absent]
-        return Found(ticks, events, snapshots, problems)
+        return Found(ticks, events, snapshots, recording.problems)
 
 
 def step(session: Session) -> None:
@@ -85,7 +80,7 @@ def step(session: Session) -> None:
 
 
 class Mortal:
-    """A recorder in a process of its own, killed at an instant: there is one in each write, and before each note."""
+    """A recorder in a process of its own, killed in one of its writes, or before a note or a name."""
 
     def __init__(self, run: Run, instant: int) -> None:
         self._instant = instant
@@ -117,7 +112,7 @@ class Mortal:
         return status == 0
 
     def _record(self, session: Session, orders: int, answers: int) -> None:
-        store, pwrite = SharedBlock.store, os.pwrite
+        store, pwrite, rename = SharedBlock.store, os.pwrite, os.rename
 
         def mortal_store(block: SharedBlock, word: Word, value: int) -> None:
             self._live_on()
@@ -129,7 +124,11 @@ class Mortal:
             self._live_on()
             return half + pwrite(fd, data[half:], offset + half)
 
-        SharedBlock.store, os.pwrite = mortal_store, mortal_pwrite
+        def mortal_rename(old: Path, new: Path) -> None:
+            self._live_on()
+            rename(old, new)
+
+        SharedBlock.store, os.pwrite, os.rename = mortal_store, mortal_pwrite, mortal_rename
         while os.read(orders, 1):
             step(session)
             os.write(answers, b".")

@@ -1,7 +1,8 @@
 """An MCAP file that grows chunk by chunk, each written whole or not at all.
 
-`PATH.part` (or another suffix) while it grows, `PATH` once it has its index. Cut off at any moment, the file holds
-everything up to its last chunk; a full disk leaves room for the index by giving up the last chunks.
+`PATH.part` (or another suffix) from its first chunk on, `PATH` once it has its index: a file under either name can be
+read. Cut off at any moment, it holds everything up to its last chunk; a full disk leaves room for the index by giving
+up the last chunks.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class ChunkFile:
 
     def __init__(self, path: Path, header: Header, repeated: Sequence[McapRecord], suffix: str = ".part") -> None:
         self.path, self.part = path, path.with_name(path.name + suffix)
+        self._name = path.with_name(f"{self.part.name}.new")
         self.size = 0
         self._repeated = repeated
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
@@ -109,6 +111,8 @@ class ChunkFile:
         written = _Written(pack_records([entry]), counts, self._crc)
         self._append(chunk + b"".join(content.indexes.values()))
         self._chunks.append(written)
+        if self._name != self.part:
+            self._show()
 
     def drop_last(self) -> dict[int, int]:
         """Take the last chunk off the file; returns its messages by channel."""
@@ -150,23 +154,40 @@ class ChunkFile:
 
     def discard(self) -> None:
         """Give up the file and remove it."""
-        if self.is_there():
-            with contextlib.suppress(OSError):
-                os.unlink(self.part)
+        with contextlib.suppress(OSError):
+            os.unlink(self._name)
         self.close()
 
     def _open(self) -> int:
-        if self.path.exists():
-            raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
+        """Of a file that nobody takes for a recording yet; one that was left so is begun anew."""
+        self._refuse_to_replace()
         try:
-            fd = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
-            return fd
-        except FileExistsError:
-            message = f"{self.part} is left from an unfinished run; `rtloop recover` completes it"
-            raise OutputError(message, errno.EEXIST) from None
+            fd = os.open(self._name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise self._refused(error) from None
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
+            os.ftruncate(fd, 0)
+        except OSError as error:
+            os.close(fd)
+            raise self._refused(error) from None
+        return fd
+
+    def _show(self) -> None:
+        """Give the file, which has its first chunk, the name under which it grows."""
+        self._refuse_to_replace()
+        try:
+            os.rename(self._name, self.part)
+        except OSError as error:
+            raise self._refused(error) from None
+        self._name = self.part
+
+    def _refuse_to_replace(self) -> None:
+        if self.path.exists():
+            raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
+        if self.part.exists():
+            message = f"{self.part} is left from an unfinished run; `rtloop recover` completes it"
+            raise OutputError(message, errno.EEXIST)
 
     def _append(self, data: bytes) -> None:
         """All of `data` at the end of the file, or nothing of it."""
