@@ -61,17 +61,41 @@ class Options(BaseModel):
                 raise ValueError(f"{field} is set, but {name} is {getattr(self, name)!r}: allowed with {value!r} only")
 
 
-class HysteresisOptions(Options):
-    """Prandtl-Ishlinskii model of the actuator: one that has a name, or thresholds and weights of one's own."""
+class BoucWenOptions(Options):
+    """y = d·u − h, dh/dt = A·du/dt − B·|du/dt|·h − Γ·du/dt·|h| (Wen 1976, of order 1)."""
 
-    truth: Literal["residual", "nominal", "custom"] = "residual"
+    um_per_v: float = Field(gt=0)
+    """d."""
+    rise_um_per_v: float = Field(gt=0)
+    """A: h begins with it, and ends at A/(B + Γ)."""
+    decay_per_v: float = Field(gt=0, le=10)
+    """B."""
+    lean_per_v: float = Field(default=0.0)
+    """Γ, no larger than B either way, or h would grow without bound."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if abs(self.lean_per_v) > self.decay_per_v:
+            raise ValueError(f"lean_per_v: {self.lean_per_v:g}; up to ±decay_per_v = {self.decay_per_v:g} is allowed")
+        return self
+
+
+class HysteresisOptions(Options):
+    """Model of the actuator: Prandtl-Ishlinskii of a name, or of thresholds and weights of one's own, or Bouc-Wen."""
+
+    truth: Literal["residual", "nominal", "custom", "bouc-wen"] = "residual"
     thresholds_v: Numbers = ()
     weights_um_per_v: Numbers = ()
+    bouc_wen: BoucWenOptions | None = None
     history_v: Numbers = ()
     """Drives that the actuator went through before it came to rest at 0 V: it then starts with memory of them."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.truth != "bouc-wen":
+            self._only_with("truth", "bouc-wen", "bouc_wen")
+        elif self.bouc_wen is None:
+            raise ValueError("bouc_wen: missing; truth = 'bouc-wen' needs its numbers")
         if self.truth != "custom":
             self._only_with("truth", "custom", "thresholds_v", "weights_um_per_v")
             return self

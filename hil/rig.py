@@ -21,11 +21,11 @@ import numpy as np
 from rtloop.hil.modal import modal_sum
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.options import DynamicsOptions, PlantOptions, RigOptions
-from rtloop.hil.stages import converters, creep, disturbance, dynamics, hysteresis, noise, sensor
+from rtloop.hil.stages import bouc_wen, converters, creep, disturbance, dynamics, hysteresis, noise, sensor
 
 MAX_COUPLED = 16
 """Axes of a rig in which any are coupled."""
-_STAGES = (converters, hysteresis, creep, disturbance, dynamics, sensor, noise)
+_STAGES = (converters, hysteresis, bouc_wen, creep, disturbance, dynamics, sensor, noise)
 
 COEFFICIENTS = np.dtype(
     [
@@ -101,7 +101,7 @@ def _rest_after(history_v: Sequence[float], coefficients: np.record, state: np.r
     """Leave the axis's actuator as the drives `history_v` and then a long rest at 0 V leave it."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
-        displacement_um = hysteresis.step(coefficients, state, drive_v)
+        displacement_um = _displacement_um(coefficients, state, drive_v)
     state.lags_um[:] = displacement_um
     state.hysteresis_um = creep.step(coefficients, state, displacement_um)
 
@@ -121,6 +121,8 @@ def _coefficients_of(plant: PlantOptions, period_s: float) -> dict[str, object]:
         "sensor_noise_um": plant.sensor.noise_um,
         "sensor_resolution_um": plant.sensor.resolution_um,
     }
+    if plant.hysteresis.bouc_wen is not None:
+        fields |= {f"bw_{name}": value for name, value in plant.hysteresis.bouc_wen}
     for name, converter in (("adc", plant.adc), ("dac", plant.dac)):
         span = converters.span(converter.range_v, converter.bits)
         fields |= dict(zip((f"{name}_lsb_v", f"{name}_lowest_v", f"{name}_highest_v"), span, strict=True))
@@ -171,11 +173,19 @@ def advance(coefficients, state, dac_v):
     """One period of all axes, `dac_v` [V] written to their DACs at its beginning; NaN holds what was written before."""
     for i in range(coefficients.shape[0]):
         actuator_v = converters.drive(coefficients[i], state[i], dac_v[i])
-        displacement_um = hysteresis.step(coefficients[i], state[i], actuator_v)
+        displacement_um = _displacement_um(coefficients[i], state[i], actuator_v)
         state[i].hysteresis_um = creep.step(coefficients[i], state[i], displacement_um)
     for i in range(coefficients.shape[0]):
         input_um = _moved_um(coefficients, state, i) + disturbance.step(coefficients[i], state[i])
         dynamics.step(coefficients[i], state[i], input_um)
+
+
+@jit
+def _displacement_um(coefficients, state, actuator_v):
+    """Displacement of an actuator at rest at `actuator_v` [µm], by plays or by Bouc-Wen."""
+    if coefficients.bw_um_per_v != 0.0:
+        return bouc_wen.step(coefficients, state, actuator_v)
+    return hysteresis.step(coefficients, state, actuator_v)
 
 
 @jit

@@ -42,7 +42,11 @@ def identify() -> None:
 @RUNS
 @AXIS
 @click.option("--operators", default=15, show_default=True, type=click.IntRange(1, 64), help="Number of plays.")
-@click.option("--placement", default="chebyshev", show_default=True, type=click.Choice(["chebyshev", "uniform"]))
+@click.option(
+    "--placement", default="auto", show_default=True,
+    type=click.Choice(["auto", "chebyshev", "chebyshev-from-0", "uniform"]),
+    help="Of thresholds: with a dead band (chebyshev) or without; auto takes what errs less.",
+)  # fmt: skip
 @click.option("--thresholds", type=Numbers(), help="Thresholds in V instead: '0,0.5,1,2'.")
 @click.option(
     "--weights", default="invertible", show_default=True, type=click.Choice(["invertible", "free"]),
@@ -53,7 +57,8 @@ def identify() -> None:
 @JSON
 @fails_clearly
 def hysteresis(
-    runs: tuple[Path, ...], axis: str | None, operators: int, placement: Literal["chebyshev", "uniform"],
+    runs: tuple[Path, ...], axis: str | None, operators: int,
+    placement: Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"],
     thresholds: tuple[float, ...] | None, weights: Literal["invertible", "free"], out: Path | None, plot: Path | None,
     as_json: bool,
 ) -> int:  # fmt: skip

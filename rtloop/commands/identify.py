@@ -22,7 +22,7 @@ from rtloop.design.identification.identified import (
 )
 from rtloop.design.identification.identify_delay import delayed
 from rtloop.design.identification.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identification.identify_hysteresis import Placement, Weights, identify_hysteresis
+from rtloop.design.identification.identify_hysteresis import Placement, Weights, identify_hysteresis, unexplained_um
 from rtloop.design.identification.measured import Measured, UnsuitableData, measured
 from rtloop.design.identification.prediction_error import LARGEST_ORDER
 from rtloop.errors import ConfigError
@@ -41,7 +41,7 @@ def hysteresis_report(
     *,
     axis: str | None = None,
     count: int = 15,
-    placement: Placement = "chebyshev",
+    placement: Placement = "auto",
     thresholds_v: Sequence[float] | None = None,
     weights: Weights = "invertible",
     out: Path | None = None,
@@ -67,6 +67,7 @@ def hysteresis_report(
             "measured_h_percent": fit.measured_loop.percent,
             "model_h_percent": fit.model_loop.percent,
             "invertible": fit.invertible,
+            "unexplained_um": unexplained_um(runs, fit),
             "output": out,
             "plot": plot,
         }

@@ -38,7 +38,7 @@ from rtloop.laws.shipped.play_model import PlayModel
 
 LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
-all that the position moved, which the model of the hysteresis may leave."""
+all that the actuator moved, which the model of the hysteresis may leave."""
 AT_REST = {"kind": "hold", "value": 0.0}
 SWINGS = 8
 """Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
@@ -83,7 +83,8 @@ def identified(hysteresis: Measured, step: Measured, order: int | None = None) -
     shape = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
-    _require_explained(step, dynamics)
+    noise_um = min(noise_of(step.position_um), noise_of(hysteresis.position_um))
+    _require_explained(step, dynamics, max(noise_um, SMALL_PART * float(np.ptp(excitation.input))))
     return Stage(hysteresis, step, shape, dynamics, with_gain(shape.model, dynamics.static_gain))
 
 
@@ -96,9 +97,9 @@ def designed(stage: Stage, design: DesignOptions) -> Chain:
     return Chain(stage, asked, synthesise_design(asked))
 
 
-def _require_explained(step: Measured, dynamics: DynamicsFit) -> None:
+def _require_explained(step: Measured, dynamics: DynamicsFit, noise_um: float) -> None:
     """Raise UnsuitableData for a model that misses more of its recording than noise and hysteresis leave."""
-    allowed_um = LARGEST_ERROR * max(noise_of(step.position_um), SMALL_PART * float(np.ptp(step.position_um)))
+    allowed_um = LARGEST_ERROR * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
             f"{step.name}: no model explains it: that of order {dynamics.model.order} behind {dynamics.delay_ticks} "

@@ -7,7 +7,6 @@ what they reached, and in between a loop is left.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import root_scalar
 
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import loading_curve, model_output
@@ -25,6 +24,8 @@ def with_hysteresis_left(model: PlayModel, percent: float, drive_v: float) -> Pl
     """
     if percent == 0:
         return model
+    from scipy.optimize import root_scalar  # a quarter of a second of import, which most stages have no use for
+
     reach_um = float(loading_curve(model, drive_v))
     command_um = reach_um * np.sin(np.linspace(0, 2 * np.pi * CYCLES, round(SAMPLES * CYCLES)))
     drives_v = np.clip(model_output(model.without_dead_band().inverse(), command_um), -drive_v, drive_v)

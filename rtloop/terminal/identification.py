@@ -19,8 +19,13 @@ def print_hysteresis(report: dict[str, Any]) -> None:
     out.print(shown)
     out.print(
         f"error {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
-        f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm)"
+        f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm); noise {report['noise_um']:.3g} µm"
     )
+    if report["unexplained_um"]:
+        out.print(
+            f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms are left however many "
+            "there are; small steps and loops of other sizes may differ from the model's by more"
+        )
     out.print(f"h/H {_number(report['measured_h_percent'])} % measured, {_number(report['model_h_percent'])} % model")
     out.print("sensor offset: " + ", ".join(f"{offset:.4g} µm" for offset in report["offsets_um"]))
     if not report["invertible"]:

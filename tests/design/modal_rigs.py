@@ -47,6 +47,16 @@ class ModalRig(NamedTuple):
     weights_um_per_v: np.ndarray[Any, Any]
     noise_um: float | None = None
     command_um: float = 20.0
+    bouc_wen: dict[str, float] | None = None
+    """In place of the weights."""
+
+    @property
+    def reach_um(self) -> float:
+        """What 10 V reach from rest."""
+        if self.bouc_wen is None:
+            return float(np.sum(self.weights_um_per_v * (10.0 - np.array(THRESHOLDS_V))))
+        d, rise, decay, lean = self.bouc_wen.values()
+        return 10.0 * d - rise / (decay + lean) * (1.0 - math.exp(-10.0 * (decay + lean)))
 
     def configuration(self, sine: bool) -> str:
         """For the slow sine at 1 kHz, or for the steps up and down at 10 kHz."""
@@ -74,8 +84,7 @@ class ModalRig(NamedTuple):
             f'[loop]\nrate_hz = {1000 if sine else RATE_HZ}\nmode = "raw"',
             f'[driver]\nkind = "sim"\nseed = {self.seed}\nlatency_ticks = {0 if sine else self.delay_ticks}',
             '[driver.channels.x]\ninput = "adc0"\noutput = "dac0"\num_per_v = 10.0',
-            f'[driver.plant.hysteresis]\ntruth = "custom"\nthresholds_v = {list(THRESHOLDS_V)}',
-            f"weights_um_per_v = {self.weights_um_per_v.tolist()}",
+            self._hysteresis(),
             f'[driver.plant.dynamics]\nform = "zpk"\ngain = {leading!r}',
             *dynamics,
             "" if self.noise_um is None else f"[driver.plant.sensor]\num_per_v = 10.0\nnoise_um = {self.noise_um!r}",
@@ -86,14 +95,29 @@ class ModalRig(NamedTuple):
             f"[axis.reference]\n{reference}",
         ])  # fmt: skip
 
+    def _hysteresis(self) -> str:
+        if self.bouc_wen is None:
+            truth = f'truth = "custom"\nthresholds_v = {list(THRESHOLDS_V)}'
+            return f"[driver.plant.hysteresis]\n{truth}\nweights_um_per_v = {self.weights_um_per_v.tolist()}"
+        numbers = "\n".join(f"{name} = {value!r}" for name, value in self.bouc_wen.items())
+        return f'[driver.plant.hysteresis]\ntruth = "bouc-wen"\n[driver.plant.hysteresis.bouc_wen]\n{numbers}'
+
 
 def noisy_rig(seed: int) -> ModalRig:
-    """Slower, noisier and longer than `modal_rig`: 100 Hz to 2 kHz, 10 to 100 nm, ±43 µm, weights of eq (4) ± 30 %."""
+    """Slower, noisier and longer than `modal_rig`: 100 Hz to 2 kHz, 10 to 100 nm, about ±43 µm.
+
+    Of even seeds the weights are those of eq (4) ± 30 %; of odd ones the actuator is Bouc-Wen, A 5 to 20 % of d.
+    """
     random = np.random.default_rng(10_000 + seed)
     drawn = _modes(random, 100.0, 2000.0)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.7, 1.3, len(THRESHOLDS_V))
     noise_um = float(np.exp(random.uniform(np.log(0.01), np.log(0.1))))
-    return ModalRig(seed, *drawn, weights, noise_um, command_um=43.0)
+    if seed % 2 == 0:
+        return ModalRig(seed, *drawn, weights, noise_um, command_um=43.0)
+    d, decay = 4.6 * random.uniform(0.8, 1.2), random.uniform(0.1, 0.4)
+    lean, part = decay * random.uniform(-0.5, 0.5), random.uniform(0.05, 0.2)
+    numbers = {"um_per_v": d, "rise_um_per_v": part * d, "decay_per_v": decay, "lean_per_v": lean}
+    return ModalRig(seed, *drawn, weights, noise_um, 43.0, {name: float(value) for name, value in numbers.items()})
 
 
 def modal_rig(seed: int) -> ModalRig:

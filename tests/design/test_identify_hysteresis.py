@@ -159,7 +159,22 @@ def test_a_position_within_its_noise_is_too_little() -> None:
 
 
 def test_options_that_cannot_be_are_named() -> None:
-    with pytest.raises(ValueError, match="placement: 'random'; allowed are chebyshev, uniform"):
-        placed_thresholds(5, 10.0, "random")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="placement: 'random'; allowed are auto, chebyshev, chebyshev-from-0, uniform"):
+        identify_hysteresis([run_of(np.zeros(9), np.zeros(9))], placement="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="number of operators: 65; 1 to 64"):
         placed_thresholds(65, 10.0, "uniform")
+
+
+@pytest.mark.parametrize("dead_band_v", [0.0, 0.1])
+def test_a_dead_band_is_found_where_there_is_one(dead_band_v: float) -> None:
+    """The stage's own thresholds are not those of the fit; noise is."""
+    thresholds = dead_band_v + np.array([0.0, 0.7, 1.9, 3.6, 5.2, 7.1])
+    drive = 10 * np.sin(2 * np.pi * np.arange(30_000) / 12_000)
+    held, moved = np.zeros(thresholds.size), []
+    for u in drive:
+        held = np.maximum(u - thresholds, np.minimum(u + thresholds, held))
+        moved.append(held @ [3.0, 0.5, 0.4, 0.3, 0.3, 0.2])
+    position = np.append(0.0, moved[:-1]) + np.random.default_rng(1).normal(0, 0.02, drive.size)
+    fit = identify_hysteresis([run_of(drive, position)])
+    assert (fit.model.thresholds[0] > 0) == (dead_band_v > 0)
+    assert fit.placement == ("chebyshev" if dead_band_v else "chebyshev-from-0")

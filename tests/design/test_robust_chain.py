@@ -17,6 +17,7 @@ from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.scenarios import Family
 from rtloop.linear.transfer import Transfer
+from tests.design.modal_rigs import RATE_HZ, SINE_S, STEPS_S, noisy_rig
 from tests.recording.real_loop import record
 from tests.soak.chain import run
 
@@ -150,3 +151,21 @@ def test_a_pole_beyond_reach_in_s_is_a_finite_one_that_answers_alike_at_the_tick
         return np.sum(parts[0] / (z[:, None] - np.exp(poles * PERIOD_S)), axis=1)
 
     np.testing.assert_allclose(answer(reach, kept), answer(rates, residues), rtol=1e-5)
+
+
+BOUC_WEN_ODD = 9
+
+
+def test_an_actuator_that_is_no_sum_of_plays_gets_no_promise(tmp_path) -> None:
+    """It is said before minutes are spent, with what was left and how to go on."""
+    rig = noisy_rig(BOUC_WEN_ODD)
+    assert rig.bouc_wen is not None
+    sine = record(tmp_path / "sine.mcap", rig.configuration(sine=True), round(SINE_S * 1000))[0]
+    steps = record(tmp_path / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
+    result = automatically([str(sine), str(steps)], tmp_path, SPEC.format(percent=3.0))
+    assert result.exit_code == 1
+    assert "the actuator is no sum of plays" in result.stderr
+    assert "simulation.residual_percent" in result.stderr
+    assert not (tmp_path / "made.toml").exists()
+    said = CliRunner().invoke(main, ["identify", "hysteresis", str(sine)]).stdout
+    assert "the actuator is no sum of plays" in said

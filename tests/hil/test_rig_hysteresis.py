@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
-from rtloop.hil.options import DynamicsOptions, HysteresisOptions
+from rtloop.hil.options import BoucWenOptions, DynamicsOptions, HysteresisOptions
 from rtloop.hil.stages.hysteresis import play
 
 # Eq (4): thresholds r_i [V] and weights p_i [µm/V].
@@ -147,3 +150,52 @@ def test_play_does_not_see_the_rate(start, end, threshold, stops):
 @given(thresholds, volts)
 def test_play_holds_on_nan(threshold, held):
     assert play(float("nan"), threshold, held) == held
+
+
+BOUC_WEN = {"um_per_v": 4.4, "rise_um_per_v": 0.9, "decay_per_v": 0.3, "lean_per_v": 0.1}
+
+
+def bouc_wen(run, ideal, drive: np.ndarray) -> np.ndarray:
+    """y of a rig of that kind for each drive."""
+    options = HysteresisOptions(truth="bouc-wen", bouc_wen=BoucWenOptions(**BOUC_WEN))
+    return run(np.append(drive, 0.0), ideal(hysteresis=options, dynamics=RIGID)).hysteresis_um[1:]
+
+
+def solved(turns_v: list[float], points: int) -> np.ndarray:
+    """y along straight ways from turn to turn, by scipy's integrator of the equation itself."""
+    d, rise, decay, lean = BOUC_WEN.values()
+    left, found = 0.0, []
+    for start, end in pairwise(turns_v):
+        way = end - start
+        slope = lambda _, h, way=way: rise * way - decay * abs(way) * h - lean * way * np.abs(h)
+        part = solve_ivp(slope, (0, 1), [left], rtol=1e-10, atol=1e-12, t_eval=np.linspace(0, 1, points + 1)[1:])
+        left = part.y[0, -1]
+        found.append(d * (start + way * part.t) - part.y[0])
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize("points", [1, 7, 400])
+def test_bouc_wen_is_its_equation_at_any_rate(run, ideal, points):
+    """With one step of 20 V as with 400 of 50 mV."""
+    turns = [0.0, 10.0, -10.0, 6.0, -2.0, 3.0, -10.0, 10.0]
+    drive = np.concatenate([a + (b - a) * np.arange(1, points + 1) / points for a, b in pairwise(turns)])
+    np.testing.assert_allclose(bouc_wen(run, ideal, drive), solved(turns, points), rtol=0, atol=2e-3)
+
+
+def test_bouc_wen_does_not_move_on_no_number(run, ideal):
+    found = bouc_wen(run, ideal, np.array([5.0, np.nan, 5.0, 7.0]))
+    assert found[0] == found[1] == found[2]
+    assert found[3] > found[2]
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"truth": "bouc-wen"}, "bouc_wen: missing"),
+        ({"bouc_wen": BOUC_WEN}, "bouc_wen is set, but truth is 'residual'"),
+        ({"truth": "bouc-wen", "bouc_wen": BOUC_WEN | {"lean_per_v": -0.4}}, "up to ±decay_per_v = 0.3 is allowed"),
+    ],
+)
+def test_bouc_wen_of_wrong_numbers(options, match):
+    with pytest.raises(ValueError, match=match):
+        HysteresisOptions.model_validate(options)

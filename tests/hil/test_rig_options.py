@@ -78,7 +78,7 @@ def test_defaults_are_the_papers():
         ("seed = -1", "seed", "greater than or equal to 0"),
         ("seed = 1.5", "seed", "valid integer"),
         ("latency_ticks = 17", "latency_ticks", "less than or equal to 16"),
-        ('plant.hysteresis.truth = "real"', "plant.hysteresis.truth", "'residual', 'nominal' or 'custom'"),
+        ('plant.hysteresis.truth = "real"', "plant.hysteresis.truth", "'residual', 'nominal', 'custom' or 'bouc-wen'"),
         ('plant.hysteresis.truth = "custom"', "plant.hysteresis", "thresholds_v has 0 numbers: allowed are 1 to 64"),
         ("plant.hysteresis.thresholds_v = [1]", "plant.hysteresis", "truth is 'residual': allowed with 'custom' only"),
         (

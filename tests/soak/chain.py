@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +28,7 @@ from rtloop.linear.discretise import discretise
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, modal_rig
 from tests.recording.real_loop import record
+from tests.soak.draws import every_draw
 
 STEP_UM, DWELL_S = 10.0, 0.2
 LIMITS = {"overshoot_percent": 20.0, "static_percent": 2.0}
@@ -42,15 +41,8 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    bad = 0
-    for seed in range(given.seed, given.seed + given.draws):
-        started = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:
-            good, words = one(modal_rig(seed), Path(folder))
-        bad += not good
-        print(f"{seed:3} {words}  [{time.perf_counter() - started:.0f} s]{'' if good else '  BAD'}", flush=True)
-    print(f"{given.draws} rigs, {bad} bad")
-    return int(bad > 0)
+    seeds = range(given.seed, given.seed + given.draws)
+    return every_draw(seeds, lambda seed, folder: one(modal_rig(seed), folder))
 
 
 def one(rig: ModalRig, folder: Path) -> tuple[bool, str]:

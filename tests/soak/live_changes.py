@@ -23,6 +23,7 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
+from rtloop.recording.capture.names import Names
 from rtloop.recording.replay.replay import replay
 from rtloop.service.desk import Desk
 from rtloop.service.live import LiveLaw
@@ -45,7 +46,8 @@ class GuardedProcesses(Processes):
     def __init__(self) -> None:
         self.fd = SharedBlock.reserve()
         self.loop = Child("tests.soak.guarded_process", self.fd)
-        self.recorder = Child("rtloop.recording.capture.recorder", self.fd)
+        self.names = Names.create()
+        self.recorder = Child("rtloop.recording.capture.recorder", self.fd, names=self.names.fd)
 
 
 class EveryChange(Changes):

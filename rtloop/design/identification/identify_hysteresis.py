@@ -12,20 +12,23 @@ recording costs nothing in accuracy. What the plant's lag adds, rate × lag, cou
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from rtloop.design.identification.measured import Measured, UnsuitableData
+from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output, play_outputs, turning_points
 from rtloop.laws.shipped.play_model import MAX_PLAYS, PlayModel
 
-Placement = Literal["chebyshev", "uniform"]
+Placed = Literal["chebyshev", "chebyshev-from-0", "uniform"]
+Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 Weights = Literal["invertible", "free"]
 
 BLOCKS = 20_000
@@ -34,6 +37,9 @@ LEAST_SLOPE = 0.05
 """Of "invertible" weights: the least partial sum, as a part of the mean slope, so that the inverse stays moderate."""
 REST = 0.02
 """A recording starts from rest where its first drive is below this part of the largest."""
+FINEST, STRUCTURE = 60, 2.5e-4
+"""An actuator is no sum of plays where not even so many explain it: what they leave beside noise is more than this part
+of the range."""
 LEAST_DIRECTION = 1e-9
 """Smallest singular value of the scaled columns, relative to the largest, for weights that can be told apart."""
 
@@ -42,13 +48,14 @@ LEAST_DIRECTION = 1e-9
 class HysteresisFit:
     """The model in V and µm, and how well it explains what it was made from.
 
-    `offsets_um` is of each recording's sensor; errors are of averaged samples; percentages are of the range.
+    `offsets_um` is of each recording's sensor; errors and noise are of averaged samples; percentages are of the range.
     """
 
     model: PlayModel
     offsets_um: tuple[float, ...]
     rms_error_um: float
     max_error_um: float
+    noise_um: float
     range_um: float
     drive_v: float
     measured_loop: LoopShape
@@ -68,34 +75,58 @@ class _Equations(NamedTuple):
     position_um: Real
 
 
-def placed_thresholds(count: int, largest_v: float, placement: Placement) -> Real:
+def placed_thresholds(count: int, largest_v: float, placement: Placed) -> Real:
     """`count` thresholds in V below `largest_v`, the largest drive.
 
     "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
-    give those of eq (4) within 0.02 V. "uniform": R·i/n from 0 on, without a dead band.
+    give those of eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.
+    "uniform": R·i/n from 0 on.
     """
-    if placement not in get_args(Placement):
-        raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
     if not 1 <= count <= MAX_PLAYS:
         raise ValueError(f"number of operators: {count}; 1 to {MAX_PLAYS} are allowed")
     if placement == "uniform":
         return largest_v * np.arange(count) / count
-    return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(1, count + 1) / (count + 1)))
+    if placement == "chebyshev":
+        return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(1, count + 1) / (count + 1)))
+    return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(count) / count))
 
 
 def identify_hysteresis(
     runs: Sequence[Measured],
     count: int = 15,
-    placement: Placement = "chebyshev",
+    placement: Placement = "auto",
     thresholds_v: Sequence[float] | None = None,
     weights: Weights = "invertible",
 ) -> HysteresisFit:
-    """The model that fits all `runs`, each from rest at 0 V. Raises UnsuitableData, ValueError for the options."""
+    """The model that fits all `runs`, each from rest at 0 V. Raises UnsuitableData, ValueError for the options.
+
+    "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever leaves less of the recordings.
+    """
+    if placement not in get_args(Placement):
+        raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
     for run in runs:
         _require_loop(run)
     largest_v = max(float(np.abs(run.drive_v).max()) for run in runs)
-    given = thresholds_v is not None
-    thresholds = np.array(thresholds_v, float) if given else placed_thresholds(count, largest_v, placement)
+    if thresholds_v is not None:
+        return _fitted(runs, np.array(thresholds_v, float), "given", weights, largest_v)
+    tried: tuple[Placed, ...] = ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
+    fits = [_fitted(runs, placed_thresholds(count, largest_v, one), one, weights, largest_v) for one in tried]
+    return min(fits, key=lambda fit: fit.rms_error_um)
+
+
+def unexplained_um(runs: Sequence[Measured], fit: HysteresisFit) -> float:
+    """rms in µm of what no sum of plays explains in the recordings of a fit, noise aside; 0 where that is nothing."""
+    errors = fit.rms_error_um
+    with suppress(UnsuitableData):  # so many cannot be told apart
+        errors = min(errors, identify_hysteresis(runs, FINEST).rms_error_um)
+    left_um = math.sqrt(max(0.0, errors**2 - fit.noise_um**2))
+    return left_um if left_um > STRUCTURE * fit.range_um else 0.0
+
+
+def _fitted(
+    runs: Sequence[Measured], thresholds: Real, placed: str, weights: Weights, largest_v: float
+) -> HysteresisFit:
+    """With plays at `thresholds` in V."""
     _require_reached(thresholds, largest_v)
     equations = [_equations(run, thresholds, i, len(runs)) for i, run in enumerate(runs)]
     columns = np.vstack([part.columns for part in equations])
@@ -111,11 +142,12 @@ def identify_hysteresis(
         tuple(offsets.tolist()),
         float(np.sqrt(np.mean(errors**2))),
         float(np.abs(errors).max()),
+        float(np.sqrt(np.mean([noise_of(run.position_um) ** 2 / _block(run) for run in runs]))),
         range_um,
         largest_v,
         loop_shape(widest.drive_v[:-1], widest.position_um[1:]),
         loop_shape(widest.drive_v, model_output(model, widest.drive_v)),
-        "given" if given else placement,
+        placed,
         weights,
         least,
     )
@@ -127,8 +159,13 @@ def _equations(run: Measured, thresholds: Real, index: int, runs: int) -> _Equat
     plays[:, :-1] -= plays[:, 1:].copy()
     offset = np.zeros((plays.shape[0], runs))
     offset[:, index] = 1.0
-    size = max(1, plays.shape[0] // BLOCKS)
+    size = _block(run)
     return _Equations(_averaged(np.hstack([plays, offset]), size), _averaged(run.position_um[1:, None], size)[:, 0])
+
+
+def _block(run: Measured) -> int:
+    """Samples that are averaged to one."""
+    return max(1, (run.drive_v.size - 1) // BLOCKS)
 
 
 def _averaged(rows: Real, size: int) -> Real:

@@ -16,9 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
 from rtloop.design.chain import Stage, text_with
+from rtloop.design.identification.identify_hysteresis import unexplained_um
 from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.robust.search import Progress, Robust, robust_controller
@@ -28,6 +30,7 @@ from rtloop.design.robust.subject import lacking, subject_of
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions, DisturbanceOptions
 from rtloop.errors import ConfigError, NoDesign
+from rtloop.linear.discretise import discretise
 
 RANGES_PERCENT = (10.0, 5.0, 2.0)
 """Of the resonance that a controller bears, where [scenarios] is left out."""
@@ -37,6 +40,9 @@ PERIODS = 2.9
 """Of the slowest leading mode, that the taps last where their number is left out."""
 NARROW_PERCENT = 2.5
 """Half of the band for settling: what the inverse leaves of hysteresis, and noise, may take the other half."""
+LEAST_DAMPING, ABOUT = 0.1, 1.5
+"""In closed loop, from the lowest leading mode's frequency by this factor down to the highest one's up: taps make steps
+of a model, and what the stage does besides rings on."""
 FEWEST_POINTS = 3
 """Of a tick, in the programme of many taps; the proof looks at as many as ever."""
 HELD, SLOWER = 0.1, 100.0
@@ -62,6 +68,7 @@ def designed_robustly(
     `spec_name` is the specification's file relative to `folder`, where the configuration is to stand. Raises NoDesign
     with what is missed. The specification is one that `require_enough` lets through.
     """
+    _require_plays(stage, design)
     asked = stage.asked(design)
     asked, found = _controller(asked, progress)
     comments = provenance(found, asked, spec_name, spec_text)
@@ -92,20 +99,62 @@ def require_enough(design: DesignOptions, source: str) -> None:
         raise ConfigError(source, faults)
 
 
+def _require_plays(stage: Stage, design: DesignOptions) -> None:
+    """Raise NoDesign where steps cannot be promised: the inverse leaves what no recording tells.
+
+    A specification that says how much hysteresis is left (`simulation.residual_percent`) has it simulated instead.
+    """
+    left_um = unexplained_um([stage.slow], stage.hysteresis)
+    if left_um and "residual_percent" not in design.simulation.model_fields_set:
+        raise NoDesign(
+            f"{stage.slow.name}: the actuator is no sum of plays: {left_um:.3g} µm rms are left however many there "
+            "are, and what steps of other sizes do is not in the recording. With simulation.residual_percent, how much "
+            "hysteresis the inverse may leave, the design goes on, and is verified with it"
+        )
+
+
 def _controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions, Robust]:
     """The controller for the widest range that has one. Raises NoDesign."""
     asked = _with_disturbance(asked)
     *wider, last = _ranges(asked)
     for one in wider:
         try:
-            return one, robust_controller(one, progress)
+            return one, _damped(one, progress)
         except NoController as error:
             progress(f"±{one.scenarios.resonance_percent:g} % is too wide: {error}")
     try:
-        return last, robust_controller(last, progress)
+        return last, _damped(last, progress)
     except (NoController, ValueError) as error:
         tried = "" if not wider else f"not even for resonances within ±{last.scenarios.resonance_percent:g} %: "
         raise NoDesign(f"{tried}{error}") from None
+
+
+def _damped(asked: DesignOptions, progress: Progress) -> Robust:
+    """A controller that damps what rings about the leading modes, unless `robust.decay_ms` says what is enough.
+
+    Raises NoController.
+    """
+    found = robust_controller(asked, progress)
+    if asked.robust.decay_ms is None and found.family.leading:
+        hz, damping = _lightest(found)
+        if damping < LEAST_DAMPING:
+            raise NoController(
+                f"robust: {hz:.4g} Hz keep ringing, with a damping of {damping:.2g} in closed loop; {LEAST_DAMPING:g} "
+                "is needed, or what the inverse leaves excites them in every step. Modes that are so close, so light "
+                "or so late need more than this controller; robust.decay_ms, a time that is accepted, lets it pass"
+            )
+    return found
+
+
+def _lightest(found: Robust) -> tuple[float, float]:
+    """Frequency in Hz and damping of the lightest closed-loop mode of the model about its leading ones."""
+    family = found.family
+    controller = discretise(found.controller, family.period_s, "matched")
+    rates = discrete_loop(controller, family.plant(family.nominal), family.nominal.delay_ticks).rates
+    sizes, leading = np.abs(rates), np.abs(family.modes[list(family.leading)])
+    within = rates[(sizes > leading.min() / ABOUT) & (sizes < leading.max() * ABOUT)]
+    lightest = min(within, key=lambda rate: -rate.real / abs(rate), default=complex(-1.0))
+    return abs(lightest) / (2 * math.pi), float(-lightest.real / abs(lightest))
 
 
 def _ranges(asked: DesignOptions) -> Iterator[DesignOptions]:
