@@ -1,0 +1,175 @@
+"""What a trigger looks for in a signal, at every tick, in whatever lengths the ticks come.
+
+A condition is handed a signal (n,) after the other and returns the places where it is met, in order. It remembers the
+signal from one to the next. Of what happened in ticks that were lost in between, it finds what the first tick behind
+them still shows, and nothing else: it may have missed something, but never made something up. NaN is neither here nor
+there. None of them is met at the first tick of all, for nobody knows what came before.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.hil.modal import Real
+from rtloop.signals import COMMON, FLAGS, MODE, PERIODS_MISSED, TRIP_MASK
+
+Places = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+
+class Slope(StrEnum):
+    """Which way an edge goes."""
+
+    RISING = "rising"
+    FALLING = "falling"
+    EITHER = "either"
+
+
+class Condition(Protocol):
+    """`source` is the signal that it is about."""
+
+    source: str
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """Where in `values` (n,), n > 0, it is met; `gap` says that ticks in front of them were lost."""
+        ...
+
+    def at_its_tick(self, place: int, gap: bool) -> bool:
+        """Whether what was found there happened at that very tick, and not in the lost ones before it."""
+        return not (gap and place == 0)
+
+
+class Crossing:
+    """From one side to the other, whatever lies in between: the fired side is reached after the ready one."""
+
+    def __init__(self) -> None:
+        self._ready = False
+
+    def find(self, ready: Mask, fired: Mask, gap: bool) -> Places:
+        """Where `fired` holds for the first time after `ready` did; never both at once."""
+        places = np.flatnonzero(ready | fired)
+        if gap and not fired[0]:
+            self._ready = False
+        if places.size == 0:
+            return places
+        sides = ready[places]
+        before = np.concatenate([[self._ready], sides[:-1]])
+        self._ready = bool(sides[-1])
+        return places[before & ~sides]
+
+
+class Edge(Condition):
+    """The source reaches `level`, after having been more than `hysteresis` away from it on the other side."""
+
+    def __init__(self, source: str, level: float, slope: Slope = Slope.RISING, hysteresis: float = 0.0) -> None:
+        _require_finite("trigger level", level)
+        _require_finite("trigger hysteresis", hysteresis)
+        if hysteresis < 0:
+            raise ValueError(f"trigger hysteresis: {hysteresis:g}; 0 or more is allowed")
+        self.source, self._level, self._hysteresis = source, level, hysteresis
+        self._rising = Crossing() if slope is not Slope.FALLING else None
+        self._falling = Crossing() if slope is not Slope.RISING else None
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """Where the level is reached."""
+        level, hysteresis, places = self._level, self._hysteresis, []
+        if self._rising is not None:
+            places.append(self._rising.find(values < level - hysteresis, values >= level, gap))
+        if self._falling is not None:
+            places.append(self._falling.find(values > level + hysteresis, values <= level, gap))
+        return places[0] if len(places) == 1 else np.union1d(*places)
+
+
+class Window(Condition):
+    """The source leaves the band from `low` to `high`, both of which belong to it."""
+
+    def __init__(self, source: str, low: float, high: float) -> None:
+        _require_finite("trigger window", low)
+        _require_finite("trigger window", high)
+        if not low < high:
+            raise ValueError(f"trigger window: from {low:g} to {high:g}; the lower end comes first")
+        self.source, self._low, self._high = source, low, high
+        self._leaving = Crossing()
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """The first ticks outside."""
+        outside = (values < self._low) | (values > self._high)
+        return self._leaving.find(~outside & ~np.isnan(values), outside, gap)
+
+
+class Tripped(Condition):
+    """A cause of a trip appears among the flags, beside others or alone."""
+
+    source = COMMON[FLAGS].name
+
+    def __init__(self) -> None:
+        self._before: int | None = None
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """Where one appears."""
+        causes = values.astype(np.int64) & TRIP_MASK
+        before = _before(causes, self._before)
+        self._before = int(causes[-1])
+        return np.flatnonzero(causes & ~before)
+
+
+class ModeChanged(Condition):
+    """Another mode is in force."""
+
+    source = COMMON[MODE].name
+
+    def __init__(self) -> None:
+        self._before: float | None = None
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """The first ticks in it."""
+        before = _before(values, self._before)
+        self._before = float(values[-1])
+        return np.flatnonzero(values != before)
+
+
+class Late(Condition):
+    """A tick woke so late that whole periods were missed."""
+
+    source = COMMON[PERIODS_MISSED].name
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """The ticks that did."""
+        return np.flatnonzero(values > 0)
+
+    def at_its_tick(self, place: int, gap: bool) -> bool:
+        """Always: a tick says it of itself."""
+        return True
+
+
+class Stepped(Condition):
+    """The source, such as a reference, changes by more than `threshold` from one tick to the next."""
+
+    def __init__(self, source: str, threshold: float = 0.0) -> None:
+        _require_finite("trigger threshold", threshold)
+        if threshold < 0:
+            raise ValueError(f"trigger threshold: {threshold:g}; 0 or more is allowed")
+        self.source, self._threshold = source, threshold
+        self._before: float | None = None
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """The ticks with the new value; none behind lost ones, over which a ramp goes far as well."""
+        before = _before(values, None if gap else self._before)
+        self._before = float(values[-1])
+        with np.errstate(invalid="ignore", over="ignore"):  # from infinity to infinity is no step
+            return np.flatnonzero(np.abs(values - before) > self._threshold)
+
+
+def _before(values: npt.NDArray, first: float | None) -> npt.NDArray:
+    """The value before each one, of the first one `first`, or itself where that is not known."""
+    return np.concatenate([values[:1] if first is None else [first], values[:-1]])
+
+
+def _require_finite(what: str, value: float) -> None:
+    if not math.isfinite(value):
+        raise ValueError(f"{what}: {value}; a finite number is needed")

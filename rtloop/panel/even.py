@@ -1,0 +1,45 @@
+"""Samples on an even grid of time, as a spectrum needs them: short holes are bridged, long ones break the record.
+
+A loop that misses a period has no sample of it. A straight line in its place changes the density of white noise by the
+part of the samples that were bridged; a spectrum that began anew at each would never get to its low frequencies.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+
+
+class Even:
+    """Puts samples on their grid; holes of up to `longest` samples are bridged by a straight line."""
+
+    def __init__(self, longest: int) -> None:
+        self._longest = longest
+        self._last: tuple[float, float] | None = None
+        self.bridged = 0
+        """Samples that were put in."""
+
+    def take(self, values: Real, places: Real) -> list[tuple[bool, Real]]:
+        """Runs without a hole, each with whether it goes on where the one before it ended.
+
+        `values` (n,), where what is not finite is a hole, stand at the whole numbers `places` (n,).
+        """
+        good = np.isfinite(values)
+        values, places = values[good], places[good]
+        if values.size == 0:
+            return []
+        goes_on = self._last is not None
+        if self._last is not None:
+            values, places = np.concatenate([[self._last[1]], values]), np.concatenate([[self._last[0]], places])
+        self._last = float(places[-1]), float(values[-1])
+        strides = np.diff(places)
+        breaks = 1 + np.flatnonzero((strides < 1) | (strides > self._longest + 1))
+        runs = []
+        for number, (at, x) in enumerate(zip(np.split(places, breaks), np.split(values, breaks), strict=True)):
+            grid = np.arange(at[0], at[-1] + 1)
+            self.bridged += grid.size - at.size
+            filled = np.interp(grid, at, x) if grid.size > at.size else x
+            continued = goes_on and number == 0
+            runs.append((continued, filled[1:] if continued else filled))  # the last one before was handed out before
+        return runs

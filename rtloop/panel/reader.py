@@ -1,0 +1,78 @@
+"""One more reader of a running service's ring of ticks, with a cursor of its own; whatever it does, no tick waits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.engine.ring import Ring, drain
+from rtloop.errors import UnavailableError
+from rtloop.panel.mapping import Mapping, is_at, open_mapping
+from rtloop.panel.stretch import Stretch
+
+MOST_TICKS = 1 << 14
+"""In one stretch, so that whoever reads a full ring can do something else in between."""
+CLEARANCE = 16
+"""Of a full ring one part in so many, the oldest, is left to the writer, which is about to overwrite it."""
+
+
+class Reader:
+    """Reads the ring in the shared block at `path`, whenever there is one; a service that starts again has another.
+
+    `columns` says which signals the loop records, and is asked once a run. The first stretch begins with what the ring
+    still holds, about ten seconds ago.
+    """
+
+    def __init__(self, path: Path, columns: Callable[[], Sequence[str]]) -> None:
+        self._path, self._ask = path, columns
+        self._mapping: Mapping | None = None
+        self._ring: Ring | None = None
+        self._columns: tuple[str, ...] = ()
+        self._cursor = 0
+        self.run = -1
+        """Number of the run that is read, from 0 on."""
+        self.lost = 0
+        """Ticks that were overwritten before they could be read, in all runs."""
+
+    def read(self) -> Stretch | None:
+        """The next ticks; None where there are none now. Waits for nothing.
+
+        Raises HostRefused, UnavailableError, and what `columns` raises.
+        """
+        stretch = self._take()
+        if stretch is None and (self._mapping is None or not is_at(self._mapping, self._path)) and self._follow():
+            stretch = self._take()
+        return stretch
+
+    def _follow(self) -> bool:
+        """Go over to the block that lies there now; False while no loop has made one."""
+        mapping = open_mapping(self._path)
+        if mapping is None:
+            return False
+        ring, columns = mapping.ring(), tuple(self._ask())
+        capacity, width = ring.slots.shape
+        if len(columns) != width:
+            raise UnavailableError(f"{self._path}: records of {width} signals, and {len(columns)} names for them")
+        if self._mapping is None:
+            self._cursor = max(int(ring.head[0]) - capacity + capacity // CLEARANCE, 0)
+        else:
+            self._cursor = 0
+        self._mapping, self._ring, self._columns = mapping, ring, columns
+        self.run += 1
+        return True
+
+    def _take(self) -> Stretch | None:
+        if self._ring is None:
+            return None
+        ready = int(self._ring.head[0]) - self._cursor
+        if ready == 0:
+            return None
+        rows = np.empty((min(ready, MOST_TICKS), len(self._columns)))
+        copied, first, lost = drain(self._ring, self._cursor, rows)
+        if copied == 0:
+            return None
+        self._cursor = first + copied
+        self.lost += lost
+        return Stretch(self._columns, first, rows[:copied], lost, self.run)

@@ -1,0 +1,197 @@
+"""Power spectral density from near DC to half the rate, averaged as the samples come: a cascade of short transforms.
+
+Stage s averages periodograms (Hann window, 50 % overlap; Welch 1967) of SEGMENT samples at the rate
+f/DECIMATION^s, and hands what it was given, low-pass filtered and decimated, to stage s + 1. Each frequency is taken
+from the last stage that can tell it, so that the resolution is some percent of the frequency everywhere, high ones are
+there at once, and the work for a sample is bounded. As in QUARTIQ's stabilizer-stream (Jördens) and in LPSD (Tröbs and
+Heinzel 2006, doi:10.1016/j.measurement.2005.10.010).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.hil.modal import Real
+from rtloop.panel.even import Even
+
+SEGMENT = 1024
+DECIMATION = 4
+PASS = 0.4
+"""A decimated stage is true up to this part of its rate, and what lies above half of it folds back to above that."""
+ATTENUATION_DB = 100.0
+"""Of what would fold back below that."""
+LOWEST_BIN = 2
+"""A constant, seen through the window, is all of it in bins 0 and 1."""
+LONGEST_HOLE = SEGMENT // 100
+WORKED_ON = 1 << 16
+"""Samples at once, so that a long record needs little memory."""
+FINER_UNITS = {"µm": ("nm", 1e3)}
+
+
+class Power(NamedTuple):
+    """Of one stage, (edges,): the power `below` each edge of its bins, in the density's unit squared."""
+
+    edges_hz: Real
+    below: Real
+
+
+class Density(NamedTuple):
+    """One-sided density over contiguous bands; band i reaches from `edges_hz[i]` to `edges_hz[i + 1]`."""
+
+    hz: Real
+    """(bands,)"""
+    edges_hz: Real
+    """(bands + 1,)"""
+    amplitude: Real
+    """(bands,) in `unit`/√Hz."""
+    averages: npt.NDArray[np.intp]
+    """(bands,): periodograms that were averaged."""
+    unit: str
+    powers: tuple[Power, ...]
+    """What each stage contributes to the whole."""
+
+    def rms(self, low_hz: float, high_hz: float) -> float:
+        """Of what lies between two frequencies, in `unit`; frequencies that are not there count as nothing.
+
+        Where two stages tell the same, one gives way to the other over an octave: a line that lies where the bands
+        change their width would else count too much or too little.
+        """
+        if not low_hz < high_hz:
+            return 0.0
+        ends = [np.interp([low_hz, high_hz], power.edges_hz, power.below) for power in self.powers]
+        return float(np.sqrt(max(sum(beyond - below for below, beyond in ends), 0.0)))
+
+
+class Spectrum:
+    """Of a signal with samples at `rate_hz` in `unit`; µm are told in nm."""
+
+    def __init__(self, rate_hz: float, unit: str, segment: int = SEGMENT) -> None:
+        if not rate_hz > 0:
+            raise ValueError(f"spectrum: a rate of {rate_hz:g} Hz; more than 0 is needed")
+        self._rate_hz, self._segment = rate_hz, segment
+        self._unit, self._scale = FINER_UNITS.get(unit, (unit, 1.0))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all that was averaged."""
+        self._even = Even(LONGEST_HOLE)
+        self._stages: list[_Stage] = []
+
+    @property
+    def bridged(self) -> int:
+        """Samples that were missing, since the last reset, and had a straight line put in their place."""
+        return self._even.bridged
+
+    def feed(self, values: Real, periods: Real) -> None:
+        """Average samples (n,); `periods` (n,) says which period each belongs to, as `Stretch.periods` does.
+
+        Periods without a finite sample are a hole: up to LONGEST_HOLE are bridged, and behind more of them segments and
+        filters begin anew.
+        """
+        for start in range(0, len(values), WORKED_ON):
+            part = slice(start, start + WORKED_ON)
+            for goes_on, samples in self._even.take(values[part], periods[part]):
+                if not goes_on:
+                    for stage in self._stages:
+                        stage.begin()
+                self._pass_down(samples)
+
+    def density(self, least: int = 1) -> Density:
+        """As it is now, of stages with at least so many averages; empty before there are any."""
+        stages = [stage for stage in self._stages if stage.averages >= max(least, 1)]
+        hz, edges, amplitude, averages, powers = [], [np.array([self._rate_hz / 2])], [], [], []
+        for number, stage in enumerate(stages):
+            rate_hz, deepest = self._rate_hz / DECIMATION**number, number == len(stages) - 1
+            width_hz, bins = rate_hz / self._segment, np.arange(self._segment // 2 + 1)
+            density = stage.density / rate_hz * self._scale**2
+            lowest = LOWEST_BIN if deepest else int(PASS * self._segment / DECIMATION)
+            taken = (bins >= lowest) & ((bins - 0.5) * width_hz < edges[-1][0])
+            hz.append(bins[taken] * width_hz)
+            edges.append((bins[taken] - 0.5) * width_hz)
+            amplitude.append(np.sqrt(density[taken]))
+            averages.append(np.full(np.count_nonzero(taken), stage.averages))
+            share = np.where(bins >= LOWEST_BIN, 1.0, 0.0) if deepest else _share(bins / self._segment * DECIMATION)
+            if number:
+                share -= _share(bins / self._segment)
+            ends = np.minimum(np.append(bins - 0.5, bins[-1]), bins[-1]) * width_hz
+            powers.append(Power(ends, np.concatenate([[0.0], np.cumsum(share * density * np.diff(ends))])))
+        if not stages:
+            return Density(np.zeros(0), edges[0], np.zeros(0), np.zeros(0, np.intp), self._unit, ())
+        joined = (np.concatenate(parts[::-1]) for parts in (hz, edges, amplitude, averages))
+        return Density(*joined, unit=self._unit, powers=tuple(powers))
+
+    def _pass_down(self, samples: Real) -> None:
+        number = 0
+        while samples.size:
+            if number == len(self._stages):
+                self._stages.append(_Stage(self._segment))
+            samples = self._stages[number].feed(samples)
+            number += 1
+
+
+class _Stage:
+    """Averages periodograms of what it is fed, and returns that decimated."""
+
+    def __init__(self, segment: int) -> None:
+        self._segment = segment
+        self._window = np.sin(np.pi / segment * np.arange(segment)) ** 2
+        self._power = np.zeros(segment // 2 + 1)
+        self.averages = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """What comes does not go on from what came; what was averaged stays."""
+        self._waiting = self._unfiltered = np.zeros(0)
+
+    @property
+    def density(self) -> Real:
+        """One-sided (segment/2 + 1,), for a rate of 1; at half the rate, where a bin is half as wide, as beside it."""
+        return 2 * self._power / (self.averages * np.sum(self._window**2))
+
+    def feed(self, samples: Real) -> Real:
+        """The decimated samples (m,), the first of them at the first sample.
+
+        The filter begins with that one held: the window hardly weighs what comes of it, and the segments of all stages
+        begin together.
+        """
+        self._average(samples)
+        if self._unfiltered.size == 0:
+            self._unfiltered = np.full(TAPS.size // 2, samples[0])
+        self._unfiltered = np.concatenate([self._unfiltered, samples])
+        count = 1 + (self._unfiltered.size - TAPS.size) // DECIMATION
+        if count < 1:
+            return np.zeros(0)
+        decimated = np.convolve(self._unfiltered, TAPS, "valid")[::DECIMATION]
+        self._unfiltered = self._unfiltered[count * DECIMATION :].copy()
+        return decimated
+
+    def _average(self, samples: Real) -> None:
+        step, segment = self._segment // 2, self._segment
+        waiting = np.concatenate([self._waiting, samples])
+        count = 1 + (waiting.size - segment) // step
+        if count >= 1:
+            segments = np.lib.stride_tricks.sliding_window_view(waiting, segment)[::step]
+            self._power += np.sum(np.abs(np.fft.rfft(segments * self._window)) ** 2, axis=0)
+            self.averages += count
+            waiting = waiting[count * step :].copy()
+        self._waiting = waiting
+
+
+def _share(part: Real) -> Real:
+    """Of a stage in what the next one tells as well, at frequencies in parts of the rate of that one."""
+    return np.clip(2 * part / PASS - 1, 0.0, 1.0)
+
+
+def _low_pass() -> Real:
+    """Taps of a low-pass at half the decimated rate, from PASS to 1 − PASS of it, by Kaiser's window (Kaiser 1974)."""
+    transition = 2 * np.pi * (1 - 2 * PASS) / DECIMATION
+    half = int(np.ceil((ATTENUATION_DB - 7.95) / (2.285 * transition) / 2))
+    beta = 0.1102 * (ATTENUATION_DB - 8.7)
+    taps = np.sinc(np.arange(-half, half + 1) / DECIMATION) * np.kaiser(2 * half + 1, beta)
+    return taps / taps.sum()
+
+
+TAPS = _low_pass()

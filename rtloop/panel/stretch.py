@@ -1,0 +1,50 @@
+"""Consecutive ticks of one run of a loop, as they were read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.signals import COMMON, DEADLINE
+
+DEADLINE_NS = COMMON[DEADLINE].name
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Whole records, `rows` (n, columns), of the ticks from `first` on; `stretch["x_position_um"]` is (n,)."""
+
+    columns: Sequence[str]
+    first: int
+    rows: Real
+    lost: int = 0
+    """Ticks before `first` that were overwritten before they could be read."""
+    run: int = 0
+    """Goes up by one where the loop was started anew and counts its ticks from 0 again."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, name: str) -> Real:
+        """A signal (n,), a view. Raises ValueError for one that the loop does not have."""
+        return self.rows[:, index_of(name, self.columns)]
+
+    @property
+    def end(self) -> int:
+        """The tick behind the last one."""
+        return self.first + len(self.rows)
+
+    def periods(self, rate_hz: float) -> Real:
+        """Which period of the grid of deadlines each tick ran in (n,): one after the other but for holes."""
+        return np.rint(self[DEADLINE_NS] * (rate_hz / 1e9))
+
+
+def index_of(name: str, columns: Sequence[str]) -> int:
+    """Column of a signal. Raises ValueError for one that is not among `columns`."""
+    try:
+        return columns.index(name)
+    except ValueError:
+        raise ValueError(f"signal {name!r}: not in the record; {', '.join(columns)} are") from None
