@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rtloop.recording.load import load as load
+    from rtloop.service.client.connection import connect as connect
 
 __version__ = "0.2.0"
-__all__ = ["__version__", "load"]
+__all__ = ["__version__", "connect", "load"]
 
 
 def __getattr__(name: str) -> Any:
@@ -17,4 +18,8 @@ def __getattr__(name: str) -> Any:
         from rtloop.recording.load import load
 
         return load
+    if name == "connect":
+        from rtloop.service.client.connection import connect
+
+        return connect
     raise AttributeError(f"module 'rtloop' has no attribute {name!r}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import glob
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -58,32 +58,23 @@ def hil_serve(config: Path, on_can: bool) -> int:
 @click.group()
 @click.option("--name", help="Name of the service: that of its configuration file [the only one running].")
 @click.option("--socket", "socket_path", type=OUTPUT, help="Path of its control socket.")
+@click.option("--as", "as_name", metavar="NAME", help="Who drives, and is recorded [operator].")
 @click.pass_context
-def ctl(context: click.Context, name: str | None, socket_path: Path | None) -> None:
-    """Talk to a running service. Answers are JSON."""
-    context.obj = (name, socket_path)
+def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
+    """Talk to a running service. Answers are JSON.
+
+    One drives: while somebody else does, all that moves or changes something is refused but stop.
+    """
+    context.obj = (name, socket_path, as_name)
 
 
 def client_of(context: click.Context) -> Any:
     """Of the service that `ctl` was asked to talk to. Raises UnavailableError."""
-    from rtloop.errors import UnavailableError
     from rtloop.service.client import Client
-    from rtloop.supervision.paths import client_folders
+    from rtloop.service.client.finding import socket_of
 
-    name, path = context.obj
-    if path is None:
-        folders = client_folders()
-        pattern = "*" if name is None else glob.escape(name)
-        found = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
-        where = " or ".join(str(folder) for folder in folders)
-        if not found:
-            meant = "no service" if name is None else f"no service {name!r}"
-            raise UnavailableError(f"{meant} has a control socket in {where}; `rtloop serve CONFIG` starts one")
-        if len(found) > 1:
-            there = ", ".join(item.stem for item in found)
-            raise UnavailableError(f"several services have a control socket in {where}: {there}; --name says which")
-        path = found[0]
-    return Client(path)
+    name, path, as_name = context.obj
+    return Client(path or socket_of(name), as_name)
 
 
 def _post(name: str, help_text: str) -> None:
@@ -106,10 +97,35 @@ for _name, _help in (
 
 
 @ctl.command()
+@click.option(
+    "--break", "breaks", is_flag=True, help="From whoever holds it, by the emergency key, which is asked for."
+)
+@click.pass_context
+@fails_clearly
+def lock(context: click.Context, breaks: bool) -> int:
+    """Take the lock before the first command does."""
+    key = None
+    if breaks:
+        at_terminal = sys.stdin.isatty()
+        key = click.prompt("emergency key", hide_input=True, err=True) if at_terminal else sys.stdin.readline().strip()
+    click.echo(json.dumps(client_of(context).lock(key)))
+    return 0
+
+
+@ctl.command()
+@click.pass_context
+@fails_clearly
+def release(context: click.Context) -> int:
+    """Release the lock: somebody else may drive."""
+    click.echo(json.dumps(client_of(context).delete("/lock")))
+    return 0
+
+
+@ctl.command()
 @click.pass_context
 @fails_clearly
 def status(context: click.Context) -> int:
-    """State, rate, lateness, faults and the newest signals."""
+    """State, who drives, rate, lateness, faults and the newest signals."""
     click.echo(json.dumps(client_of(context).get("/status"), indent=2))
     return 0
 

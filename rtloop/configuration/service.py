@@ -24,6 +24,8 @@ class ServiceOptions(Options):
     socket: str | None = None
     """Path of the control socket; RUNTIME_DIRECTORY/NAME.sock, or /run/user or /tmp, by default."""
     socket_mode: Annotated[str, Field(pattern=r"^0[0-7]{3}$")] = "0660"
+    emergency_key_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """Of the key that takes the lock from whoever holds it, as sha256sum says it: recordings hold this text."""
     stall_ms: float = Field(default=50.0, ge=10.0)
     """Ticks that stand still for so long, while the supervisor was awake, get the loop killed and parked."""
     arm: bool = False

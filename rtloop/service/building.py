@@ -59,7 +59,6 @@ class Builder:
             stdout=subprocess.PIPE,
             process_group=0,
             bufsize=0,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
         )
 
     def prepare(self, configuration: Configuration) -> Prepared:

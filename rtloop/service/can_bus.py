@@ -1,8 +1,9 @@
 """Supervision over a CAN bus: status, heartbeat and trips out; setpoints, modes and trip resets in; frames of the DBC.
 
 Two threads of the service's process; nothing here is in the path of a tick. What the loop is asked for here is
-recorded as asked for by "can". A frame that is malformed, outside the envelope or does not suit the state is counted
-in the status frame, said in the log (at most once a second), and changes nothing.
+recorded as asked for by "can"; for the lock, the bus is one of those who give no name. A frame that is malformed,
+outside the envelope or does not suit the state is counted in the status frame, said in the log (at most once a
+second), and changes nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from rtloop import errors, signals
 from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
-from rtloop.service.desk import Refused, asked_by
+from rtloop.recording.file.events import OPERATOR
+from rtloop.service.desk import Asker, Refused, asked_by
 from rtloop.service.service import Service, State
 from rtloop.signals import Mode
 
@@ -100,7 +102,6 @@ class CanSupervision:
 
     def listen(self) -> None:
         """Follow the frames that come, one after the other."""
-        asked_by.set(Origin.CAN)
         while not self.ending.is_set():
             try:
                 message = self._bus.recv(POLL_S)
@@ -128,17 +129,21 @@ class CanSupervision:
         axes = live.prepared.plan.axes
         if axis >= len(axes):
             raise Refused(f"axis {axis:g}: 0 to {len(axes) - 1} are allowed")
-        live.set_reference(axes[int(axis)], {"kind": "hold", "value": value})
+        with self._service.lock.driving(OPERATOR, Origin.CAN):
+            live.set_reference(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _mode(self, number: float) -> None:
         if number not in list(Mode):
             raise Refused(f"mode {number:g}: 0 to {max(Mode)} are allowed")
-        self._service.set_mode(Mode(int(number)).name.lower())
+        asking = asked_by(Asker(origin=Origin.CAN))
+        with asking if number == Mode.OFF else self._service.lock.driving(OPERATOR, Origin.CAN):
+            self._service.set_mode(Mode(int(number)).name.lower())
 
     def _reset(self, confirm: float) -> None:
         if confirm != 1:
             raise Refused(f"confirm {confirm:g}: 1 is needed")
-        self._service.reset()
+        with self._service.lock.driving(OPERATOR, Origin.CAN):
+            self._service.reset()
 
     def _newest(self) -> Any:
         supervisor = self._service.supervisor

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,14 +21,38 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
+from rtloop.recording.capture.names import Names
+from rtloop.recording.file.events import OPERATOR
 from rtloop.signals import Mode
 
 ANSWER_TIMEOUT_S = 2.0
 ANSWER_PERIODS = 3.0
 """A loop that is slower than ANSWER_TIMEOUT_S has so many periods to answer."""
 POLL_S = 0.001
-asked_by = ContextVar("asked_by", default=Origin.OPERATOR)
-"""Who asks, in this thread: the origin that the recording shows."""
+
+
+@dataclass(frozen=True)
+class Asker:
+    """Who asks: the name and the origin that the recording shows; `require` raises Refused for who may no longer."""
+
+    name: str = OPERATOR
+    origin: Origin = Origin.OPERATOR
+    require: Callable[[], None] = lambda: None
+
+
+NOBODY = Asker()
+"""Who gives no name."""
+_asker = ContextVar("asker", default=NOBODY)
+
+
+@contextmanager
+def asked_by(asker: Asker) -> Iterator[None]:
+    """What this thread asks for in between, and those that it hands its context to, is asked for by `asker`."""
+    token = _asker.set(asker)
+    try:
+        yield
+    finally:
+        _asker.reset(token)
 
 
 class Refused(RtloopError):
@@ -38,21 +64,26 @@ class Taken(RtloopError):
 
 
 class Desk:
-    """Commands to the loop of `block`, from any thread."""
+    """Commands to the loop of `block`, from any thread; the recorder finds who asked in `names`."""
 
-    def __init__(self, block: SharedBlock, rate_hz: float = 1e6) -> None:
-        self._block, self._period_s = block, 1.0 / rate_hz
+    def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: Names | None = None) -> None:
+        self._block, self._period_s, self._names = block, 1.0 / rate_hz, names
         self._lock = threading.Lock()
         self._identity = 0
 
     def submit(self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = ()) -> int:
         """Send a command and wait until its tick was executed, which it returns. Raises Refused, Taken, QueueFull."""
-        command = message(kind, axis=axis, origin=asked_by.get(), values=values)
+        asker = _asker.get()
+        command = message(kind, axis=axis, origin=asker.origin, values=values)
         safe = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
+        if not safe:
+            asker.require()
         with self._lock:  # the queue has one producer
             self._identity += 1
             command["identity"] = identity = self._identity
             cursor = int(self._block["events_head"][0])
+            if self._names is not None and asker.name != OPERATOR:
+                self._names.note(identity, asker.name)
             position = send(self._block, command, urgent=safe)
         return self._answer(kind, identity, cursor, position)
 

@@ -32,6 +32,7 @@ from rtloop.recording.file.recover import leftovers, recover
 from rtloop.service.building import expect_changes, prepare_limited
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.live import LiveLaw
+from rtloop.service.lock import Lock
 from rtloop.service.measurement import Results
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
@@ -71,6 +72,7 @@ class Service:
             fault = "schedule: not allowed with service.tare_s or service.depolarise, which take the first ticks"
             raise ConfigError(str(config), [fault])
         self.notifier = Notifier()
+        self.lock = Lock()
         self.faults: list[str] = []
         self.armed = not self.configuration.service.arm
         self.results: list[RunResult] = []
@@ -202,7 +204,7 @@ class Service:
             supervisor = Supervisor(processes, prepared, recording_path(prepared, None), options.stall_ms / 1000)
             try:
                 supervisor.start()
-                self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz)
+                self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz, supervisor.names)
                 self.live = LiveLaw(prepared, supervisor.block, self._desk, self._offsets_v)
                 self.supervisor = supervisor
                 if preparing:

@@ -16,13 +16,14 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """State, timing over the last ticks, faults, whether ticks are recorded, and the newest signals."""
+    """State, who drives, timing over the last ticks, faults, whether ticks are recorded, and the newest signals."""
     supervisor = service.supervisor
     report: dict[str, Any] = {
         "name": service.configuration.name,
         "state": service.state.value,
         "armed": service.armed,
         "faults": list(service.faults),
+        "lock": service.lock.held,
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
         "recording": {} if supervisor is None else recording_state(supervisor.block),

@@ -14,14 +14,19 @@ END_TIMEOUT_S = 5.0
 
 
 class Child:
-    """`python -m MODULE --fd N`, in a process group of its own so that a terminal's Ctrl-C reaches the parent alone."""
+    """`python -m MODULE --fd N`, and `--NAME M` of further files.
 
-    def __init__(self, module: str, fd: int) -> None:
+    In a process group of its own, so that a terminal's Ctrl-C reaches the parent alone.
+    """
+
+    def __init__(self, module: str, fd: int, **more: int) -> None:
+        files = {"fd": fd, **more}
+        options = [word for name, file in files.items() for word in (f"--{name}", str(file))]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", module, "--fd", str(fd)],
+            [sys.executable, "-m", module, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            pass_fds=[fd],
+            pass_fds=[*files.values()],
             process_group=0,
         )
         self._reports: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()

@@ -96,9 +96,9 @@ def _name(configuration: Configuration) -> str:
 
 def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
     """What a host takes of an axis's margin; None of an axis whose loop is not known, or not stable."""
-    if check.plant is None or check.running is None or not check.running.stable:
+    if check.on_model is None or not check.on_model.is_stable:
         return None
-    margin_s, _ = delay_tolerated(check.loop(check.plant, check.delay_ticks))
+    margin_s, _ = delay_tolerated(check.on_model)
     wire = max(host.wire_ticks.get(check.name, 1) - 1 - check.delay_ticks, 0)
     period_us = US_PER_S / host.rate_hz
     more_us = host.lateness_us + wire * period_us

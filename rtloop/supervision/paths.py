@@ -8,10 +8,13 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rtloop.configuration.file import Configuration
 from rtloop.errors import HostRefused, OutputError, UnavailableError
 from rtloop.hil.trusted import Untrusted, open_file, open_folder
+
+if TYPE_CHECKING:  # clients of the control API need none of it: half a second of import
+    from rtloop.configuration.file import Configuration
 
 FOLDER_MODE = 0o750
 """Members of the group get to the socket."""
@@ -64,10 +67,10 @@ def new_block(path: Path) -> int:
         raise OutputError(f"{path}: cannot make the shared block: {error.strerror}") from None
 
 
-def open_block(path: Path) -> int | None:
+def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
     """A service's shared block; None where there is none. Raises HostRefused, UnavailableError."""
     try:
-        return open_file(path, os.O_RDWR)
+        return open_file(path, flags)
     except FileNotFoundError:
         return None
     except Untrusted as error:

@@ -16,6 +16,7 @@ from typing import Any
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
+from rtloop.recording.capture.names import Names
 from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
 from rtloop.supervision.stall import StallWatch
@@ -36,8 +37,8 @@ class RecorderKeeper:
     is lost while the ring still holds it. `start`, then `finish`, and `totals` once that has come to its end.
     """
 
-    def __init__(self, child: Child, block: SharedBlock, path: Path, options: RecordingOptions) -> None:
-        self._child, self._block, self._path, self._options = child, block, path, options
+    def __init__(self, child: Child, block: SharedBlock, names: Names, path: Path, options: RecordingOptions) -> None:
+        self._child, self._block, self._names, self._path, self._options = child, block, names, path, options
         self._header: dict[str, Any] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
         self._ordered = False
@@ -115,7 +116,7 @@ class RecorderKeeper:
             self.notes.append(f"the recorder {reason} and was replaced")
             self.replacements += 1
             self._block.store(Word.RECORDER_STATE, ProcessState.STARTING)
-            self._child, self._ordered = Child(MODULE, self._block.fd), False
+            self._child, self._ordered = Child(MODULE, self._block.fd, names=self._names.fd), False
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 
     def _finish(self) -> dict[str, Any]:

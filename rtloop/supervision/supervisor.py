@@ -23,12 +23,14 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
+from rtloop.recording.capture.names import Names
 from rtloop.recording.file.events import trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
 from rtloop.supervision.host_delay import require_margins
 from rtloop.supervision.parking import park
 from rtloop.supervision.paths import new_block
+from rtloop.supervision.recorder_keeper import MODULE as RECORDER
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from rtloop.supervision.stall import StallWatch, stall_limit_s
 
@@ -69,8 +71,9 @@ class Processes:
     def __init__(self, block: Path | None = None) -> None:
         """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
         self.fd = SharedBlock.reserve() if block is None else new_block(block)
+        self.names = Names.create()
         self.loop = Child("rtloop.engine.process", self.fd)
-        self.recorder = Child("rtloop.recording.capture.recorder", self.fd)
+        self.recorder = Child(RECORDER, self.fd, names=self.names.fd)
 
     def __enter__(self) -> Processes:
         return self
@@ -81,6 +84,7 @@ class Processes:
         for child in (self.loop, self.recorder):
             child.wait(END_TIMEOUT_S)
             child.end()
+        self.names.close()
 
 
 class Supervisor:
@@ -103,7 +107,9 @@ class Supervisor:
         self.error: str | None = None
         """Why the loop died, and what became of its outputs."""
         self._loop = processes.loop
-        self.recorder = RecorderKeeper(processes.recorder, self.block, recording, prepared.configuration.recording)
+        self.names = processes.names
+        options = prepared.configuration.recording
+        self.recorder = RecorderKeeper(processes.recorder, self.block, self.names, recording, options)
         self._stall = StallWatch(stall_limit_s(stall_s, prepared.plan.pacing.rate_hz), LONGEST_STEP_S)
         self._stalled = False
         self._reports: dict[str, dict[str, Any]] = {}

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from rtloop.service.api.application import application
+from rtloop.service.lock import Lock
 
 PATIENCE_S = 20.0
 MANY = 60
@@ -18,7 +19,7 @@ class Stuck:
     """A service whose ordinary work does not come back until it is let go."""
 
     def __init__(self) -> None:
-        self.let_go = threading.Event()
+        self.let_go, self.lock = threading.Event(), Lock()
         self.stopped = 0
 
     def reload_now(self) -> dict[str, Any]:

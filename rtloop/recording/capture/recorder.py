@@ -1,11 +1,11 @@
 """The recorder: a process beside the loop that copies the rings into a file and computes nothing.
 
-    python -m rtloop.recording.capture.recorder --fd N
+    python -m rtloop.recording.capture.recorder --fd N [--names M]
 
-N is the shared block. One JSON line on stdin starts it: {"path": ".../NAME.mcap", "header": {...}} and optionally
-"options": the fields of `session.Options`. It ends when the loop has and the rings are empty, and prints one JSON
-line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. SIGINT and SIGTERM are
-ignored, for the loop's last ticks are to be recorded too.
+N is the shared block, M the names of those who give commands. One JSON line on stdin starts it: {"path":
+".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. It ends when the loop has
+and the rings are empty, and prints one JSON line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes,
+complete, error, cpu_s}. SIGINT and SIGTERM are ignored, for the loop's last ticks are to be recorded too.
 
 RECORDER_STATE is FAILED while nothing can be written, and RUNNING again once that is over.
 """
@@ -25,6 +25,7 @@ from typing import Any
 
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import RtloopError
+from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError
@@ -86,7 +87,7 @@ def _read_command() -> dict[str, Any]:
     return json.loads(line)
 
 
-def run(fd: int) -> int:
+def run(fd: int, names: Names | None = None) -> int:
     """Record one run from the shared block at `fd`; returns the exit code."""
     try:
         block = SharedBlock.attach(fd, _supervisor_gone)
@@ -98,7 +99,7 @@ def run(fd: int) -> int:
     try:
         command = _read_command()
         header = command["header"]
-        session = Session(block, Path(command["path"]), header, Options(**command.get("options", {})))
+        session = Session(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
         block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
         result = recorder.record(session, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)
@@ -116,10 +117,11 @@ def main() -> int:
     """Command line entry."""
     parser = argparse.ArgumentParser(prog="rtloop.recording.capture.recorder", description="record the loop's rings")
     parser.add_argument("--fd", type=int, required=True, help="file descriptor of the shared block")
+    parser.add_argument("--names", type=int, help="file descriptor of the names")
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    return run(arguments.fd)
+    return run(arguments.fd, None if arguments.names is None else Names(arguments.names))
 
 
 if __name__ == "__main__":

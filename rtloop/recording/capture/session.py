@@ -17,6 +17,7 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import TickBuffer
 from rtloop.recording.capture.files import Files, Options, left_by_another
+from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.pending import Entry, Pending, tick_of
 from rtloop.recording.capture.progress import Position, Progress
 from rtloop.recording.capture.rings import RingReader
@@ -44,7 +45,10 @@ class Session:
     nothing is recorded now, `error` what came first. An unpaced run waits for its recorder: it is not tried again.
     """
 
-    def __init__(self, block: SharedBlock, path: Path, header: dict[str, Any], options: Options) -> None:
+    def __init__(
+        self, block: SharedBlock, path: Path, header: dict[str, Any], options: Options, names: Names | None = None
+    ) -> None:
+        self._names = names
         self._block, self._path, self._header, self._options = block, path, header, options
         self._laws = [law["name"] for law in header.get("law", {}).get("laws", ())]
         self._buffer = TickBuffer(header["columns"], header["rate_hz"])
@@ -84,7 +88,8 @@ class Session:
         snapshots, events = self._snapshots.take(), self._events.take()
         for message in events:
             time_ns = self._buffer.time_ns(int(message["tick"]))
-            self._pending.add_event(event_of(message, self._header["axes"], time_ns, self._laws))
+            name = self._names and self._names.of(int(message["identity"]))
+            self._pending.add_event(event_of(message, self._header["axes"], time_ns, self._laws, name))
         self._ahead.extend(map(bytes, snapshots))
         while self._ahead and (tick := tick_of(self._ahead[0])) <= self.cursor:
             self._cut_if_due(tick)

@@ -18,7 +18,16 @@ from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
 from rtloop.law.extras import ExtraOutput, Extras
 from rtloop.law.layout import MAX_EXTRAS
 from rtloop.law.reference import Generator
-from rtloop.recording.file.events import FINAL, GAP, RECORDER, RECORDING_FAILED, RECORDING_RESUMED, Event, known
+from rtloop.recording.file.events import (
+    FINAL,
+    GAP,
+    RECORDER,
+    RECORDING_FAILED,
+    RECORDING_RESUMED,
+    Event,
+    known,
+    name_fault,
+)
 from rtloop.recording.file.format import FORMAT
 from rtloop.signals import Mode
 
@@ -199,9 +208,10 @@ def event_from(payload: bytes, axes: Sequence[str]) -> Event:
             raise Malformed(f"who: {_shown(event['who'])}; only the {RECORDER} says {kind}")
         _require(model, what, "what.")
         return event
-    for key, names in (("kind", Kind), ("who", Origin)):
-        if not known(names, event[key]):
-            raise Malformed(f"{key}: {_shown(event[key])}; {', '.join(names.__members__).lower()} or a number")
+    if not known(Kind, kind):
+        raise Malformed(f"kind: {_shown(kind)}; {', '.join(Kind.__members__).lower()} or a number")
+    if not known(Origin, event["who"]) and (fault := name_fault(event["who"])):
+        raise Malformed(f"who: {fault}")
     _require(_Message, what, "what.")
     _require_command(kind, event["axis"], [_number(value) for value in what["values"]])
     return event

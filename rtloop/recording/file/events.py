@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Any
+from unicodedata import category
 
 import numpy as np
 
@@ -20,6 +21,15 @@ GAP, FINISHED, ROTATED, RECOVERED = "gap", "finished", "rotated", "recovered"
 RECORDING_FAILED, RECORDING_RESUMED = "recording_failed", "recording_resumed"
 """Kinds that the recorder itself writes; `who` is RECORDER."""
 RECORDER = "recorder"
+COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
+"""Kinds that somebody asked for."""
+OPERATOR = Origin.OPERATOR.name.lower()
+"""Who asks without a name."""
+TAKEN = (*(origin.name.lower() for origin in Origin), RECORDER)
+MAX_NAME = 40
+"""Characters of an operator's name."""
+BETWEEN = " .-_@+'"
+"""What may stand in one beside letters and digits: it goes through terminals, logs, pages and addresses."""
 UNITS = {
     **dict.fromkeys(("position", "tracking"), " µm"),
     **dict.fromkeys(("non_finite", "sensor_range", "enable"), " V"),
@@ -31,8 +41,13 @@ FINAL = (FINISHED, ROTATED, RECOVERED)
 """One of these ends a file; its `what` holds the totals."""
 
 
-def event_of(message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = ()) -> Event:
-    """The event of one record of MESSAGE; `time_ns` since the start of the run, `laws` the names of those it knows."""
+def event_of(
+    message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
+) -> Event:
+    """The event of one record of MESSAGE; `time_ns` since the start of the run, `laws` the names of those it knows.
+
+    `name` is that of the operator who asked, where one was given.
+    """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
     meaning: dict[str, Any] = {}
@@ -48,7 +63,7 @@ def event_of(message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence
         "tick": int(message["tick"]),
         "time_ns": time_ns,
         "kind": _name(Kind, kind),
-        "who": _name(Origin, int(message["origin"])),
+        "who": name or _name(Origin, int(message["origin"])),
         "axis": axes[axis] if 0 <= axis < len(axes) else None,
         "what": {**meaning, "values": [json_value(value) for value in values], "identity": int(message["identity"])},
     }
@@ -80,10 +95,22 @@ def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None
         return None
     record = np.zeros(1, MESSAGE)
     record["tick"], record["identity"] = event["tick"], event["what"]["identity"]
-    record["kind"], record["origin"] = _number(Kind, event["kind"]), _number(Origin, event["who"])
+    record["kind"], record["origin"] = _number(Kind, event["kind"]), _origin(event["who"])
     record["axis"] = ALL_AXES if event["axis"] is None else list(axes).index(event["axis"])
     record["values"][0] = [float(value) for value in event["what"]["values"]]
     return record
+
+
+def name_fault(name: str) -> str | None:
+    """What is wrong with the name of an operator, and what is allowed; None for one that may stand in a recording."""
+    spelled = all(character in BETWEEN or category(character)[0] in "LMN" for character in name)
+    if not 0 < len(name) <= MAX_NAME or not spelled or not name[0].isalnum() or name.endswith(" "):
+        shown = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
+        allowed = f"1 to {MAX_NAME} letters, digits, blanks and {BETWEEN.strip()}, a letter or digit first"
+        return f"{shown}; {allowed}, are allowed"
+    if name != OPERATOR and (known(Origin, name) or name.lower() == RECORDER):
+        return f"{name!r}; others have this name: one that is no number and none of {', '.join(TAKEN)} is allowed"
+    return None
 
 
 def known(kinds: Any, name: str) -> bool:
@@ -102,6 +129,11 @@ def _name(kinds: Any, value: float) -> str:
         return str(kinds(int(value)).name).lower()
     except (ValueError, OverflowError):
         return str(value)
+
+
+def _origin(who: str) -> int:
+    """Of who is no origin by that word or number, an operator gave a name."""
+    return _number(Origin, who) if known(Origin, who) else int(Origin.OPERATOR)
 
 
 def _number(kinds: Any, name: str) -> int:

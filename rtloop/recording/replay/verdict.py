@@ -65,8 +65,8 @@ def not_judged(header: Mapping[str, Any]) -> list[str]:
     """What no replay can judge: nothing that the law computes depends on it."""
     return [
         f"measured times: {', '.join(signals.COMMON[column].name for column in MEASURED)}, flag OVERRUN, rate_hz, host",
-        "inputs as far as no output depends on them: adc_v, reference_um, deadline_ns, periods_missed, sample_age_us, "
-        "enable_v",
+        "inputs as far as no output depends on them: adc_v, reference_um, feed_um, deadline_ns, periods_missed, "
+        "sample_age_us, enable_v",
         f"observed signals: {', '.join(header['observed']) or 'there are none'}",
         "events but for the commands that the law obeys: generators of references, texts, who, time_ns, identity",
         "the state that the first snapshot starts from; the configuration's text",

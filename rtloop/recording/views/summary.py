@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.events import RECOVERED
+from rtloop.recording.file.events import COMMANDS, RECOVERED
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.views.histogram import Histogram
@@ -141,6 +141,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
             for event in events
             if event["kind"] == "tripped"
         ],
+        "commands": dict(Counter(event["who"] for event in events if event["kind"] in COMMANDS).most_common()),
         "events": len(events),
         "size_bytes": size_bytes,
         "bytes_per_tick": size_bytes / totals.ticks if totals.ticks else None,

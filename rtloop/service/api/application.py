@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import ValidationError
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -23,14 +23,15 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from rtloop.configuration.axis import TableOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.references import read_samples
-from rtloop.drivers.errors import DriverError
-from rtloop.engine.commands import QueueFull
-from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.errors import ConfigError
+from rtloop.recording.file.events import OPERATOR
+from rtloop.service.api.asking import asking, lock
 from rtloop.service.api.bodies import (
     MAX_BODY_BYTES,
     Body,
     ControllerBody,
     LearnBody,
+    LockBody,
     ModeBody,
     ReferenceBody,
     ResponseBody,
@@ -38,9 +39,10 @@ from rtloop.service.api.bodies import (
     TuneBody,
     WaveformBody,
 )
-from rtloop.service.api.lanes import Busy, Lane, Lanes
+from rtloop.service.api.lanes import Lane, Lanes
 from rtloop.service.api.metrics import metrics_text
-from rtloop.service.desk import Refused, Taken
+from rtloop.service.api.refusals import refusal, refused
+from rtloop.service.desk import Refused
 from rtloop.service.learning import learn
 from rtloop.service.live import LiveLaw
 from rtloop.service.measurement import Asked, Results, measure
@@ -163,7 +165,7 @@ def application(service: Service) -> Starlette:
 
     async def get_configuration(_: Request) -> Response:
         if service.live is None:
-            return _error(409, f"no loop is running: the service is {service.state}")
+            return refused(409, f"no loop is running: the service is {service.state}")
         return JSONResponse(service.live.as_it_runs)
 
     async def get_metrics(_: Request) -> Response:
@@ -175,14 +177,15 @@ def application(service: Service) -> Starlette:
     async def watch(socket: WebSocket) -> None:
         async with stream(socket) as accepted:
             while accepted:
-                await socket.send_text(json.dumps({"state": service.state} | newest_signals(service)))
+                said = {"state": service.state, "lock": service.lock.held}
+                await socket.send_text(json.dumps(said | newest_signals(service)))
                 await asyncio.sleep(1 / WATCH_HZ)
 
     async def setpoints(socket: WebSocket) -> None:
         """A stream of setpoints, each answered by its tick or an error."""
         async with stream(socket) as accepted:
             while accepted:
-                answer = await _answer(service, lanes, "/setpoint", await socket.receive_text())
+                answer = await _answer(service, lanes, socket, "/setpoint", await socket.receive_text())
                 await socket.send_text(bytes(answer.body).decode())
 
     async def post(request: Request) -> Response:
@@ -191,8 +194,13 @@ def application(service: Service) -> Starlette:
         except ClientDisconnect:
             return Response()
         except ValueError as error:
-            return _error(413, str(error))
-        return await _answer(service, lanes, request.url.path, data)
+            return refused(413, str(error))
+        if request.url.path == "/lock":
+            return lock(service, request, data)
+        return await _answer(service, lanes, request, request.url.path, data)
+
+    async def delete_lock(request: Request) -> Response:
+        return lock(service, request, None)
 
     routes: list[Any] = [
         Route("/status", get_status),
@@ -202,7 +210,8 @@ def application(service: Service) -> Starlette:
         WebSocketRoute("/watch", watch),
         WebSocketRoute("/setpoints", setpoints),
     ]
-    routes += [Route(path, post, methods=["POST"]) for path in ACTIONS]
+    routes += [Route(path, post, methods=["POST"]) for path in (*ACTIONS, "/lock")]
+    routes += [Route("/lock", delete_lock, methods=["DELETE"])]
     return Starlette(routes=routes)
 
 
@@ -216,26 +225,15 @@ async def _read(request: Request) -> bytes:
     return data
 
 
-async def _answer(service: Service, lanes: Lanes, path: str, data: bytes | str) -> Response:
-    """Validate, act in a thread, and answer; errors become 4xx that say why, 503 where too many wait."""
+async def _answer(service: Service, lanes: Lanes, connection: HTTPConnection, path: str, data: bytes | str) -> Response:
+    """Validate, act in a thread, and answer."""
     body, _, action = ACTIONS[path]
     try:
         wanted = None if body is None else body.model_validate_json(data)
-        return JSONResponse(await lanes.run(LANES.get(path, Lane.ORDINARY), action, service, wanted))
-    except ValidationError as error:
-        return _error(422, "; ".join(describe(error, "", None)))
-    except ConfigError as error:
-        return _error(422, "; ".join(error.faults))
-    except (Busy, UnavailableError) as error:
-        return _error(503, str(error))
-    except Taken as error:
-        return _error(504, str(error))
-    except (QueueFull, RtloopError, DriverError) as error:
-        return _error(409, str(error))
-
-
-def _error(code: int, message: str) -> JSONResponse:
-    return JSONResponse({"error": message}, status_code=code)
+        with asking(service, connection, path, wanted):
+            return JSONResponse(await lanes.run(LANES.get(path, Lane.ORDINARY), action, service, wanted))
+    except Exception as error:
+        return refusal(error)
 
 
 def openapi() -> dict[str, Any]:
@@ -246,16 +244,26 @@ def openapi() -> dict[str, Any]:
         "/metrics": {"get": {"summary": "Prometheus text."}},
     }
     answers = {"200": {"description": "done; a command's `tick` is when it took effect"},
-               "409": {"description": "refused in this state, and withdrawn"}, "413": {"description": "too large"},
+               "409": {"description": "refused in this state, or while somebody else drives, and withdrawn"},
+               "413": {"description": "too large"},
                "422": {"description": "malformed, or outside the envelope"},
                "503": {"description": "too many wait, or it takes too long"},
                "504": {"description": "taken by a loop that stands still: takes effect if that goes on"}}  # fmt: skip
     for path, (body, summary, _) in ACTIONS.items():
-        operation: dict[str, Any] = {"summary": summary, "responses": answers}
-        if body is not None:
-            schema = body.model_json_schema()
-            operation["requestBody"] = {"required": True, "content": {"application/json": {"schema": schema}}}
-        paths[path] = {"post": operation}
+        paths[path] = {"post": _operation(summary, answers, body)}
+    paths["/lock"] = {
+        "post": _operation("Take the lock, or break it open by the emergency key.", answers, LockBody, required=False),
+        "delete": _operation("Release the lock.", answers, None),
+    }
     from rtloop import __version__
 
     return {"openapi": "3.1.0", "info": {"title": "rtloop control API", "version": __version__}, "paths": paths}
+
+
+def _operation(summary: str, answers: Any, body: type[Body] | None, required: bool = True) -> dict[str, Any]:
+    who = {"name": "as", "in": "query", "description": "who drives", "schema": {"type": "string", "default": OPERATOR}}
+    operation: dict[str, Any] = {"summary": summary, "parameters": [who], "responses": answers}
+    if body is not None:
+        content = {"application/json": {"schema": body.model_json_schema()}}
+        operation["requestBody"] = {"required": required, "content": content}
+    return operation

@@ -54,6 +54,12 @@ class Body(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
+class LockBody(Body):
+    """The emergency key, where the lock is to be taken from somebody else."""
+
+    emergency_key: Annotated[str, Field(max_length=1000)] | None = None
+
+
 class ModeBody(Body):
     """A mode for all axes."""
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from rtloop.errors import HostRefused, LoopFault, RtloopError, UnavailableError
 from rtloop.hil.trusted import Untrusted, owners
@@ -56,10 +57,10 @@ def _connected(path: Path) -> socket.socket:
 
 
 class Client:
-    """Talks to the service at `path`."""
+    """Talks to the service at `path`, under a name where one is given."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, name: str | None = None) -> None:
+        self.path, self._name = path, name
 
     def get(self, resource: str) -> Any:
         """JSON, or text where it is none. Raises UnavailableError, RtloopError."""
@@ -68,6 +69,14 @@ class Client:
     def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float = TIMEOUT_S) -> Any:
         """The answer. Raises UnavailableError, or RtloopError with what the service says against it."""
         return self._request("POST", resource, json.dumps(body or {}), timeout_s)
+
+    def delete(self, resource: str) -> Any:
+        """As `post`."""
+        return self._request("DELETE", resource, None)
+
+    def lock(self, emergency_key: str | None = None) -> Any:
+        """Take the lock, or break it open; who holds it now. Raises as `post`."""
+        return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
 
     def move(self, resource: str, body: Mapping[str, Any], timeout_s: float) -> Any:
         """As `post`, of what moves an axis from what it holds; at Ctrl-C that is held again. Raises LoopFault then."""
@@ -96,6 +105,8 @@ class Client:
 
     def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
         connection = _UnixConnection(self.path, timeout_s)
+        if self._name is not None and method != "GET":
+            resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
         try:
             connection.request(method, resource, body, {"Content-Type": "application/json"})
             response = connection.getresponse()

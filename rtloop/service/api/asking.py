@@ -1,0 +1,59 @@
+"""Who asks, `?as=NAME`, and whether they may while somebody else drives."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Any
+from urllib.parse import parse_qs
+
+from starlette.requests import HTTPConnection
+from starlette.responses import JSONResponse, Response
+
+from rtloop.errors import ConfigError
+from rtloop.recording.file.events import OPERATOR, name_fault
+from rtloop.service.api.bodies import LockBody
+from rtloop.service.api.refusals import refusal
+from rtloop.service.desk import NOBODY, Asker, asked_by
+from rtloop.service.service import Service
+
+
+def _name(connection: HTTPConnection) -> str:
+    """Who asks: `?as=NAME`. Raises ConfigError for what is no name."""
+    try:
+        text = connection.scope.get("query_string", b"").decode("ascii")
+        query = parse_qs(text, keep_blank_values=True, errors="strict")
+    except ValueError:
+        raise ConfigError("request", ["as: its bytes are no text; UTF-8 is needed"]) from None
+    names = query.get("as", [OPERATOR])
+    if len(names) > 1:
+        raise ConfigError("request", [f"as: {len(names)} names; one is allowed"])
+    if fault := name_fault(names[0]):
+        raise ConfigError("request", [f"as: {fault}"])
+    return names[0]
+
+
+def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -> AbstractContextManager[None]:
+    """By whom, and with the lock: but stop waits for nobody's, and no name holds it up. Raises ConfigError, Refused."""
+    if path != "/stop" and not (path == "/mode" and body.mode == "off"):
+        return service.lock.driving(_name(connection))
+    try:
+        return asked_by(Asker(_name(connection)))
+    except ConfigError:
+        return asked_by(NOBODY)
+
+
+def lock(service: Service, connection: HTTPConnection, data: bytes | None) -> Response:
+    """Take the lock, break it open where there is a key, or release it where there is no body."""
+    try:
+        name = _name(connection)
+        if data is None:
+            service.lock.release(name)
+            return JSONResponse({})
+        key = LockBody.model_validate_json(data or b"{}").emergency_key
+        if key is None:
+            service.lock.take(name)
+        else:
+            service.lock.break_open(name, key, service.configuration.service.emergency_key_sha256)
+        return JSONResponse(service.lock.held)
+    except Exception as error:
+        return refusal(error)

@@ -1,0 +1,24 @@
+"""Which service is meant: the control socket of a name, or the only one there."""
+
+from __future__ import annotations
+
+import glob
+from pathlib import Path
+
+from rtloop.errors import UnavailableError
+from rtloop.supervision import paths
+
+
+def socket_of(name: str | None) -> Path:
+    """The control socket of the service `name`, of the only one where that is None. Raises UnavailableError."""
+    folders = paths.client_folders()
+    pattern = "*" if name is None else glob.escape(name)
+    found = [item for folder in folders for item in sorted(folder.glob(f"{pattern}.sock"))]
+    where = " or ".join(str(folder) for folder in folders)
+    if not found:
+        meant = "no service" if name is None else f"no service {name!r}"
+        raise UnavailableError(f"{meant} has a control socket in {where}; `rtloop serve CONFIG` starts one")
+    if len(found) > 1:
+        there = ", ".join(item.stem for item in found)
+        raise UnavailableError(f"several services have a control socket in {where}: {there}; --name says which")
+    return found[0]

@@ -1,0 +1,226 @@
+"""One drives, many watch: who may command, until when, and under which name it is recorded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+from click.testing import CliRunner
+from websockets.sync.client import unix_connect
+
+import rtloop
+from rtloop.cli import main
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.service.client import Client
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.service.http import answer, exchange
+
+KEY = "brass-otter-seven"
+DIGEST = hashlib.sha256(KEY.encode()).hexdigest()
+TUNE = {"axis": "x", "section": "limits", "values": {"bump_s": 0.02}}
+DRIVES = "ada has driven since "
+ASKED: dict[str, Any] = {
+    "/arm": {}, "/start": {}, "/reset": {}, "/reload": {}, "/mode": {"mode": "raw"}, "/tune": TUNE,
+    "/setpoint": {"axis": "x", "value": 1.0}, "/reference": {"axis": "x", "reference": {"kind": "hold", "value": 1.0}},
+    "/waveform": {"axis": "x", "samples": [1.0]}, "/response": {"axis": "x"},
+    "/learn": {"axis": "x", "samples": [0.0] * 4}, "/controller": {"axis": "x", "controller": {}},
+}  # fmt: skip
+HOSTILE = ["", " ada", "ada ", "a\nb", "\x1b[2Jada", "a\0b", "\u202eada", "[red]", "<b>", "a/b", "é" * 41, "can",
+           "LOOP", "recorder", "Operator", "42", "-rf", "\ufffd"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Armed on command, with an emergency key."""
+    section = f'[service]\narm = true\nemergency_key_sha256 = "{DIGEST}"\n[recording]'
+    with Bench(tmp_path_factory.mktemp("lock"), ("[recording]", section)) as bench:
+        yield bench
+
+
+@pytest.fixture
+def ada(bench: Bench) -> Iterator[Client]:
+    """Drives, in closed loop."""
+    client = Client(bench.client.path, "ada")
+    client.post("/arm")
+    client.post("/setpoint", {"axis": "x", "value": 20.0})
+    client.post("/start")
+    bench.await_drive()
+    yield client
+    client.lock(KEY)
+    client.post("/stop")
+    client.delete("/lock")
+    bench.await_state("stopped")
+
+
+@pytest.fixture
+def bob(bench: Bench) -> Client:
+    return Client(bench.client.path, "bob")
+
+
+def who(bench: Bench, kind: str, tick: int) -> str:
+    """Who asked for what took effect at `tick`, by the recording."""
+
+    def found() -> list[Any]:
+        events = [event for part in (bench.folder / "recordings").glob("*.part") for event in rtloop.load(part).events]
+        return [event["who"] for event in events if event["kind"] == kind and event["tick"] == tick]
+
+    return wait_for(found, f"{kind} at {tick} in the file")[0]
+
+
+def test_the_second_is_refused_with_who_drives_and_both_may_stop(bench: Bench, ada: Client, bob: Client):
+    held = bench.status()["lock"]
+    assert held["name"] == "ada"
+    assert 0 < held["until_unix_s"] - held["since_unix_s"] < 120
+    ada.post("/setpoint", {"axis": "x", "value": 7.0})
+    for path, body in ASKED.items():
+        for asking in ("?as=bob", ""):
+            code, said = answer(bench, "POST", f"{path}{asking}", body)
+            assert (code, said["error"][: len(DRIVES)]) == (409, DRIVES), path
+    with unix_connect(str(bench.client.path), "ws://localhost/setpoints?as=bob") as stream:
+        stream.send(json.dumps({"axis": "x", "value": 1.0}))
+        assert json.loads(stream.recv())["error"].startswith(DRIVES)
+    assert next(iter(bob.watch()))["lock"]["name"] == "ada"
+    assert "rtloop_state" in bob.get("/metrics")
+    assert (bench.status()["axes"]["x"]["reference_um"], bench.status()["mode"]) == (7.0, "closed_loop")
+    stopped = bob.post("/stop")["tick"]
+    assert bench.status()["lock"]["name"] == "ada"
+    bench.await_state("stopped")
+    ada.post("/arm")
+    started, again = ada.post("/start")["tick"], bob.post("/mode", {"mode": "off"})["tick"]
+    last = ada.post("/stop")["tick"]
+    assert [who(bench, "set_mode", tick) for tick in (stopped, started, again, last)] == ["bob", "ada", "bob", "ada"]
+
+
+def test_what_was_changed_is_recorded_under_the_name(bench: Bench, ada: Client):
+    changed, loaded = ada.post("/setpoint", ASKED["/setpoint"])["tick"], ada.post("/tune", TUNE)["tick"]
+    assert (who(bench, "set_reference", changed), who(bench, "load_law", loaded)) == ("ada", "ada")
+    ada.delete("/lock")
+    nobody = bench.client.post("/setpoint", ASKED["/setpoint"])["tick"]
+    assert who(bench, "set_reference", nobody) == "operator"
+    assert bench.status()["lock"]["name"] == "operator"
+    bench.client.post("/setpoint", ASKED["/setpoint"])  # all who give no name are one
+
+
+def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client):
+    for key in ("", "brass-otter-six", DIGEST, "ä\0"):
+        with pytest.raises(RtloopError, match=r"^emergency key: this is not the one"):
+            bob.lock(key)
+    for refused in (bob.lock, lambda: bob.delete("/lock")):
+        with pytest.raises(RtloopError, match=f"^{DRIVES}.*; stop works for everybody$"):
+            refused()
+    assert bench.status()["lock"]["name"] == "ada"
+    assert bob.lock(KEY)["name"] == "bob"
+    with pytest.raises(RtloopError, match=r"^bob has driven since "):
+        ada.post("/setpoint", ASKED["/setpoint"])
+    assert bob.delete("/lock") == {}
+    assert bench.status()["lock"] is None
+    assert (KEY in bench.log(), "bob takes the lock from ada" in bench.log()) == (False, True)
+    assert KEY not in json.dumps(bench.client.get("/configuration"))
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_is_no_name_is_refused_but_stops(bench: Bench, name: str):
+    before = bench.status()["lock"]
+    query = f"?as={quote(name, safe='')}"
+    for path in ("/arm", "/lock"):
+        code, said = answer(bench, "POST", f"{path}{query}")
+        assert (code, said["error"][:4], said["error"].replace("…", "").isascii()) == (422, "as: ", True)
+    assert bench.status()["lock"] == before
+    stopped = answer(bench, "POST", f"/stop{query}")[1]["tick"]
+    assert who(bench, "set_mode", stopped) == "operator"
+
+
+@pytest.mark.parametrize("query", ["as=%ff", "as=a&as=b", "as=%", "as=" + 60_000 * "a"])
+def test_a_query_that_is_none(bench: Bench, query: str):
+    code, said = exchange(bench.client.path, "POST", f"/arm?{query}")
+    assert code == 422
+    assert len(said) < 300
+    assert bench.status()["state"] == "stopped"
+
+
+@pytest.mark.parametrize("name", ["ada", "Ada Lovelace", "李小龍", "Zoë Ångström", "x.y-z_1", "a@b+c", "O'Neill"])
+def test_names_of_people(bench: Bench, name: str):
+    with rtloop.connect(bench.client.path, as_=name) as loop:
+        assert who(bench, "set_mode", loop.stop()) == name
+        loop.arm()
+        assert loop.status["lock"]["name"] == name
+        loop.stop()
+    assert bench.status()["lock"] is None
+
+
+def test_ctl_drives_under_a_name(bench: Bench, ada: Client):
+    def ctl(*arguments: str, typed: str | None = None) -> Any:
+        done = CliRunner().invoke(main, ["ctl", "--socket", str(bench.client.path), "--as", *arguments], input=typed)
+        return done.exit_code, done.output
+
+    code, said = ctl("bob", "setpoint", "x", "3")
+    assert (code, said[:28]) == (1, f"rtloop: {DRIVES}"[:28])
+    assert ctl("bob", "lock")[0] == ctl("bob", "release")[0] == ctl("bob", "lock", "--break", typed="no\n")[0] == 1
+    assert ctl("bob", "lock", "--break", typed=f"{KEY}\n")[0] == 0
+    code, said = ctl("bob", "setpoint", "x", "3")
+    assert who(bench, "set_reference", json.loads(said)["tick"]) == "bob"
+    assert json.loads(ctl("eve", "status")[1])["lock"]["name"] == "bob"
+    assert ctl("bob", "release") == (0, "{}\n")
+    assert ctl("a\x1bb", "arm") == (1, "rtloop: as: 'a\\x1bb'; 1 to 40 letters, digits, blanks and .-_@+', a letter or "
+                                       "digit first, are allowed\n")  # fmt: skip
+
+
+def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [bench.client.path.parent])
+    with rtloop.connect("lab", as_="ada") as loop, rtloop.connect(str(bench.client.path), as_="bob") as other:
+        loop.arm()
+        loop.setpoint("x", 20.0)
+        started = loop.start()
+        bench.await_drive()
+        assert loop.setpoint("x", 12.5) > started
+        assert loop.status["axes"]["x"]["reference_um"] == 12.5
+        moved = loop.reference("x", kind="sine", amplitude=2.0, frequency_hz=3.0)
+        tuned = loop.tune("x", "controller", gain=0.012)
+        assert [who(bench, *one) for one in (("set_reference", moved), ("load_law", tuned))] == ["ada", "ada"]
+        for refused in (other.start, other.reset, other.take, other.release, lambda: other.setpoint("x", 1.0)):
+            with pytest.raises(RtloopError, match=f"^{DRIVES}"):
+                refused()
+        for bad, words in ((99.0, "beyond the axis's"), (float("nan"), "value: "), ("5", "value: ")):
+            with pytest.raises(RtloopError, match=words):
+                loop.setpoint("x", bad)  # type: ignore[arg-type]
+        with pytest.raises(RtloopError, match="nothing is tripped"):
+            loop.reset()
+        other.stop()
+        assert other.take(emergency_key=KEY)["name"] == "bob"
+    assert rtloop.connect().status["lock"] is None
+    bench.await_state("stopped")
+
+
+def test_nobody_answers(tmp_path: Path):
+    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers there"):
+        rtloop.connect(tmp_path / "nobody.sock", as_="ada")
+    with pytest.raises(UnavailableError, match="no service 'nowhere' has a control socket"):
+        rtloop.connect("nowhere")
+
+
+def test_a_recorder_in_the_place_of_a_dead_one_knows_the_names(bench: Bench):
+    dead = bench.pid("recorder")
+    os.kill(dead, signal.SIGKILL)
+    wait_for(lambda: bench.pid("recorder") != dead, "another recorder")
+    with rtloop.connect(bench.client.path, as_="ada") as loop:
+        assert who(bench, "set_reference", loop.setpoint("x", 2.0)) == "ada"
+
+
+def test_the_recording_shows_and_replays_it(bench: Bench):
+    """Last in this file: the service ends."""
+    bench.client.post("/stop")
+    assert bench.stop() == 0
+    pattern = str(bench.folder / "recordings" / "lab*.mcap")
+    shown = CliRunner().invoke(main, ["info", pattern, "--json"])
+    assert json.loads(shown.output)["commands"]["ada"] > 0
+    done = CliRunner().invoke(main, ["replay", pattern, "--json"])
+    assert (done.exit_code, json.loads(done.output)["identical"]) == (0, True)
+    assert "Traceback" not in bench.log()

@@ -1,0 +1,150 @@
+"""The lock against a clock that the test moves: silence, work that goes on, and a key that comes meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtloop.configuration.file import load
+from rtloop.engine.messages import Kind, Origin, message
+from rtloop.errors import ConfigError
+from rtloop.recording.capture.names import Names
+from rtloop.recording.file.events import OPERATOR, event_of, message_of, name_fault
+from rtloop.service.api.application import application
+from rtloop.service.desk import Desk, Refused
+from rtloop.service.lock import Lock
+from tests.faults.configuration import on_a_board
+
+DIGEST = hashlib.sha256(b"a key").hexdigest()
+
+
+class Clock:
+    """Seconds, moved by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class Bench:
+    """The API without a loop: `arm` works for `work_s`, and does `meanwhile`."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.lock = Lock(self.clock)
+        self.work_s, self.meanwhile = 0.0, lambda: None
+        options = SimpleNamespace(service=SimpleNamespace(emergency_key_sha256=DIGEST))
+        service: Any = SimpleNamespace(lock=self.lock, configuration=options, arm=self._arm, stop=lambda: 7)
+        self._application = application(service)
+
+    def _arm(self) -> None:
+        self.clock.now_s += self.work_s
+        self.meanwhile()
+
+    def ask(self, who: str, path: str = "/arm", method: str = "POST") -> tuple[int, str]:
+        """Status, and what is said against it."""
+        scope = {"type": "http", "method": method, "path": path, "query_string": f"as={who}".encode(), "headers": []}
+        sent: list[dict[str, Any]] = []
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": b"", "more_body": False}
+
+        async def send(message: dict[str, Any]) -> None:
+            sent.append(message)
+
+        asyncio.run(self._application(scope, receive, send))  # type: ignore[arg-type]
+        return sent[0]["status"], json.loads(sent[1]["body"]).get("error", "")
+
+
+def test_after_a_minute_of_silence_another_drives():
+    bench = Bench()
+    assert bench.ask("ada")[0] == 200
+    bench.clock.now_s += 59.0
+    code, said = bench.ask("bob")
+    assert (code, "does until 1 s have passed" in said) == (409, True)
+    assert bench.ask("ada") == (200, "")  # no silence: the minute begins anew
+    bench.clock.now_s += 59.9
+    assert [bench.ask("bob", path)[0] for path in ("/arm", "/lock", "/stop")] == [409, 409, 200]
+    bench.clock.now_s += 0.1
+    assert bench.lock.held is None
+    assert bench.ask("bob")[0] == 200
+    assert bench.ask("ada")[1].startswith("bob has driven since ")
+
+
+def test_stop_and_what_reads_takes_no_lock():
+    bench = Bench()
+    assert [bench.ask("bob", "/stop")[0], bench.ask("bob", "/openapi.json", "GET")[0]] == [200, 200]
+    assert bench.lock.held is None
+    assert bench.ask("ada", "/lock")[0] == 200
+    bench.clock.now_s += 30.0
+    bench.ask("bob", "/stop")
+    bench.clock.now_s += 30.0
+    assert bench.ask("bob")[0] == 200
+
+
+def test_work_that_goes_on_is_no_silence():
+    bench = Bench()
+    answers: list[tuple[int, str]] = []
+    bench.work_s, bench.meanwhile = 300.0, lambda: answers.append(bench.ask("bob", "/lock"))
+    assert bench.ask("ada")[0] == 200
+    assert answers[0][0] == 409
+    bench.clock.now_s += 59.0
+    assert bench.ask("bob", "/lock")[0] == 409
+    bench.clock.now_s += 1.0
+    assert bench.ask("bob", "/lock")[0] == 200
+
+
+def test_nothing_that_was_asked_for_before_the_key_came_takes_effect_after_it():
+    bench = Bench()
+    desk = Desk(None)  # type: ignore[arg-type]
+    with bench.lock.driving("ada"):
+        bench.lock.break_open("bob", "a key", DIGEST)
+        with pytest.raises(Refused, match=r"^bob has driven since "):
+            desk.submit(Kind.LOAD_LAW, axis=0, values=[1.0])
+    assert bench.lock.held is not None
+    assert bench.lock.held["name"] == "bob"
+
+
+def test_no_key_breaks_it_where_none_is_configured():
+    lock = Lock(Clock())
+    lock.take("ada")
+    for key in ("", "None"):
+        with pytest.raises(Refused, match="none is configured"):
+            lock.break_open("bob", key, None)
+
+
+@pytest.mark.parametrize("key", ["", "a key", DIGEST.upper(), DIGEST[1:]])
+def test_the_configuration_has_a_digest_and_no_key(tmp_path: Path, key: str):
+    path = tmp_path / "lab.toml"
+    path.write_text(on_a_board(tmp_path, ("[recording]", f'[service]\nemergency_key_sha256 = "{key}"\n[recording]')))
+    with pytest.raises(ConfigError, match=r"service\.emergency_key_sha256"):
+        load(path)
+
+
+def test_names_are_found_by_the_recorder_until_others_take_their_place():
+    names = Names.create()
+    recorder = Names(names.fd)
+    names.note(17, "ada")
+    names.note(18, "é李" * 20)
+    assert [recorder.of(identity) for identity in (0, 16, 17, 18)] == [None, None, "ada", "é李" * 20]
+    names.note(17 + 4096, "bob")  # as many as the ring of events holds
+    assert [recorder.of(identity) for identity in (17, 17 + 4096)] == [None, "bob"]
+    names.close()
+
+
+def test_an_event_by_a_name_is_the_command_of_an_operator():
+    command = message(Kind.SET_MODE, tick=5, values=[3.0])
+    event = event_of(command[0], ["x"], 0, name="ada")
+    assert (event["who"], event_of(command[0], ["x"], 0)["who"]) == ("ada", OPERATOR)
+    again = message_of(event, ["x"])
+    assert again is not None
+    assert again.tobytes() == command.tobytes()
+    assert [name_fault(origin.name.lower()) is None for origin in Origin] == [o is Origin.OPERATOR for o in Origin]
