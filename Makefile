@@ -1,6 +1,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# As the command line does by itself: matrices here have tens of rows, and threads wait longer for each other than they compute.
+export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
 .PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship

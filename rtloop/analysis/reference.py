@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter, sosfilt
 
 from rtloop.hil.modal import Complex, Real
 
@@ -40,14 +39,16 @@ class ReferencePath:
 
     def toward_error(self, values: npt.ArrayLike) -> Real:
         """Values (…, ticks) behind taps and sections, from rest."""
-        found = lfilter(self.taps, 1.0, values)
+        found = _convolved(self.taps, values)
         if len(self.sections):
+            from scipy.signal import sosfilt  # a second of import, for the few who have sections
+
             found = sosfilt(np.insert(self.sections, 3, 1.0, axis=1), found)
         return np.asarray(found, np.float64)
 
     def toward_command(self, values: npt.ArrayLike) -> Real:
         """Values (…, ticks) behind the command's taps, from rest."""
-        return np.asarray(lfilter(self.command_taps, 1.0, values), np.float64)
+        return _convolved(self.command_taps, values)
 
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
         """F_x and F_v at points (k,) of the z plane."""
@@ -59,3 +60,9 @@ class ReferencePath:
 
 
 AS_IT_IS = ReferencePath()
+
+
+def _convolved(taps: Real, values: npt.ArrayLike) -> Real:
+    """Values (…, ticks) behind taps, from rest."""
+    signals = np.asarray(values, np.float64)
+    return np.apply_along_axis(lambda one: np.convolve(taps, one)[: one.size], -1, signals)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import click
 
 from rtloop import __version__
 from rtloop.cli import adapt, design, doctor, experiment, identify, laws, loop, recordings, response, service
+
+# matrices here have tens of rows: a library's threads wait for each other longer than they compute, on the loop's cores
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

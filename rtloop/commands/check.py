@@ -14,7 +14,6 @@ from rich.table import Table
 
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
-from rtloop.commands.design import verified
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.checks import AxisCheck, Together
 from rtloop.configuration.file import load
@@ -85,6 +84,8 @@ def _judged(prepared: Prepared, check: AxisCheck) -> Verification | None:
     axis = prepared.configuration.axes[prepared.plan.axes.index(check.name)]
     if axis.specification is None or not check.is_known:
         return None
+    from rtloop.commands.design import verified  # half a second of import, for who has a specification
+
     return verified(prepared.configuration, check, None)[0]
 
 
@@ -134,7 +135,7 @@ def _described_together(found: Together) -> str:
 
 def _shifts(check: AxisCheck) -> dict[str, Range]:
     """Shift of the model's resonance that the loop survives."""
-    if check.plant is None or check.running is None:
+    if check.plant is None or check.on_model is None:
         return {}
     resonance = changes(check.plant).get("resonance")
     if resonance is None:

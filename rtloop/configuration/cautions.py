@@ -38,15 +38,15 @@ def cautions(prepared: Prepared) -> list[str]:
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    loop, asked = check.running, axis.margins
-    if loop is None or not loop.stable:
+    found, asked = check.margins, axis.margins
+    if found is None or check.on_model is None or not check.on_model.is_stable:
         return  # there is no margin, and preparing it has said so
-    if loop.gain_margin < asked.gain:
-        yield f"controller: gain margin {loop.gain_margin:.3g}, below margins.gain = {asked.gain:g}"
-    if loop.phase_margin_deg < asked.phase_deg:
-        yield f"controller: phase margin {loop.phase_margin_deg:.3g}°, below margins.phase_deg = {asked.phase_deg:g}"
-    if loop.max_sensitivity > asked.sensitivity:
-        yield f"controller: max |S| {loop.max_sensitivity:.3g}, above margins.sensitivity = {asked.sensitivity:g}"
+    if found.gain_margin < asked.gain:
+        yield f"controller: gain margin {found.gain_margin:.3g}, below margins.gain = {asked.gain:g}"
+    if found.phase_margin_deg < asked.phase_deg:
+        yield f"controller: phase margin {found.phase_margin_deg:.3g}°, below margins.phase_deg = {asked.phase_deg:g}"
+    if found.max_sensitivity > asked.sensitivity:
+        yield f"controller: max |S| {found.max_sensitivity:.3g}, above margins.sensitivity = {asked.sensitivity:g}"
 
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
-from rtloop.analysis.closed_loop import Loop, discrete_loop
+import numpy as np
+
+from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
 from rtloop.analysis.comparison import Comparison, compare
 from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, TogetherMargins, coupling_matrix
-from rtloop.analysis.loop_analysis import LoopAnalysis, analyse, analyse_continuous
+from rtloop.analysis.loop_analysis import LoopAnalysis, analyse
+from rtloop.analysis.margins import Margins, margins
 from rtloop.analysis.reference import AS_IT_IS, ReferencePath
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import controller_of
@@ -54,7 +58,12 @@ class Together:
     law: CoupledController
     linear: SampledTogether | None = None
     plant: CoupledPlant | None = None
-    margins: TogetherMargins | None = None
+    loop: CoupledLoop | None = None
+
+    @property
+    def margins(self) -> TogetherMargins | None:
+        """Of all its axes at once."""
+        return None if self.loop is None else self.loop.margins
 
     def alone(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
         """The loop of this axis with other dynamics, broken alone. Raises ValueError where a part is not known."""
@@ -69,7 +78,8 @@ class AxisCheck:
     """What is known of an axis before it runs; None where there is no controller or no model.
 
     `delay_ticks` are those of its loop, as its model or the simulated rig has them, and `reference` is its pre-filter.
-    Of an axis that shares its controller, `running` is its loop broken alone, and `together` knows the rest.
+    `on_paper` is its loop as C(s), `on_model` as it will run; of an axis that shares its controller broken alone, and
+    `together` knows the rest. What takes long to find out is found out when it is asked for.
     """
 
     name: str
@@ -81,9 +91,24 @@ class AxisCheck:
     plant: Transfer | None = None
     delay_ticks: int = 0
     reference: ReferencePath = AS_IT_IS
-    continuous: LoopAnalysis | None = None
-    running: LoopAnalysis | None = None
+    on_paper: Loop | None = None
+    on_model: Loop | None = None
     together: Together | None = None
+
+    @cached_property
+    def continuous(self) -> LoopAnalysis | None:
+        """All there is to know of the loop on paper."""
+        return None if self.on_paper is None else analyse(self.on_paper, 0)
+
+    @cached_property
+    def running(self) -> LoopAnalysis | None:
+        """All there is to know of the loop as it will run."""
+        return None if self.on_model is None else analyse(self.on_model, self.delay_ticks)
+
+    @cached_property
+    def margins(self) -> Margins | None:
+        """Of the loop as it will run."""
+        return None if self.on_model is None else margins(self.on_model)
 
     @property
     def is_known(self) -> bool:
@@ -165,24 +190,22 @@ def _check(configuration: Configuration, axis: AxisOptions, findings: Findings) 
     if axis.model is None or linear is None:
         findings.warnings.append(f"axis.{axis.name}.model: missing; stability and margins are not checked")
         return replace(check, linear=linear)
-    plant, continuous, running = axis.model.transfer(), None, None
+    plant, on_paper, on_model = axis.model.transfer(), None, None
     check = replace(check, linear=linear)
     with findings.at(f"axis.{axis.name}.model: "):
-        continuous = None if check.controller is None else analyse_continuous(check.controller, plant)
-        running = analyse(check.loop(plant, delay), delay)
-    if running is not None:
-        _require_stable(running, axis.controller, where, f"axis.{axis.name}.model", findings)
-    return replace(check, plant=plant, continuous=continuous, running=running)
+        on_paper = None if check.controller is None else continuous_loop(check.controller, plant)
+        on_model = check.loop(plant, delay)
+    if on_model is not None:
+        _require_stable(on_model, axis.controller, where, f"axis.{axis.name}.model", findings)
+    return replace(check, plant=plant, on_paper=on_paper, on_model=on_model)
 
 
-def _require_stable(
-    running: LoopAnalysis, options: ControllerOptions, where: str, models: str, findings: Findings
-) -> None:
-    if running.stable or running.period_s is None:
+def _require_stable(loop: Loop, options: ControllerOptions, where: str, models: str, findings: Findings) -> None:
+    if loop.is_stable or loop.period_s is None:
         return
     message_ = (
-        f"{where}: the loop is unstable on {models} at {1 / running.period_s:g} Hz "
-        f"(largest |pole| {running.max_abs_pole:.6f}, must be below 1)"
+        f"{where}: the loop is unstable on {models} at {1 / loop.period_s:g} Hz "
+        f"(largest |pole| {np.abs(loop.poles).max():.6f}, must be below 1)"
     )
     if options.allow_unstable:
         findings.warnings.append(message_)
@@ -221,12 +244,17 @@ def _check_together(configuration: Configuration, number: int, findings: Finding
             loop = CoupledLoop(linear, plant)
     if loop is None or linear is None or plant is None:
         return checks
-    margins, found = loop.margins, []
-    for place, check in enumerate(checks):
-        running = analyse(loop.alone(place, check.reference), check.delay_ticks)
-        together = Together(names, place, law, linear, plant, margins)
-        found.append(replace(check, plant=plant.dynamics[place], running=running, together=together))
-    _require_stable(found[0].running, options, where, f"the models of {', '.join(names)}", findings)
+    alone = [loop.alone(place, check.reference) for place, check in enumerate(checks)]
+    found = [
+        replace(
+            check,
+            plant=plant.dynamics[place],
+            on_model=alone[place],
+            together=Together(names, place, law, linear, plant, loop),
+        )
+        for place, check in enumerate(checks)
+    ]
+    _require_stable(alone[0], options, where, f"the models of {', '.join(names)}", findings)
     return found
 
 

@@ -29,10 +29,9 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     """For each axis that has a controller and a model: 360° · f · lateness."""
     delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
     for check in prepared.checks:
-        if check.plant is None or check.running is None or not check.running.stable:
+        if check.on_model is None or not check.on_model.is_stable:
             continue
-        loop = check.loop(check.plant, check.delay_ticks)
-        tolerated_s, hz = delay_tolerated(loop)
+        tolerated_s, hz = delay_tolerated(check.on_model)
         p50_deg, p99_deg = (360 * hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
         delays.append(AxisDelay(check.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
     return delays

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
 """Of a specification, in the order of the table."""
+MOST = 8
+"""Names in a row."""
 LONGEST_STEP_ANALYSIS_TICKS = 6_000_000
 
 
@@ -96,6 +98,8 @@ def print_summary(summary: dict[str, Any]) -> None:
         shown.add_row("limited", "", f"ticks by what: {counts}")
     if len(summary["parts"]) > 1:
         shown.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
+    if summary["commands"]:
+        shown.add_row("commands", str(sum(summary["commands"].values())), _by_whom(summary["commands"]))
     for problem in summary["problems"]:
         shown.add_row("[red]problem[/]", "", escape(problem))
     if summary["driver_error"]:
@@ -113,6 +117,12 @@ def print_summary(summary: dict[str, Any]) -> None:
         error = "–" if axis["rms_error_um"] is None else f"{axis['rms_error_um']:.4f}"
         axes.add_row(axis["name"], error, f"{axis['max_abs_drive_v']:.3f}")
     out.print(axes)
+
+
+def _by_whom(commands: dict[str, int]) -> str:
+    """Those who asked most often, in that order."""
+    most = [f"{who} {count:,}" for who, count in commands.items()]
+    return escape(f"by {', '.join(most[:MOST])}{', …' * (len(most) > MOST)}")
 
 
 def _print_timing(out: Console, summary: dict[str, Any]) -> None:

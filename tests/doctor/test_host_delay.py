@@ -75,7 +75,7 @@ def test_lateness_and_ticks_beyond_those_of_the_model_are_spent() -> None:
     assert spent.margin_us == pytest.approx(MARGIN_US - 100.0, rel=0.01)
     assert not spent.is_spent
     assert "240 µs = 2.4 ticks of delay more" in spent.words
-    assert spent_margin(replace(check, plant=None), host) is None
+    assert spent_margin(replace(check, on_model=None), host) is None
 
 
 def test_a_margin_that_is_required() -> None:
@@ -90,7 +90,7 @@ def test_a_margin_that_is_required() -> None:
     note_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
     with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* nothing is left"):
         require_margins(asking)
-    unknown = replace(asking, checks=(replace(asking.checks[0], plant=None),))
+    unknown = replace(asking, checks=(replace(asking.checks[0], on_model=None),))
     with pytest.raises(ConfigError, match="the axis's margin is not known"):
         require_margins(unknown)
 

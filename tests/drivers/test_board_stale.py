@@ -84,7 +84,9 @@ def ticks_stale(recording, event) -> int:
     assert age_us[-1] > LIMIT_US
     assert age_us[-2] <= LIMIT_US
     wake_us = recording["deadline_ns"][before] * 1e-3 + recording["lateness_us"][before]
-    return int(np.sum(wake_us > wake_us[-1] + read_us[-1] - age_us[-1]))
+    # a tick may be held up between waking and reading: then the sample seems older than it is, in that tick alone
+    taken_us = np.max((wake_us + read_us - age_us)[-LIMIT_TICKS // 2 :])
+    return int(np.sum(wake_us > taken_us))
 
 
 @pytest.mark.parametrize("key", ["dropped_share", "repeated_share"])

@@ -21,13 +21,19 @@ TIME_S = np.arange(TICKS) / RATE_HZ
 
 
 @jit
-def samples(generators, first, period_s, table, volts, out):
+def samples(generators, first, period_s, table, volts, out, added):
     for k in range(out.size):
         out[k] = reference_sample(generators[0], first + k, period_s, table, volts[k])
+        added[k] = generators[0].feed_um
 
 
 def generate(options: dict, ticks: int = TICKS, volts: np.ndarray | None = None, folder: Path = Path()) -> np.ndarray:
     """Samples of a reference that begins at tick START, as a configuration says it."""
+    return both(options, ticks, volts, folder)[0]
+
+
+def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The same, and what is added to the command."""
     checked = TypeAdapter(ReferenceOptions).validate_python(options)
     table = TableOfSamples()
     table.add(np.full(5, 1e6))  # another axis's samples
@@ -35,9 +41,10 @@ def generate(options: dict, ticks: int = TICKS, volts: np.ndarray | None = None,
     generators = np.zeros(1, GENERATOR).view(np.recarray)
     generators.kind, generators.start_tick = values[0], START
     generators.parameters[0, : len(values) - 1] = values[1:]
-    out = np.empty(ticks)
-    samples(generators, START, 1 / RATE_HZ, table.samples, np.zeros((ticks, 3)) if volts is None else volts, out)
-    return out
+    out, added = np.empty(ticks), np.empty(ticks)
+    volts = np.zeros((ticks, 3)) if volts is None else volts
+    samples(generators, START, 1 / RATE_HZ, table.samples, volts, out, added)
+    return out, added
 
 
 def test_hold():
@@ -69,6 +76,19 @@ def test_table(tmp_path, suffix, repeat):
     wanted = recorded[index % 701 if repeat else np.minimum(index, 700)]
     options = {"kind": "table", "file": path.name, "hold_ticks": 3, "repeat": repeat}
     assert np.array_equal(generate(options, folder=tmp_path), wanted)
+
+
+@pytest.mark.parametrize("repeat", [True, False])
+def test_table_of_two_columns(tmp_path, repeat):
+    """The second column is added to the command, sample by sample beside the first."""
+    table = np.random.default_rng(5).normal(0, 10, (701, 2))
+    np.save(tmp_path / "learnt.npy", table)
+    index = np.arange(TICKS) // 3
+    wanted = table[index % 701 if repeat else np.minimum(index, 700)]
+    options = {"kind": "table", "file": "learnt.npy", "hold_ticks": 3, "repeat": repeat}
+    reference, added = both(options, TICKS, None, tmp_path)
+    assert np.array_equal(reference, wanted[:, 0])
+    assert np.array_equal(added, wanted[:, 1])
 
 
 def test_sine():
@@ -111,7 +131,7 @@ def test_a_long_run_keeps_its_phase():
     generators = np.zeros(1, GENERATOR).view(np.recarray)
     generators.kind, generators.parameters[0, :2] = 2, (1.0, 0.5)
     out = np.empty(20_000)
-    samples(generators, week, 1e-4, np.zeros(1), np.zeros((20_000, 1)), out)
+    samples(generators, week, 1e-4, np.zeros(1), np.zeros((20_000, 1)), out, np.empty(20_000))
     np.testing.assert_allclose(out, np.sin(np.pi * np.arange(20_000) / 10_000), rtol=0, atol=1e-6)
 
 

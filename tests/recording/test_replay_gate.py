@@ -54,6 +54,16 @@ def test_one_bit_of_any_other_signal_is_found_at_its_tick(signal_name: str, whol
     assert difference(path)["tick"] == 20_111
 
 
+def test_what_a_table_adds_to_the_command_is_an_input_whose_effect_is_judged(whole: Path, tmp_path: Path):
+    column = load(whole).columns.index("x_feed_um")
+
+    def add(rows: Rows) -> None:
+        rows[rows[:, 0] == 20_111, column] += 0.01
+
+    found = difference(rewrite(whole, tmp_path / "run.mcap", rows=add))
+    assert (found["tick"], found["signal"]) == (20_111, "x_command_um")
+
+
 @pytest.mark.parametrize(("signal_name", "by"), [("mode", -1.0), ("flags", 16.0)])
 def test_another_mode_or_flag_is_found_at_its_tick(signal_name: str, by: float, whole: Path, tmp_path: Path):
     column = load(whole).columns.index(signal_name)

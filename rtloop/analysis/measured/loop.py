@@ -7,12 +7,12 @@ turns by half a circle from one line to the next there, and this does not.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 
 from rtloop.analysis.measured.mode import LightMode
 from rtloop.analysis.measured.response import Response
@@ -65,7 +65,9 @@ class MeasuredLoop:
         return MeasuredLoop(self.hz, lifted, self.spread, self.rate_hz, self.image)
 
     @cached_property
-    def _spline(self) -> CubicSpline:
+    def _spline(self) -> Callable[[npt.ArrayLike], Complex]:
+        from scipy.interpolate import CubicSpline  # half a second of import, when a service starts
+
         return CubicSpline(np.log(self.hz), self.lifted)
 
 

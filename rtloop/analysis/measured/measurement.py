@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import margins
@@ -94,7 +93,7 @@ def measurement(
     grid = part.grid(reference, rate_hz)
     whole = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
     error, command, position = (part.folded(signals[name])[whole] for name in ("error_um", "command_um", "position_um"))
-    past = np.asarray(lfilter(command_taps or (0.0,), 1.0, reference)) + signals.get("feed_um", 0.0)
+    past = np.convolve(command_taps or (0.0,), reference)[: reference.size] + signals.get("feed_um", 0.0)
     found = response(grid, Signals(error, command, position, part.folded(past)[0]))
     mode = _mode(found, rate_hz, near_hz)
     loop = measured_loop(found, rate_hz, mode)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from rtloop.analysis.measured.response import Response
 from rtloop.hil.modal import Complex, Real
@@ -49,6 +48,8 @@ class LightMode:
 
 def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
     """The mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines there."""
+    from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
+
     kept = np.abs(found.hz / near_hz - 1) <= band
     if (lines := int(kept.sum())) < LEAST_LINES:
         raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; {LEAST_LINES} are needed")

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import least_squares
 
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.linear_model import LinearModel
@@ -112,6 +111,8 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
 
 def fitted_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
     """c + Re(a e^{(−σ + jω)t}) fitted to a step's answer within the window. Raises UnsuitableData."""
+    from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
+
     part = height[round(window_s[0] * rate_hz) : round(window_s[1] * rate_hz)]
     time_s = np.arange(part.size) / rate_hz
     spectrum = np.abs(np.fft.rfft((part - part.mean()) * np.hanning(part.size)))
