@@ -128,9 +128,9 @@ def retuned(percent: float) -> bool:
         and steps[1].settling_ms <= SETTLING_MS and steps[1].overshoot_percent <= OVERSHOOT_PERCENT
     )  # fmt: skip
     print(
-        f"{percent:+.0f} %: {hz:.2f} Hz ({off:+.4f} %); step {steps[0].settling_ms:.1f} -> {steps[1].settling_ms:.1f} "
-        f"ms, {steps[0].overshoot_percent:.3f} -> {steps[1].overshoot_percent:.3f} %; {len(swaps)} swaps in a scan move "
-        f"x by {1e3 * moved:.0f} nm at most; {verdict.ticks} ticks {'identical' if verdict.identical else verdict}"
+        f"{percent:+.0f} %: {hz:.2f} Hz ({off:+.4f} %); step {steps[0].settling_ms:.1f} -> {steps[1].settling_ms:.1f}"
+        f" ms, {steps[0].overshoot_percent:.3f} -> {steps[1].overshoot_percent:.3f} %; {len(swaps)} swaps in a scan "
+        f"move x by {1e3 * moved:.0f} nm at most; {verdict.ticks} ticks {'identical' if verdict.identical else verdict}"
         f"{'' if good else '  BAD'}",
         flush=True,
     )
