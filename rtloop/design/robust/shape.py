@@ -168,14 +168,15 @@ def trade_off(programme: Programme, fastest: float, tick_ms: float) -> tuple[tup
 
 def _worst(found: Iterable[Judged]) -> Judged:
     """Of each quantity."""
-    *largest, low, high = (np.array(values) for values in zip(*found, strict=True))
-    return Judged(*(float(one.max()) for one in largest), float(low.min()), float(high.max()))
+    settling, over, excess, under, low, high = (np.array(values) for values in zip(*found, strict=True))
+    largest = (float(one.max()) for one in (settling, over, excess, under))
+    return Judged(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
 
 def judged_of(subject: Subject, taps: Taps, scenario: Scenario) -> Judged:
     """What a step does on one plant."""
     time, position, command = _steps(subject, taps, scenario)
-    low, high = subject.bounds.command(np.float64(1 / subject.family().plant(scenario).dc_gain))
+    low, high = subject.bounds.command(np.array(1 / subject.family().plant(scenario).dc_gain))
     excess = float(max(command.max() - high, low - command.min()))
     outside = np.flatnonzero(np.abs(position - 1) > BAND)
     settled = float(time[min(outside[-1] + 1, time.size - 1)]) if outside.size else 0.0
