@@ -31,7 +31,10 @@ def info(files: tuple[Path, ...], as_json: bool) -> int:
 
     with Counter("ticks read", sys.stderr) as counter:
         summary = summarise(files, counter.show)
-    _show(summary, as_json, print_summary)
+    if as_json:
+        click.echo(json.dumps(summary.as_dict()))
+    else:
+        print_summary(summary)
     return 0
 
 

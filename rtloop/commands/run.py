@@ -15,7 +15,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
 from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.recording.file.recover import leftovers, recover
-from rtloop.recording.views.summary import summarise
+from rtloop.recording.views.summary import Summary, summarise
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.naming import recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
@@ -42,17 +42,16 @@ def run_configuration(
         with RunView(prepared, sys.stderr) as view:
             result = supervisor.run(view.show)
         interruption.attend(None)
-    summary = run_summary(warnings, result)
-    summary["startup_s"] = supervisor.startup_s
+    summary = summarise(result.recordings) if result.recordings else None
     if as_json:
-        click.echo(json.dumps(summary))
+        click.echo(json.dumps(_for_json(summary, result, warnings, supervisor.startup_s)))
     else:
         print_run(prepared, summary)
-    for note in summary["notes"]:
+    for note in result.notes:
         click.echo(f"note: {note}", err=True)
-    if summary["error"]:
-        click.echo(f"rtloop: {summary['error']}", err=True)
-    return result.exit_code or (LoopFault.exit_code if summary["trips"] else 0)
+    if result.error:
+        click.echo(f"rtloop: {result.error}", err=True)
+    return result.exit_code or (LoopFault.exit_code if summary and summary.trips else 0)
 
 
 def _stopped_before(as_json: bool) -> int:
@@ -70,18 +69,19 @@ def _cache_warnings() -> list[str]:
     return [f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is made anew when that is gone"]
 
 
-def run_summary(warnings: list[str], result: RunResult) -> dict[str, Any]:
-    """The recording's summary with what the run adds to it."""
-    summary = summarise(result.recordings) if result.recordings else {}
-    summary["recording"] = str(result.recordings[0]) if result.recordings else None
-    summary["recordings"] = [str(path) for path in result.recordings]
-    summary["notes"] = list(result.notes)
-    summary["outcome"] = result.outcome
-    summary["error"] = result.error
-    summary["recorder"] = result.recorder
-    summary["warnings"] = warnings
-    summary.setdefault("trips", [])
-    return summary
+def _for_json(
+    summary: Summary | None, result: RunResult, warnings: list[str], startup_s: float | None
+) -> dict[str, Any]:
+    """The recording's summary, if there is one, with what the run adds to it."""
+    return {"trips": [], **(summary.as_dict() if summary else {"recording": None})} | {
+        "recordings": [str(path) for path in result.recordings],
+        "notes": list(result.notes),
+        "outcome": result.outcome,
+        "error": result.error,
+        "recorder": result.recorder,
+        "warnings": warnings,
+        "startup_s": startup_s,
+    }
 
 
 def recover_leftovers(folder: Path) -> None:

@@ -16,6 +16,7 @@ from rtloop.drivers.registry import driver_class, kinds
 from rtloop.errors import RtloopError
 from rtloop.recording.load import load
 from rtloop.recording.views.steps import step_metrics
+from rtloop.recording.views.summary import Summary
 from rtloop.signals import Mode
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
@@ -63,59 +64,56 @@ def _elapsed(time_s: float, ticks: int | None, rate_hz: float) -> str:
     return f"{time_s:8.1f} s" if ticks is None else f"{time_s:8.1f} of {ticks / rate_hz:g} s"
 
 
-def print_run(prepared: Prepared, summary: dict[str, Any]) -> None:
-    """The summary of a run, with step metrics where the reference is a series of steps."""
+def print_run(prepared: Prepared, summary: Summary | None) -> None:
+    """The summary of a run, if it was recorded, with step metrics where the reference is a series of steps."""
+    if summary is None:
+        console().print("nothing is recorded")
+        return
     print_summary(summary)
-    ticks = summary.get("ticks_logged") or 0
-    if 0 < ticks <= LONGEST_STEP_ANALYSIS_TICKS and not summary["trips"]:
-        _print_steps(prepared, summary["recording"])
+    if 0 < summary.ticks_logged <= LONGEST_STEP_ANALYSIS_TICKS and not summary.trips:
+        _print_steps(prepared, summary.recording)
 
 
-def print_summary(summary: dict[str, Any]) -> None:
+def print_summary(summary: Summary) -> None:
     """What a recording holds, as tables."""
     out = console()
-    if "ticks_logged" not in summary:
-        out.print(f"nothing recorded in {escape(str(summary.get('recording')))}")
-        return
-    out.print(f"[bold]{escape(summary['recording'])}[/]  {_size(summary)}")
+    out.print(f"[bold]{escape(summary.recording)}[/]  {_size(summary)}")
     shown = table("", "", "")
-    expected = summary["ticks_expected"]
+    expected = summary.ticks_expected
     shown.add_row(
-        "ticks", f"{summary['ticks_logged']:,}", "of " + ("as many as came" if expected is None else f"{expected:,}")
+        "ticks", f"{summary.ticks_logged:,}", "of " + ("as many as came" if expected is None else f"{expected:,}")
     )
-    shown.add_row("lost", str(summary["ticks_lost"]), "complete" if summary["complete"] else "[red]not complete[/]")
-    shown.add_row("time", f"{summary['duration_s']:.3f} s", f"at {summary['rate_hz']:g} Hz")
-    if summary["paced"]:
-        achieved = summary["achieved_rate_hz"]
+    shown.add_row("lost", str(summary.ticks_lost), "complete" if summary.complete else "[red]not complete[/]")
+    shown.add_row("time", f"{summary.duration_s:.3f} s", f"at {summary.rate_hz:g} Hz")
+    if summary.paced:
+        achieved = summary.achieved_rate_hz
         rate = "–" if achieved is None else f"{achieved:.1f} Hz"
-        shown.add_row("achieved rate", rate, _scheduling(summary["realtime"] or {}))
-        shown.add_row("periods missed", str(summary["periods_missed"]), "skipped by late ticks, never caught up")
-        shown.add_row("overruns", str(summary["overruns"]), "ticks that ended after their period")
+        shown.add_row("achieved rate", rate, _scheduling(summary.realtime or {}))
+        shown.add_row("periods missed", str(summary.periods_missed), "skipped by late ticks, never caught up")
+        shown.add_row("overruns", str(summary.overruns), "ticks that ended after their period")
     else:
         shown.add_row("clock", "virtual", "unpaced: nothing was timed")
-    if any(summary["ticks_limited"].values()):
-        counts = ", ".join(f"{name} {count:,}" for name, count in summary["ticks_limited"].items() if count)
+    if any(summary.ticks_limited.values()):
+        counts = ", ".join(f"{name} {count:,}" for name, count in summary.ticks_limited.items() if count)
         shown.add_row("limited", "", f"ticks by what: {counts}")
-    if len(summary["parts"]) > 1:
-        shown.add_row("parts", str(len(summary["parts"])), "of a rotated recording")
-    if summary["commands"]:
-        shown.add_row("commands", str(sum(summary["commands"].values())), _by_whom(summary["commands"]))
-    for problem in summary["problems"]:
+    if len(summary.parts) > 1:
+        shown.add_row("parts", str(len(summary.parts)), "of a rotated recording")
+    if summary.commands:
+        shown.add_row("commands", str(sum(summary.commands.values())), _by_whom(summary.commands))
+    for problem in summary.problems:
         shown.add_row("[red]problem[/]", "", escape(problem))
-    if summary["driver_error"]:
-        shown.add_row("[red]driver[/]", "", escape(summary["driver_error"]))
-    for trip in summary["trips"]:
-        reason = escape(trip["reason"] or "")
-        shown.add_row(
-            "[red]trip[/]", f"tick {trip['tick']}", "; ".join(filter(None, [", ".join(trip["causes"]), reason]))
-        )
+    if summary.driver_error:
+        shown.add_row("[red]driver[/]", "", escape(summary.driver_error))
+    for trip in summary.trips:
+        reason = escape(trip.reason or "")
+        shown.add_row("[red]trip[/]", f"tick {trip.tick}", "; ".join(filter(None, [", ".join(trip.causes), reason])))
     out.print(shown)
-    if summary["lateness_us"] is not None:
+    if summary.lateness_us is not None:
         _print_timing(out, summary)
     axes = table("axis", "rms error µm", "largest drive V")
-    for axis in summary["axes"]:
-        error = "–" if axis["rms_error_um"] is None else f"{axis['rms_error_um']:.4f}"
-        axes.add_row(axis["name"], error, f"{axis['max_abs_drive_v']:.3f}")
+    for axis in summary.axes:
+        error = "–" if axis.rms_error_um is None else f"{axis.rms_error_um:.4f}"
+        axes.add_row(axis.name, error, f"{axis.max_abs_drive_v:.3f}")
     out.print(axes)
 
 
@@ -125,15 +123,15 @@ def _by_whom(commands: dict[str, int]) -> str:
     return escape(f"by {', '.join(most[:MOST])}{', …' * (len(most) > MOST)}")
 
 
-def _print_timing(out: Console, summary: dict[str, Any]) -> None:
+def _print_timing(out: Console, summary: Summary) -> None:
     shown = table("µs", "p50", "p99", "p99.9", "max")
-    for label, key in (("lateness", "lateness_us"), ("tick", "exec_us")):
-        shown.add_row(label, *(f"{summary[key][name]:.2f}" for name in ("p50", "p99", "p999", "max")))
+    for label, found in (("lateness", summary.lateness_us), ("tick", summary.exec_us)):
+        if found is not None:
+            shown.add_row(label, *(f"{found[name]:.2f}" for name in ("p50", "p99", "p999", "max")))
     out.print(shown)
-    histogram = summary.get("lateness_histogram")
-    if histogram:
-        out.print(bars(histogram, "late by µs"))
-    phases = summary["phases"]
+    if summary.lateness_histogram:
+        out.print(bars(summary.lateness_histogram, "late by µs"))
+    phases = summary.phases
     labels = (("read", "read_us"), ("law", "law_us"), ("write", "write_us"))
     out.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
 
@@ -219,9 +217,9 @@ def known_drivers() -> list[dict[str, Any]]:
     return found
 
 
-def _size(summary: dict[str, Any]) -> str:
-    each = summary["bytes_per_tick"]
-    return f"{summary['size_bytes'] / 2**20:.1f} MiB" + ("" if each is None else f", {each:.1f} bytes a tick")
+def _size(summary: Summary) -> str:
+    each = summary.bytes_per_tick
+    return f"{summary.size_bytes / 2**20:.1f} MiB" + ("" if each is None else f", {each:.1f} bytes a tick")
 
 
 def _scheduling(realtime: dict[str, Any]) -> str:

@@ -55,7 +55,7 @@ def account(folder: Path, blocks: list[SharedBlock]) -> Account:
         problems.append(f"{len(blocks)} loops ran, {len(runs)} are recorded")
     for number, paths in enumerate(runs):
         summary, recording = summarise(paths), rtloop.load(paths)
-        there, stated = len(recording), summary["ticks_lost"]
+        there, stated = len(recording), summary.ticks_lost
         total = there + stated
         if number < len(blocks) and len(runs) == len(blocks) and total != int(blocks[number]["ticks_head"][0]):
             problems.append(f"{paths[0].name}: {total} ticks accounted, {blocks[number]['ticks_head'][0]} executed")
@@ -64,5 +64,5 @@ def account(folder: Path, blocks: list[SharedBlock]) -> Account:
         problems += [f"{paths[0].name}: replay: {problem}" for problem in left]
         if sum(gap["count"] for gap in verdict.gaps) > stated:
             problems.append(f"{paths[0].name}: {verdict.gaps} missing, {stated} stated")
-        executed, lost, missed = executed + total, lost + stated, missed + summary["periods_missed"]
+        executed, lost, missed = executed + total, lost + stated, missed + summary.periods_missed
     return Account(executed, lost, missed, problems)

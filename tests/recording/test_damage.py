@@ -113,9 +113,9 @@ def test_a_damaged_chunk_is_an_error_unless_asked_otherwise(finished: bytes, tmp
     with Reader(path) as reader, pytest.raises(RecordingError, match=r"is damaged.*rtloop recover"):
         list(reader.blocks())
     summary = summarise(path)
-    assert not summary["complete"]
-    assert summary["ticks_lost"] == COUNT - summary["ticks_logged"] > 0
-    assert len(summary["problems"]) == 1
+    assert not summary.complete
+    assert summary.ticks_lost == COUNT - summary.ticks_logged > 0
+    assert len(summary.problems) == 1
 
 
 def test_recovering_a_damaged_file(finished: bytes, tmp_path: Path):
@@ -156,7 +156,7 @@ def test_recovering_a_file_that_only_lacks_its_index(unfinished: bytes, tmp_path
     report = recover(path)
     assert (report["ticks"], report["gaps"]) == (COUNT, [])
     summary = summarise(report["output"])
-    assert (summary["ticks_logged"], summary["ticks_lost"]) == (COUNT, 0)
+    assert (summary.ticks_logged, summary.ticks_lost) == (COUNT, 0)
     with pytest.raises(OutputError, match="exists already"):
         recover(path)
 

@@ -54,7 +54,7 @@ def check(totals: dict[str, Any], executed: int, *, gaps: int = 1, replayed: boo
     assert totals["ticks_lost"] == sum(gap["count"] for gap in lost) == executed - len(ticks)
     assert not totals["complete"]
     summary = summarise(totals["paths"])
-    assert (summary["ticks_lost"], summary["complete"]) == (totals["ticks_lost"], False)
+    assert (summary.ticks_lost, summary.complete) == (totals["ticks_lost"], False)
     for path in totals["paths"]:
         with Reader(path) as reader:
             assert reader.problems == []

@@ -129,7 +129,7 @@ EVENTS = [
 def test_malformed_events_are_problems_by_name(kind: str, change: Any, said: str, base: Base, tmp_path: Path):
     path = tmp_path / "run.mcap"
     path.write_bytes(with_event(base, kind, change))
-    assert any(re.search(f"event.*{said}", problem) for problem in summarise(path)["problems"])
+    assert any(re.search(f"event.*{said}", problem) for problem in summarise(path).problems)
     assert any(re.search(f"event.*{said}", problem) for problem in load(path).problems)
     assert not replay(load(path)).identical
     assert any(re.search(f"event.*{said}", problem) for problem in recover(path)["problems"])
@@ -188,6 +188,6 @@ def test_ticks_that_cannot_be_are_left_out_and_named(column: str, value: float, 
     path = tmp_path / "run.mcap"
     path.write_bytes(with_tick(base, column, value))
     summary = summarise(path)
-    assert (summary["ticks_logged"], summary["complete"]) == (500, False)
-    assert any(column in problem for problem in summary["problems"])
+    assert (summary.ticks_logged, summary.complete) == (500, False)
+    assert any(column in problem for problem in summary.problems)
     assert not replay(load(path)).identical

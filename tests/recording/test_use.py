@@ -17,7 +17,7 @@ from rtloop.recording.views.bands import read_bands
 from rtloop.recording.views.export import export
 from rtloop.recording.views.histogram import Histogram
 from rtloop.recording.views.plot import plot
-from rtloop.recording.views.summary import summarise
+from rtloop.recording.views.summary import AxisSummary, summarise
 from rtloop.signals import Flag, Mode
 from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
 
@@ -45,23 +45,25 @@ def path(tmp_path_factory: pytest.TempPathFactory, rows: np.ndarray) -> Path:
 def test_summary_of_a_paced_run(path: Path, rows: np.ndarray):
     summary = summarise(path)
     column = dict(zip(COLUMNS, rows.T, strict=True))
-    assert (summary["ticks_expected"], summary["ticks_logged"], summary["ticks_lost"]) == (COUNT, COUNT, 0)
-    assert (summary["overruns"], summary["periods_missed"], summary["complete"]) == (1, 3, True)
-    assert summary["duration_s"] == pytest.approx(0.7)
-    assert summary["rate_hz"] == 10_000.0
-    assert summary["achieved_rate_hz"] == pytest.approx(10_000.0)
-    for name in ("lateness_us", "exec_us"):
+    assert (summary.ticks_expected, summary.ticks_logged, summary.ticks_lost) == (COUNT, COUNT, 0)
+    assert (summary.overruns, summary.periods_missed, summary.complete) == (1, 3, True)
+    assert summary.duration_s == pytest.approx(0.7)
+    assert summary.rate_hz == 10_000.0
+    assert summary.achieved_rate_hz == pytest.approx(10_000.0)
+    for name, found in (("lateness_us", summary.lateness_us), ("exec_us", summary.exec_us)):
         quantiles = np.quantile(column[name], [0.5, 0.99, 0.999], method="inverted_cdf")
-        assert [summary[name][key] for key in ("p50", "p99", "p999")] == pytest.approx(list(quantiles), abs=1e-9)
-        assert summary[name]["max"] == column[name].max()
-    axis = summary["axes"][0]
-    assert axis["name"] == "x"
-    assert axis["rms_error_um"] == pytest.approx(np.sqrt(np.mean(column["x_error_um"][1000:] ** 2)))
-    assert axis["max_abs_drive_v"] == np.abs(column["x_drive_v"]).max()
-    assert summary["realtime"]["kernel"] == "test"
-    assert set(summary["phases"]) == {"read_us", "law_us", "write_us"}
-    assert (summary["trips"], summary["events"]) == ([], 8)
-    assert summary["size_bytes"] == path.stat().st_size
+        assert found is not None
+        assert [found[key] for key in ("p50", "p99", "p999")] == pytest.approx(list(quantiles), abs=1e-9)
+        assert found["max"] == column[name].max()
+    axis = summary.axes[0]
+    assert axis.name == "x"
+    assert axis.rms_error_um == pytest.approx(np.sqrt(np.mean(column["x_error_um"][1000:] ** 2)))
+    assert axis.max_abs_drive_v == np.abs(column["x_drive_v"]).max()
+    assert summary.realtime is not None
+    assert summary.realtime["kernel"] == "test"
+    assert set(summary.phases) == {"read_us", "law_us", "write_us"}
+    assert (summary.trips, summary.events) == ([], 8)
+    assert summary.size_bytes == path.stat().st_size
 
 
 def test_damage_is_no_lower_rate(path: Path, tmp_path: Path, rows: np.ndarray):
@@ -71,22 +73,22 @@ def test_damage_is_no_lower_rate(path: Path, tmp_path: Path, rows: np.ndarray):
     damaged = tmp_path / "run.mcap"
     damaged.write_bytes(data)
     summary = summarise(damaged)
-    assert summary["ticks_lost"] > 100
-    assert summary["achieved_rate_hz"] == pytest.approx(10_000.0)
+    assert summary.ticks_lost > 100
+    assert summary.achieved_rate_hz == pytest.approx(10_000.0)
 
 
 def test_summary_of_an_unpaced_run_has_no_times(tmp_path: Path):
     path = write_recording(tmp_path / "run.mcap", make_rows(500, paced=False), paced=False)
     summary = summarise(path)
-    assert summary["lateness_us"] is None
-    assert summary["exec_us"] is None
-    assert summary["phases"] == {"read_us": None, "law_us": None, "write_us": None}
+    assert summary.lateness_us is None
+    assert summary.exec_us is None
+    assert summary.phases == {"read_us": None, "law_us": None, "write_us": None}
 
 
 def test_summary_of_an_empty_run(tmp_path: Path):
     summary = summarise(write_recording(tmp_path / "run.mcap", make_rows(0)))
-    assert (summary["ticks_logged"], summary["duration_s"], summary["complete"]) == (0, 0.0, True)
-    assert summary["axes"] == [{"name": "x", "rms_error_um": None, "max_abs_drive_v": 0.0}]
+    assert (summary.ticks_logged, summary.duration_s, summary.complete) == (0, 0.0, True)
+    assert summary.axes == [AxisSummary("x", None, 0.0)]
 
 
 def test_large_times_keep_their_leading_digits():

@@ -106,8 +106,8 @@ def test_a_chunk_replaced_by_a_copy_of_another(base: Base, path: Path):
     report = refused(path)
     assert ranges(report.not_verified[0]) == {"first_tick": 4 * CHUNK_TICKS, "count": CHUNK_TICKS}
     summary = summarise(path)
-    assert (summary["ticks_logged"], summary["ticks_lost"], summary["complete"]) == (TICKS - 100, 100, False)
-    assert any("again" in problem or "order" in problem for problem in summary["problems"])
+    assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (TICKS - 100, 100, False)
+    assert any("again" in problem or "order" in problem for problem in summary.problems)
     for command in (["plot", "--html"], ["export", "--to", "csv"]):
         result = CliRunner().invoke(main, [command[0], str(path), *command[1:], "--json"])
         assert any("order" in problem for problem in json.loads(result.stdout)["problems"])
@@ -129,7 +129,7 @@ def test_chunks_that_are_gone(kept: slice, base: Base, path: Path):
     path.write_bytes(packed(without(base, *gone)))
     report = refused(path)
     assert report.ticks + report.unverified == TICKS
-    assert any(str(TICKS - 100 * len(gone)) in problem for problem in summarise(path)["problems"])
+    assert any(str(TICKS - 100 * len(gone)) in problem for problem in summarise(path).problems)
 
 
 def test_early_snapshots_that_are_gone(base: Base, path: Path):

@@ -71,11 +71,11 @@ def check(found: Aborted, folder: Path) -> str:
     assert found.report or too_late_for_a_run, found.error
     assert not list(folder.glob("*.part")), "a recording was left unfinished"
     for path in found.recordings:
-        assert summarise(path)["complete"], (path, found.error)
+        assert summarise(path).complete, (path, found.error)
     last = found.recordings[int(np.argmax([path.stat().st_mtime for path in found.recordings]))]
     drive = rtloop.load(last)["x_drive_v"]
     summary = summarise(last)
-    if summary["ticks_logged"] < summary["ticks_expected"]:  # a run that came to its end ramps after its last record
+    if summary.ticks_logged < summary.ticks_expected:  # a run that came to its end ramps after its last record
         assert drive.size == 0 or abs(drive[-1]) < PARKED_V, f"{last}: ends at {drive[-1]} V"
     said = ", left out the report" if too_late_for_a_run else ""
     return f"exit {found.exit_code}{said}, {len(found.recordings)} recordings, last {last.name} of {drive.size:,} ticks"

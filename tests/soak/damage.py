@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,9 @@ class Judge:
             return
         self.outcomes["whole" if whole else "in part"] += 1
         summary = summarise(path)
-        assert whole or not summary["complete"]
-        if summary["complete"]:
-            assert {**summary, "recording": 0, "parts": 0} == {**self.summary, "recording": 0, "parts": 0}
+        assert whole or not summary.complete
+        if summary.complete:
+            assert replace(summary, recording="", parts=[]) == replace(self.summary, recording="", parts=[])
         self._replay(path)
         self._recover(path)
         if number % EXPORTED == 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,65 @@ BATCH_ROWS = 1 << 18
 Progress = Callable[[int], None]
 
 
+@dataclass(frozen=True)
+class AxisSummary:
+    """The error is that of closed-loop ticks; None where the loop was never closed."""
+
+    name: str
+    rms_error_um: float | None
+    max_abs_drive_v: float
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Of an axis, or of all."""
+
+    tick: int
+    causes: list[str]
+    reason: str | None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What `rtloop info --json` shows. Times, and what is made of them, are None where nothing was timed."""
+
+    recording: str
+    parts: list[str]
+    name: str | None
+    ticks_expected: int | None
+    ticks_logged: int
+    ticks_lost: int
+    periods_missed: int
+    rate_hz: float
+    achieved_rate_hz: float | None
+    duration_s: float
+    paced: bool
+    overruns: int
+    ticks_limited: dict[str, int]
+    lateness_us: dict[str, float] | None
+    lateness_histogram: list[dict[str, Any]]
+    exec_us: dict[str, float] | None
+    phases: dict[str, float | None]
+    """Medians."""
+    complete: bool
+    result: str | None
+    driver_error: str | None
+    problems: list[str]
+    realtime: dict[str, Any] | None
+    host: dict[str, Any] | None
+    axes: list[AxisSummary]
+    trips: list[Trip]
+    commands: dict[str, int]
+    """By whom, the most first."""
+    events: int
+    size_bytes: int
+    bytes_per_tick: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
 class AxisSums:
     """Tracking error over closed-loop ticks and the largest drive of one axis."""
 
@@ -38,10 +98,10 @@ class AxisSums:
         self._count += len(errors)
         self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
-    def report(self) -> dict[str, Any]:
-        """The axis in the summary; no error where the loop was never closed."""
-        rms = math.sqrt(self._square_sum / self._count) if self._count else None
-        return {"name": self.name, "rms_error_um": rms, "max_abs_drive_v": self._drive}
+    def summary(self) -> AxisSummary:
+        """What came of it."""
+        rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
+        return AxisSummary(self.name, rms_um, self._drive)
 
 
 class Totals:
@@ -83,8 +143,8 @@ class Totals:
         return (self.last[1] - self.first[1]) / 1e9 if self.first else 0.0
 
 
-def summarise(path: Files, progress: Progress | None = None) -> dict[str, Any]:
-    """The object of `rtloop info --json`, tolerant of damage, which it names; a rotated run is summed up as one.
+def summarise(path: Files, progress: Progress | None = None) -> Summary:
+    """Tolerant of damage, which it names; a rotated run is summed up as one.
 
     Raises RecordingError.
     """
@@ -100,7 +160,7 @@ def _seamless(end: dict[str, Any] | None) -> bool:
     return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
 
 
-def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
+def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
@@ -110,42 +170,43 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
     problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
     whole = bool(finished and finished["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
+    phases = {name: reports[name] for name in MEASURED[2:]}
     size_bytes = sum(reader.size_bytes for reader in readers)
-    return {
-        "recording": str(readers[0].path),
-        "parts": [str(reader.path) for reader in readers],
-        "name": header.get("name"),
-        "ticks_expected": header.get("ticks_expected"),
-        "ticks_logged": totals.ticks,
-        "ticks_lost": lost,
-        "periods_missed": totals.periods_missed,
-        "rate_hz": rate_hz,
-        "achieved_rate_hz": totals.executed / totals.span_s if totals.span_s else None,
-        "duration_s": totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
-        "paced": header["paced"],
-        "overruns": totals.overruns,
-        "ticks_limited": totals.limited,
-        "lateness_us": reports["lateness_us"],
-        "lateness_histogram": totals.histograms["lateness_us"].classes(),
-        "exec_us": reports["exec_us"],
-        "phases": {name: report and report["p50"] for name, report in reports.items() if name in MEASURED[2:]},
-        "complete": whole,
-        "result": finished["result"] if finished else None,
-        "driver_error": finished.get("driver_error") if finished else None,
-        "problems": problems,
-        "realtime": header.get("realtime"),
-        "host": header.get("host"),
-        "axes": [axis.report() for axis in totals.axes],
-        "trips": [
-            {"tick": event["tick"], "causes": event["what"]["causes"], "reason": event["what"].get("reason")}
+    return Summary(
+        recording=str(readers[0].path),
+        parts=[str(reader.path) for reader in readers],
+        name=header.get("name"),
+        ticks_expected=header.get("ticks_expected"),
+        ticks_logged=totals.ticks,
+        ticks_lost=lost,
+        periods_missed=totals.periods_missed,
+        rate_hz=rate_hz,
+        achieved_rate_hz=totals.executed / totals.span_s if totals.span_s else None,
+        duration_s=totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
+        paced=header["paced"],
+        overruns=totals.overruns,
+        ticks_limited=totals.limited,
+        lateness_us=reports["lateness_us"],
+        lateness_histogram=totals.histograms["lateness_us"].classes(),
+        exec_us=reports["exec_us"],
+        phases={name: None if report is None else report["p50"] for name, report in phases.items()},
+        complete=whole,
+        result=finished["result"] if finished else None,
+        driver_error=finished.get("driver_error") if finished else None,
+        problems=problems,
+        realtime=header.get("realtime"),
+        host=header.get("host"),
+        axes=[axis.summary() for axis in totals.axes],
+        trips=[
+            Trip(event["tick"], event["what"]["causes"], event["what"].get("reason"))
             for event in events
             if event["kind"] == "tripped"
         ],
-        "commands": dict(Counter(event["who"] for event in events if event["kind"] in COMMANDS).most_common()),
-        "events": len(events),
-        "size_bytes": size_bytes,
-        "bytes_per_tick": size_bytes / totals.ticks if totals.ticks else None,
-    }
+        commands=dict(Counter(event["who"] for event in events if event["kind"] in COMMANDS).most_common()),
+        events=len(events),
+        size_bytes=size_bytes,
+        bytes_per_tick=size_bytes / totals.ticks if totals.ticks else None,
+    )
 
 
 def _sum_up(readers: Sequence[Reader], progress: Progress | None) -> Totals:
