@@ -3,15 +3,13 @@
     python -m rtloop.panel.capture SOCKET FILE FIRST END
 
 waits until the ticks FIRST … END − 1 of the run with the recording FILE are written, cuts them out, replays them, and
-prints one JSON line: {file, ticks, gaps, problems, replay}, or {error}. It is the panel's hand for what takes long:
-a process of its own, below everybody else's priority, whose memory is gone with it.
+prints one JSON line: {file, first, end, ticks, gaps, problems, replay}, or {error}.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from itertools import count
@@ -33,7 +31,6 @@ GRACE_S = 10.0
 KEPT_FREE_BYTES = 128 << 20
 """Twice what the recorder keeps free: no capture costs it a tick."""
 ATTEMPTS = 5
-NICE = 10
 
 
 class Run(NamedTuple):
@@ -132,7 +129,6 @@ def main() -> int:
     for name, kind in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
         parser.add_argument(name, type=kind)
     asked = parser.parse_args()
-    os.nice(NICE)
     said: dict[str, Any]
     try:
         done = capture(Client(asked.socket), asked.file, asked.first, asked.end)

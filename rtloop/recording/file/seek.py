@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.format import EVENTS
 from rtloop.recording.file.reader import Reader, Rows
 from rtloop.recording.file.ticks import Ticks
 from rtloop.signals import DEADLINE, TICK
@@ -47,6 +50,12 @@ class Seeker:
     def last(self) -> Span | None:
         """The last chunk with ticks."""
         return next(filter(None, map(self.span, reversed(range(self.end)))), None)
+
+    def final(self) -> dict[str, Any] | None:
+        """What was counted at the end of the file; None where it was not finished."""
+        found = self.chunk(self.end - 1)
+        events = [json.loads(one.payload) for one in found if one.channel == EVENTS] if isinstance(found, list) else []
+        return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
 
     def reaching(self, tick: int) -> int:
         """Place of the first chunk that has `tick` or a later one; `end` where none has."""
