@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "live.ipynb"
 Loop = tuple[Bench, Connection]
 
 
@@ -87,7 +89,7 @@ def test_beside_the_recording_and_never_over_another(loop: Loop):
     paths = [connection.capture(0.01, at=tick, pre_percent=0).paths[0] for _ in range(3)]
     stem = present_run(bench.client).file.stem
     assert [path.name for path in paths] == [f"{stem}.capture-{tick}{more}.mcap" for more in ("", "-2", "-3")]
-    assert len({path.read_bytes() for path in paths}) == 1
+    assert len({b"".join(rows.tobytes() for rows in rtloop.load(path).blocks()) for path in paths}) == 1
     assert rtloop.load(paths[0]).header["cut"]["files"][0].startswith(stem)
 
 
@@ -126,6 +128,28 @@ def test_what_is_refused(loop: Loop):
     with pytest.raises(RtloopError, match=r"no trigger within 0\.2 s"):
         connection.capture(0.1, rtloop.Tripped(), timeout_s=0.2)
     assert sorted((bench.folder / "recordings").glob("*capture*")) == before
+
+
+def test_the_notebook(loop: Loop, monkeypatch: pytest.MonkeyPatch):
+    """Its cells in order, in one namespace, as a kernel executes them; pictures are drawn and not shown."""
+    bench, connection = loop
+    connection.release()
+    monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [bench.client.path.parent])
+    matplotlib.use("agg")
+    notebook = json.loads(NOTEBOOK.read_text())
+    assert (notebook["nbformat"], len({cell["id"] for cell in notebook["cells"]})) == (4, len(notebook["cells"]))
+    names: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            assert (cell["outputs"], cell["execution_count"]) == ([], None)
+            exec(compile("".join(cell["source"]), f"{NOTEBOOK}: {cell['id']}", "exec"), names)
+    assert asked(names["step"])["x_reference_um"][[0, -1]].tolist() == [0.0, 12.5]
+    assert abs(names["position"][-1] - 12.5) < 0.2
+    assert asked(names["period"])["x_reference_um"].max() == pytest.approx(3.0, abs=0.01)
+    assert len(names["upper"].lines) == 2
+    said = connection.status
+    assert (said["lock"], said["mode"]) == (None, "off")
+    assert "notebook" in {event["who"] for event in names["step"].events}
 
 
 class Unrecorded:

@@ -10,6 +10,7 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any, Self
+from urllib.parse import quote
 
 import anyio.to_thread
 from anyio import CapacityLimiter
@@ -125,7 +126,8 @@ class Recordings:
         if path.suffix == ".mcap":
             return FileResponse(path, filename=path.name, media_type="application/octet-stream")
         size = path.stat().st_size
-        headers = {"content-length": str(size), "content-disposition": f'attachment; filename="{path.name}"'}
+        named = f"attachment; filename*=utf-8''{quote(path.name)}"
+        headers = {"content-length": str(size), "content-disposition": named}
         return StreamingResponse(_blocks(path, size), headers=headers, media_type="application/octet-stream")
 
     @_answers

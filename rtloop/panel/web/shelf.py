@@ -19,7 +19,7 @@ BUDGET_S = 1.5
 """For opening files that were not seen before; of those that are left there is the size alone, until the next time."""
 COUNTED_BYTES = 64 << 20
 """Of larger files the trips are not counted: for that all of their events would be read."""
-UNKNOWN = dict.fromkeys(("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut"))
+UNKNOWN: dict[str, Any] = dict.fromkeys(("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut"))
 
 
 class Lying(NamedTuple):
@@ -80,16 +80,17 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
     try:
         with Reader(path, tolerant=True) as reader:
             seeker = Seeker(reader)
-            first, last, end = seeker.first(), seeker.last(), seeker.final()
-            there = first is not None and last is not None
-            span_s = (last.last_ns - first.first_ns) / 1e9 if there else 0.0
+            first, last, end, ticks, span_s = seeker.first(), seeker.last(), seeker.final(), 0, 0.0
+            if first is not None and last is not None:
+                ticks = last.last + 1 - first.first
+                span_s = (last.last_ns - first.first_ns) / 1e9 + 1 / reader.header["rate_hz"]
             events = reader.events if size <= COUNTED_BYTES else None
             return {
                 "complete": bool(end and end["complete"]),
-                "ticks": end["ticks_logged"] if end else last.last + 1 - first.first if there else 0,
-                "duration_s": span_s + 1 / reader.header["rate_hz"] if there else 0.0,
+                "ticks": end["ticks_logged"] if end else ticks,
+                "duration_s": span_s,
                 "created_unix_s": reader.header["created_unix_ns"] / 1e9,
-                "trips": events and sum(event["kind"] == "tripped" for event in events),
+                "trips": None if events is None else sum(event["kind"] == "tripped" for event in events),
                 "cut": reader.header.get("cut"),
             }
     except RtloopError:

@@ -100,11 +100,10 @@ def cut(
         asked = _asked(source, first, end, from_s, until_s)
         stretch = Stretch(source.begin(asked.first), asked.end)
         output = output or cut_path(source.path, asked.first)
-        names = [reader.path.name for reader in readers]
         header = source.header | {
             "first_tick": stretch.first,
             "ticks_expected": stretch.end - stretch.first,
-            "cut": {"first": asked.first, "end": asked.end, "files": names},
+            "cut": {"first": asked.first, "end": asked.end, "files": source.files(stretch)},
         }
         copy, ticks = _write(source, stretch, header, output, min_free_bytes, progress)
         problems = [*absent_parts(readers), *source.problems]

@@ -76,6 +76,14 @@ class Source:
                         return begin
         raise RecordingError(f"{self.path}: tick {tick}: no state of the law to begin from stands at it or before it")
 
+    def files(self, stretch: Stretch) -> list[str]:
+        """The names of the files that hold ticks of it."""
+        return [
+            seeker.reader.path.name
+            for seeker in self._seekers
+            if (first := seeker.first()) and first.first < stretch.end and seeker.reaching(stretch.first) < seeker.end
+        ]
+
     def contents(self, stretch: Stretch) -> Iterator[tuple[list[Message], Rows]]:
         """Messages of the slow topics and ticks of a stretch: chunk by chunk, in the order of the files."""
         begin = stretch.first
