@@ -19,7 +19,8 @@ export class Chart {
   constructor(host, { x = {}, scales, draw, bare = false }) {
     this.#host = host;
     this.#draw = draw;
-    for (const { key } of scales) this.#ranges[key] = [0, 1];
+    if (x.log) this.#ranges.x = [0.1, 1];
+    for (const { key, log } of scales) this.#ranges[key] = log ? [0.1, 1] : [0, 1];
     const options = {
       ...this.#size(),
       pxAlign: 1,
@@ -34,7 +35,7 @@ export class Chart {
       axes: [this.#axis({ ...x, key: "x", bare }), ...scales.map((scale, place) => this.#axis(scale, place))],
       hooks: { draw: [(plot) => this.#paint(plot, [x, ...scales])] },
     };
-    this.plot = new uPlot(options, [[1, 2], ...scales.map(() => [1, 2])], host);
+    this.plot = new uPlot(options, [this.#ranges.x, ...scales.map(() => [1, 2])], host);
     this.#watcher = new ResizeObserver(() => this.plot.setSize(this.#size()));
     this.#watcher.observe(host);
   }
@@ -122,7 +123,8 @@ export class Chart {
 
 const plainTicks = (_, ticks) => {
   const step = ticks.length > 1 ? Math.abs(ticks[1] - ticks[0]) : 1;
-  const decimals = Math.min(6, Math.max(0, Math.ceil(-Math.log10(step) - 1e-9)));
+  let decimals = 0;
+  while (decimals < 7 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6) decimals++;
   return ticks.map((tick) => tick.toFixed(decimals).replace("-", "−"));
 };
 

@@ -2,7 +2,7 @@
 
 import { command, get } from "../api.js";
 import { $, calmly, complain, make, say } from "../dom.js";
-import { fromField, significant } from "../numbers.js";
+import { fromField } from "../numbers.js";
 import { Picker } from "../picker.js";
 import { Preview } from "./preview.js";
 
@@ -84,7 +84,7 @@ export class Tuning {
     const none = value === undefined;
     $("tune-value").disabled = $("tune-slider").disabled = $("show-preview").disabled = none;
     $("tune-value").value = none ? "" : String(value);
-    say($("tune-now"), none ? "" : `now ${significant(value, 6)}`);
+    say($("tune-now"), none ? "" : `now ${Number(value.toPrecision(6))}`);
     const span = Math.abs(value || 1) * SLIDER_SPAN;
     const step = 10 ** Math.floor(Math.log10(span / 100));
     Object.assign($("tune-slider"), { step: String(Number(step.toPrecision(1))), min: String(Number(((value || 0) - span).toPrecision(6))), max: String(Number(((value || 0) + span).toPrecision(6))) });

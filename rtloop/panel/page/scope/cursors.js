@@ -31,8 +31,9 @@ export class Line {
     this.value = value;
     const [low, high] = this.#chart.range(this.#key);
     const upright = this.#key === "x";
-    this.#element.style[upright ? "left" : "top"] = `${this.#chart.at(value, this.#key, true)}px`;
-    this.#element.hidden = value < low || value > high;
+    const seen = Math.min(Math.max(value, low), high); // beyond the edge it waits there to be fetched back
+    this.#element.style[upright ? "left" : "top"] = `${this.#chart.at(seen, this.#key, true)}px`;
+    this.#element.classList.toggle("beyond", seen !== value);
     if (!this.#element.hasAttribute("role")) return;
     this.#element.setAttribute("aria-valuemin", String(low));
     this.#element.setAttribute("aria-valuemax", String(high));

@@ -36,7 +36,7 @@ export class Lanes {
     });
     for (const lane of this.lanes) {
       lane.chart = new Chart(lane.box, {
-        x: { unit: lane.bare ? "" : "s", values: timeTicks },
+        x: { values: timeTicks },
         scales: lane.scales,
         bare: lane.bare,
         draw: (chart, ctx) => this.#paint(lane, chart, ctx),

@@ -15,7 +15,7 @@ const OVERLAYS = [0, 1, 3, 7, 15, 31];
 const KEPT = "rtloop-scope";
 
 const defaults = (axes) => ({
-  signals: ["reference_um", "position_um", "drive_v"].map((name) => `${axes[0]}_${name}`),
+  signals: ["position_um", "reference_um", "drive_v"].map((name) => `${axes[0]}_${name}`),
   seconds: 0.2,
   stacked: false,
   autoscale: true,
