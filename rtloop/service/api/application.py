@@ -47,7 +47,7 @@ from rtloop.service.learning import learn
 from rtloop.service.live import LiveLaw
 from rtloop.service.measurement import Asked, Results, measure
 from rtloop.service.service import Service, State
-from rtloop.service.status import newest_signals, status
+from rtloop.service.status import newest_signals, running_configuration, status
 from rtloop.supervision.supervisor import Supervisor
 
 WATCH_HZ = 20.0
@@ -164,9 +164,10 @@ def application(service: Service) -> Starlette:
         return JSONResponse(status(service))
 
     async def get_configuration(_: Request) -> Response:
-        if service.live is None:
-            return refused(409, f"no loop is running: the service is {service.state}")
-        return JSONResponse(service.live.as_it_runs)
+        try:
+            return JSONResponse(running_configuration(service))
+        except Refused as error:
+            return refusal(error)
 
     async def get_metrics(_: Request) -> Response:
         return PlainTextResponse(metrics_text(service), media_type="text/plain; version=0.0.4")

@@ -1,0 +1,124 @@
+"""What one client sees: its wishes, fed with every tick, and the frames that are due when it can take them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rtloop.panel.stretch import Stretch
+from rtloop.panel.web.feed import Feed
+from rtloop.panel.web.frames import pack
+from rtloop.panel.web.link import Description
+from rtloop.panel.web.past import Past
+from rtloop.panel.web.scope import Scope
+from rtloop.panel.web.state import State
+from rtloop.panel.web.wishes import ViewWish, read_wishes, wish_of
+
+FRAME_S = 1 / 30
+PERIODS_S = {"state": 1 / 20, "sweep": FRAME_S}
+"""At least, between two frames of a kind."""
+MOST_REFUSALS = 16
+
+
+class Viewer:
+    """One client."""
+
+    def __init__(self, feed: Feed, state: State) -> None:
+        self._feed, self._state = feed, state
+        self._view: ViewWish | None = None
+        self._scope: Scope | None = None
+        self._held = False
+        self._refusals: list[bytes] = []
+        self._due_s = dict.fromkeys(PERIODS_S, 0.0)
+        self._makers: dict[str, Callable[[], bytes | None]] = {"state": self._state_frame, "sweep": self._sweep_frame}
+
+    # what the feed calls, under its lock
+
+    def begin(self, loop: Description) -> None:
+        """A run of a loop begins: what was wished is judged for it."""
+        if self._view is None or (self._scope is not None and self._scope.suits(loop)):
+            return
+        try:
+            self._scope = Scope(self._view, loop)
+        except ValueError as error:
+            self._scope = None
+            self._refuse("view", str(error))
+
+    def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
+        """Ticks came; `commands` are those at which one took effect."""
+        if self._scope is not None:
+            self._scope.feed(stretch, commands)
+
+    def end_run(self, past: Past | None) -> None:
+        """The run is over."""
+        if self._scope is not None and past is not None:
+            self._scope.end_run(past)
+
+    # what the client's task calls
+
+    def wish(self, text: str) -> None:
+        """Take over what a message wishes; what cannot be granted is refused by a frame, and the old one goes on."""
+        try:
+            wishes = read_wishes(text)
+        except ValueError as error:
+            self._refuse("message", str(error))
+            return
+        for name, value in wishes.items():
+            try:
+                wished = wish_of(name, value)
+                with self._feed.lock:
+                    self._grant(name, wished)
+            except ValueError as error:
+                self._refuse(name, str(error))
+
+    def due(self) -> list[bytes]:
+        """The frames that are to be sent now."""
+        now_s = time.monotonic()
+        frames, self._refusals = self._refusals, []
+        for kind, make in self._makers.items():
+            if now_s < self._due_s[kind]:
+                continue
+            with self._feed.lock:
+                frame = make()
+            if frame is not None:
+                frames.append(frame)
+                self._due_s[kind] = max(self._due_s[kind] + PERIODS_S[kind], now_s - FRAME_S)
+        return frames
+
+    def _grant(self, name: str, wish: Any) -> None:
+        """Raises ValueError for what the loop does not have."""
+        match name:
+            case "view":
+                self._show(wish)
+            case "hold":
+                self._held = wish
+            case "arm" if self._scope is not None and wish:
+                self._scope.arm()
+            case "force" if self._scope is not None and wish:
+                self._scope.force()
+
+    def _show(self, wish: ViewWish | None) -> None:
+        loop = self._feed.loop
+        if wish is None:
+            self._scope = None
+        elif loop is not None:
+            asked = Scope(wish, loop)
+            if self._scope is None or not self._scope.redrawn(wish):
+                self._scope = asked
+        self._view = wish
+
+    def _state_frame(self) -> bytes:
+        feed = self._feed
+        beside = {"unix_s": time.time(), "age_s": feed.age_s, "lost": feed.lost, "run": feed.run, "fault": feed.fault}
+        return pack("state", self._state.now | beside)
+
+    def _sweep_frame(self) -> bytes | None:
+        past = self._feed.past
+        if self._scope is None or self._held or past is None:
+            return None
+        return self._scope.frame(past)
+
+    def _refuse(self, name: str, error: str) -> None:
+        if len(self._refusals) < MOST_REFUSALS:
+            self._refusals.append(pack("refused", {"wish": name[:100], "error": error[:2000]}))
