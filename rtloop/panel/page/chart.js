@@ -4,7 +4,6 @@ import { palette } from "./palette.js";
 import { significant } from "./numbers.js";
 
 const FONT = '11px Inter, system-ui, "Segoe UI", Roboto, "Liberation Sans", Arial, sans-serif';
-const LEVEL_PX = 46;
 
 export class Chart {
   #ranges = { x: [0, 1] };
@@ -89,7 +88,7 @@ export class Chart {
       size: upright ? 54 : bare ? 2 : 26,
       gap: 4,
       font: FONT,
-      space: upright ? LEVEL_PX * 0.75 : 70,
+      space: (_plot, _axis, _low, _high, length_px) => Math.max(upright ? 34 : 70, length_px / 13),
       stroke: () => palette().text,
       grid: { show: !upright || place === 0, stroke: () => palette().grid, width: 1 },
       ticks: { show: false },
@@ -130,7 +129,7 @@ const plainTicks = (_, ticks) => {
 
 /** Labels at powers of ten alone. */
 const decades = (_, ticks) =>
-  ticks.map((tick) => (tick && Math.abs(Math.log10(tick) % 1) < 1e-6 ? (tick >= 1e4 ? `${tick / 1e3}k` : significant(tick, 1)) : ""));
+  ticks.map((tick) => (tick && Math.abs(Math.log10(tick) % 1) < 1e-6 ? (tick >= 1e6 ? `${tick / 1e6}M` : tick >= 1e4 ? `${tick / 1e3}k` : significant(tick, 1)) : ""));
 
 /** Limits of round numbers that hold `low` … `high`; those in force stay while they suit. */
 export function roundLimits(low, high, now, least = 0.02) {

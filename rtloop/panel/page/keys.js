@@ -36,14 +36,14 @@ export class Keys {
   #down(event, stop) {
     const { key, target } = event;
     if (key === " ") return this.#space(event, stop);
-    if (key === "Escape" && typed(target)) target.blur();
+    if (key === "Escape" && typed(target)) return target.blur();
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     if (key === "Enter" && target.matches?.("input[type=checkbox]")) {
       event.preventDefault();
       target.click();
     }
-    const inside = document.querySelector("dialog[open]") || target.closest?.("[role=listbox]");
-    if (typed(target) || inside || !this.letters || event.repeat) return;
+    const inside = document.querySelector("dialog:modal") || target.closest?.("[role=listbox]");
+    if (inside || event.repeat || (key !== "Escape" && (typed(target) || !this.letters))) return;
     const action = this.#actions.get(key.length === 1 ? key.toLowerCase() : key);
     if (!action) return;
     event.preventDefault();

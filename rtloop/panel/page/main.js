@@ -15,6 +15,12 @@ import { askForToken, openSession } from "./session.js";
 import { Strip } from "./strip.js";
 import { Views } from "./views/views.js";
 
+function closeHelp() {
+  if (!$("help-dialog").open) return;
+  $("help-dialog").close();
+  $("help").focus();
+}
+
 const live = new Live();
 const strip = new Strip(live);
 const drive = new Drive(live, strip);
@@ -26,8 +32,8 @@ themes($("theme"), () => {
   tuning?.arrange();
 });
 for (const id of ["port", "port-there"]) $(id).textContent = location.port || "80";
-$("help").addEventListener("click", () => $("help-dialog").showModal());
-$("close-help").addEventListener("click", () => $("help-dialog").close());
+$("help").addEventListener("click", () => ($("help-dialog").open ? closeHelp() : $("help-dialog").show())); // not modal: STOP stays in reach
+$("close-help").addEventListener("click", closeHelp);
 addEventListener("rtloop-session-lost", () => askForToken());
 
 const panel = await openSession(get);
@@ -63,3 +69,4 @@ for (const key of ["+", "="]) keys.on(key, press("longer"));
 for (const key of ["-", "−"]) keys.on(key, press("shorter"));
 for (const [place, button] of [...document.querySelectorAll("#views [data-view]:not(.narrow)")].entries()) keys.on(String(place + 1), () => button.click());
 keys.on("?", press("help"));
+keys.on("Escape", closeHelp);

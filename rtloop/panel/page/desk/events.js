@@ -9,6 +9,7 @@ export function showEvents(live) {
   live.addEventListener("events", ({ detail }) => {
     const list = $("events");
     for (const event of detail.events) {
+      if ([...list.children].some((item) => item.title === JSON.stringify(event))) continue; // said again after a break
       const { tick, kind, who, axis, what } = event;
       const tripped = kind === "tripped";
       const text = [axis, String(kind).replaceAll("_", " "), about(what ?? event)].filter(Boolean).join(" · ");

@@ -5,7 +5,7 @@ import { $, make } from "../dom.js";
 import { fixed, significant } from "../numbers.js";
 import { palette } from "../palette.js";
 
-const shift = (range) => (range ? `${fixed(range[0], 1)} … +${fixed(range[1], 1)} %` : "—");
+const shift = (range) => (range ? `${fixed(range[0], 1)}…+${fixed(range[1], 1)} %` : "—");
 const width = (range) => (range ? Math.min(-range[0], range[1]) : null);
 /** Key of the figures, its name, how it is shown, and whether more of it is better. */
 const ROWS = [
@@ -49,7 +49,7 @@ export class Preview {
   #draw() {
     this.#chart ??= new Chart($("preview-plot"), {
       x: { unit: "ms" },
-      scales: [{ key: "µm", unit: "µm, a step of 1 µm" }],
+      scales: [{ key: "µm", unit: "" }],
       draw: (chart, ctx) => this.#paint(chart, ctx),
     });
     const steps = Object.values(this.#steps).filter((step) => step?.t_ms?.length);

@@ -65,6 +65,7 @@ export class Reference {
     submitted("waveform", () => this.#upload(), "waveform-error");
     for (const button of document.querySelectorAll("[data-jog]")) button.addEventListener("click", () => this.jog(Number(button.dataset.jog)));
     live.addEventListener("state", ({ detail }) => {
+      if (!Number.isFinite(this.#now[this.axis]?.reference_um) && detail.axes) $("setpoint").value = $("setpoint-slider").value = (detail.axes[this.axis]?.reference_um ?? 0).toFixed(2);
       this.#now = detail.axes ?? this.#now;
       if (detail.mode === this.#mode) return;
       this.#mode = detail.mode;

@@ -31,7 +31,10 @@ export class Tuning {
       $("tune-value").value = $("tune-slider").value;
       this.#previewSoon();
     });
-    $("tune-value").addEventListener("input", () => this.#withdraw());
+    $("tune-value").addEventListener("input", () => {
+      this.#withdraw();
+      $("tune-slider").value = $("tune-value").value.replace(",", ".");
+    });
     $("tune").addEventListener("submit", (event) => {
       event.preventDefault();
       this.#ask(() => ({ [this.#key.value]: fromField($("tune-value")) }));

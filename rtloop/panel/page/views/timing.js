@@ -35,7 +35,7 @@ export class Timing {
   arrange() {
     this.#chart?.destroy();
     this.#chart = new Chart($("timing-plot"), {
-      x: { unit: "late, µs", log: true, values: (_, ticks) => ticks.map((tick) => (Math.abs(Math.log10(tick) % 1) < 1e-6 ? String(Number(tick.toPrecision(1))) : "")) },
+      x: { unit: "late, µs", log: true },
       scales: [{ key: "ticks", unit: "ticks", log: true }],
       draw: (chart, ctx) => this.#paint(chart, ctx),
     });
@@ -67,11 +67,13 @@ export class Timing {
     const ground = chart.at(0.5, "ticks");
     const bound = (edge) => chart.at(Math.min(Math.max(edge, lowest), highest), "x");
     ctx.fillStyle = palette().traces[0];
+    ctx.globalAlpha = 0.8;
     for (let bar = 0; bar < counts.length; bar++) {
       if (!(counts[bar] > 0)) continue;
       const [left, right, top] = [bound(edges_us[bar]), bound(edges_us[bar + 1]), chart.at(counts[bar], "ticks")];
       ctx.fillRect(left, top, Math.max(right - left - devicePixelRatio, devicePixelRatio), ground - top);
     }
+    ctx.globalAlpha = 1;
     ctx.lineWidth = devicePixelRatio;
     ctx.strokeStyle = palette().strong;
     ctx.setLineDash([4 * devicePixelRatio, 3 * devicePixelRatio]);

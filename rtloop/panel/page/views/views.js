@@ -45,7 +45,7 @@ export class Views {
     if (name !== "scope") this.#beside = name;
     const other = large.matches ? this.#beside : name;
     for (const button of document.querySelectorAll("#views [data-view]")) {
-      const seen = button.dataset.view === name || (large.matches && button.dataset.view === other);
+      const seen = button.dataset.view === other || (large.matches && button.dataset.view === "scope");
       if (seen) button.setAttribute("aria-current", "true");
       else button.removeAttribute("aria-current");
     }
