@@ -67,14 +67,16 @@ class Crossing:
 class Edge(Condition):
     """The source reaches `level`, after having been more than `hysteresis` away from it on the other side."""
 
-    def __init__(self, source: str, level: float, slope: Slope = Slope.RISING, hysteresis: float = 0.0) -> None:
+    def __init__(self, source: str, level: float, slope: Slope | str = Slope.RISING, hysteresis: float = 0.0) -> None:
+        if slope not in [*Slope]:
+            raise ValueError(f"trigger slope: {slope!r}; {', '.join(Slope)} are allowed")
         _require_finite("trigger level", level)
         _require_finite("trigger hysteresis", hysteresis)
         if hysteresis < 0:
             raise ValueError(f"trigger hysteresis: {hysteresis:g}; 0 or more is allowed")
         self.source, self._level, self._hysteresis = source, level, hysteresis
-        self._rising = Crossing() if slope is not Slope.FALLING else None
-        self._falling = Crossing() if slope is not Slope.RISING else None
+        self._rising = Crossing() if slope != Slope.FALLING else None
+        self._falling = Crossing() if slope != Slope.RISING else None
 
     def find(self, values: Real, gap: bool) -> Places:
         """Where the level is reached."""

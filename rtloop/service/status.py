@@ -30,7 +30,7 @@ def status(service: Service) -> dict[str, Any]:
         "lock": service.lock.held,
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
-        "recording": {} if supervisor is None else recording_state(supervisor.block),
+        "recording": {} if supervisor is None else recording_state(supervisor.block) | supervisor.recorder.written,
         "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
         "restarts": len(service.results),
     }

@@ -116,6 +116,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> dict[str, Any]:
         "parts": [str(reader.path) for reader in readers],
         "name": header.get("name"),
         "ticks_expected": header.get("ticks_expected"),
+        "cut": header.get("cut"),
         "ticks_logged": totals.ticks,
         "ticks_lost": lost,
         "periods_missed": totals.periods_missed,
