@@ -18,7 +18,7 @@ import uvicorn
 from starlette.applications import Starlette
 
 import rtloop
-from rtloop.panel.web.aside import Aside, Crowded, Failed
+from rtloop.panel.shelf.aside import Aside, Crowded, Failed
 from rtloop.panel.web.link import Service
 from rtloop.panel.web.recordings import routes
 from rtloop.recording.replay.replay import replay
@@ -236,7 +236,7 @@ def test_sweeps(panel: Panel, captured: dict[str, Any]):
 
 
 def test_few_at_a_time(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rtloop.panel.web.aside.MOST_WAITING", 2)
+    monkeypatch.setattr("rtloop.panel.shelf.aside.MOST_WAITING", 2)
 
     async def many() -> list[Any]:
         aside = Aside()

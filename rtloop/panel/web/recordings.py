@@ -22,11 +22,11 @@ from starlette.routing import BaseRoute, Route
 from rtloop.configuration.file import describe
 from rtloop.errors import RtloopError, UnavailableError
 from rtloop.panel.capture import Run, present_run
-from rtloop.panel.web.aside import Aside, Crowded
+from rtloop.panel.shelf.aside import Aside, Crowded
+from rtloop.panel.shelf.reference import Wanted, sweep
+from rtloop.panel.shelf.shelf import Shelf
 from rtloop.panel.web.link import Service
 from rtloop.panel.web.proxy import limited_body
-from rtloop.panel.web.reference import Wanted, sweep
-from rtloop.panel.web.shelf import Shelf
 from rtloop.recording.file.ticks import LARGEST
 
 READING_AT_A_TIME = 2

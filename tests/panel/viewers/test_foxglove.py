@@ -26,9 +26,9 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web import cdr
-from rtloop.panel.web.digest import Digest
-from rtloop.panel.web.foxglove import MAX_VIEWERS, PATH, PROTOCOLS, Foxglove, viewers_token
+from rtloop.panel.viewers import cdr
+from rtloop.panel.viewers.digest import Digest
+from rtloop.panel.viewers.foxglove import MAX_VIEWERS, PATH, PROTOCOLS, Foxglove, viewers_token
 from tests.faults.evidence import wait_for
 
 NAMES = ("tick", "x_position_um", "x_drive_v", "y_position_um")
@@ -156,7 +156,7 @@ class Server:
 
     def __init__(self) -> None:
         self.feed = Feed()
-        foxglove = Foxglove(self.feed, TOKEN, "lab")  # type: ignore[arg-type]
+        foxglove = Foxglove(self.feed, viewers_token(TOKEN), "lab")  # type: ignore[arg-type]
         listening = socket.create_server(("127.0.0.1", 0))
         self.address = f"ws://127.0.0.1:{listening.getsockname()[1]}{PATH}?token={viewers_token(TOKEN)}"
         config = uvicorn.Config(Starlette(routes=[foxglove.route]), log_level="critical", lifespan="off")
@@ -182,10 +182,10 @@ def server() -> Iterator[Server]:
     server.close()
 
 
-def begun(viewer: ClientConnection) -> dict[str, dict[str, Any]]:
+def begun(viewer: ClientConnection, name: str = "lab") -> dict[str, dict[str, Any]]:
     """What is advertised, by topic."""
     info = json.loads(viewer.recv(10))
-    assert (info["op"], info["name"], info["capabilities"]) == ("serverInfo", "lab", [])
+    assert (info["op"], info["name"], info["capabilities"]) == ("serverInfo", name, [])
     channels: dict[str, dict[str, Any]] = {}
     while len(channels) < 2:
         said = json.loads(viewer.recv(10))
@@ -297,7 +297,7 @@ def test_other_protocols_and_more_viewers(server: Server):
     ],
 )
 def test_who_is_let_in(server: Server, query: str, let_in: bool):
-    foxglove = Foxglove(server.feed, TOKEN)  # type: ignore[arg-type]
+    foxglove = Foxglove(server.feed, viewers_token(TOKEN))  # type: ignore[arg-type]
     scope = {"type": "websocket", "path": PATH, "query_string": query.encode()}
     assert foxglove.admits(scope) is let_in
     assert not foxglove.admits(scope | {"type": "http"})

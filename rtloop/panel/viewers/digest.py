@@ -40,7 +40,7 @@ class Digest:
             self.generation += 1
         self._open = None
 
-    def feed(self, stretch: Stretch, _: Sequence[int]) -> None:
+    def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
         """Ticks came."""
         rows = stretch.rows[:, self._columns]
         if len(rows) == 0:
@@ -51,7 +51,7 @@ class Digest:
             count, lost = count + before.ticks, lost + before.lost
         self._open = Taken(stretch.end - 1, count, lost, np.column_stack([low, high, rows[-1]]))
 
-    def end_run(self, _: Past) -> None:
+    def end_run(self, past: Past) -> None:
         """The run is over: what was not taken is gone with it."""
         self._open = None
 

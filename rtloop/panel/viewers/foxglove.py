@@ -26,8 +26,8 @@ from starlette.routing import WebSocketRoute
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from rtloop.panel.web import cdr
-from rtloop.panel.web.digest import Digest, Taken
+from rtloop.panel.viewers import cdr
+from rtloop.panel.viewers.digest import Digest, Taken
 from rtloop.panel.web.feed import Feed
 from rtloop.panel.web.live import TAKE_S
 
@@ -42,7 +42,7 @@ WARNING = 1
 
 
 def viewers_token(token: str) -> str:
-    """The token that lets viewers in: who learns it from an address cannot drive."""
+    """What lets viewers in, made of the panel's token: who learns it from an address cannot drive."""
     return hmac.new(token.encode(), b"viewers", hashlib.sha256).hexdigest()[:32]
 
 
@@ -61,10 +61,10 @@ EVENTS = Channel(1, "/events", cdr.EVENT, cdr.event_schema())
 
 
 class Foxglove:
-    """The endpoint, for viewers whose address has the token made of `token`."""
+    """The endpoint, for viewers whose address has `token`, that of `viewers_token`."""
 
     def __init__(self, feed: Feed, token: str, name: str = "rtloop") -> None:
-        self._feed, self._name, self._token = feed, name, viewers_token(token)
+        self._feed, self._name, self._token = feed, name, token
         self._viewers = 0
 
     @property
