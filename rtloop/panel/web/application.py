@@ -19,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from rtloop.errors import RtloopError
 from rtloop.panel.viewers.foxglove import Foxglove
+from rtloop.panel.web import recordings
 from rtloop.panel.web.feed import Feed
 from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Live
@@ -84,11 +85,12 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
 
     routes: Sequence[BaseRoute] = [
         Route("/", index),
-        Mount("/page", Pages(directory=PAGE, check_dir=False)),
+        Mount("/page", Pages(directory=PAGE)),
         Route("/session", session, methods=["POST"]),
         Route("/api/panel", panel),
         Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
+        *recordings.routes(service, lambda: feed.run),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
     guard = Middleware(Guard, sessions=sessions)
