@@ -35,7 +35,7 @@ PATH = "/foxglove"
 PROTOCOLS = ("foxglove.websocket.v1", "foxglove.sdk.v1")
 RATE_HZ, EVENTS_HZ = 50.0, 8.0
 """Together less than the 60 messages a second above which viewers warn."""
-MAX_VIEWERS, MAX_SUBSCRIPTIONS = 4, 16
+MAX_VIEWERS = 4
 REQUESTS_PER_S = 20.0
 MESSAGE_DATA = struct.Struct("<BIQ")
 WARNING = 1
@@ -154,8 +154,8 @@ class _Viewer:
         for number, channel in asked:
             if channel not in known:
                 return f"channel {channel}: {', '.join(map(str, sorted(known)))} are advertised"
-            if number in self._subscribed or len(self._subscribed) >= MAX_SUBSCRIPTIONS or not 0 <= number < 1 << 32:
-                return f"subscription {number}: a new number below 2**32 is needed, {MAX_SUBSCRIPTIONS} at most"
+            if number in self._subscribed or channel in self._subscribed.values() or not 0 <= number < 1 << 32:
+                return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
             self._subscribed[number] = channel
         return None
 

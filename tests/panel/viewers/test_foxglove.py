@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import os
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 import uvicorn
 from starlette.applications import Starlette
+from starlette.websockets import WebSocket
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -268,6 +270,41 @@ def test_what_viewers_cannot(server: Server, message: Any):
         said = json.loads(viewer.recv(10))
         assert (said["op"], said["level"], bool(said["message"])) == ("status", 1, True)
     wait_for(lambda: not server.feed.viewers, "its end")
+
+
+def test_who_takes_nothing_is_dropped(server: Server, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rtloop.panel.viewers.foxglove.TAKE_S", 0.2)
+    told: list[dict[str, Any]] = []
+
+    async def serve() -> None:
+        advertised = asyncio.Event()
+        said = iter([{"type": "websocket.connect"}])
+
+        async def receive() -> dict[str, Any]:
+            if (first := next(said, None)) is not None:
+                return first
+            await advertised.wait()
+            if told[-1].get("text", "").count("/live"):
+                told.append({})
+                asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 2}]}
+                return {"type": "websocket.receive", "text": json.dumps(asked)}
+            return await asyncio.get_running_loop().create_future()
+
+        async def send(message: Any) -> None:
+            told.append(message)
+            if "/live" in message.get("text", ""):
+                advertised.set()
+            if "bytes" in message:
+                await asyncio.get_running_loop().create_future()  # its buffers are full
+
+        scope = {"type": "websocket", "path": PATH, "subprotocols": [PROTOCOLS[0]], "headers": [], "query_string": b""}
+        viewer = WebSocket(scope, receive, send)
+        await asyncio.wait_for(Foxglove(server.feed, "").serve(viewer), 30)  # type: ignore[arg-type]
+
+    asyncio.run(serve())
+    assert sum("bytes" in message for message in told) == 1
+    assert told[-1]["type"] == "websocket.close"
+    assert not server.feed.viewers
 
 
 def test_other_protocols_and_more_viewers(server: Server):
