@@ -18,6 +18,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
 from rtloop.errors import RtloopError
+from rtloop.panel.viewers.foxglove import Foxglove
 from rtloop.panel.web import recordings
 from rtloop.panel.web.feed import Feed
 from rtloop.panel.web.link import Service
@@ -43,8 +44,8 @@ class Pages(StaticFiles):
         return response
 
 
-def application(service: Service, sessions: Sessions) -> Starlette:
-    """The panel of a service."""
+def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
+    """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
     feed, state, tries = Feed(service), State(service.client), Rate(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
@@ -92,4 +93,8 @@ def application(service: Service, sessions: Sessions) -> Starlette:
         *recordings.routes(service, lambda: feed.run),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
-    return Starlette(routes=routes, middleware=[Middleware(Guard, sessions=sessions)], lifespan=lifespan)
+    guard = Middleware(Guard, sessions=sessions)
+    if viewers_token is not None:
+        foxglove = Foxglove(feed, viewers_token)
+        routes, guard = [*routes, foxglove.route], Middleware(Guard, sessions=sessions, also=foxglove.admits)
+    return Starlette(routes=routes, middleware=[guard], lifespan=lifespan)
