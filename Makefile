@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run test browser bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -18,6 +18,12 @@ test: $(READY)
 	$(BIN)/lint-imports
 	$(BIN)/python -m rtloop.commands.warm
 	$(BIN)/pytest -n 2 --dist loadfile
+
+# What the tests of the panel's page need: Debian's Chromium (as root), Playwright, and axe, which judges accessibility.
+browser: $(READY)
+	command -v chromium >/dev/null || apt-get install --yes chromium
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[browser]'
+	npm install --prefix $(VENV)/lib --no-save --silent axe-core@4 || echo "axe-core could not be installed: its test will be skipped"
 
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)
