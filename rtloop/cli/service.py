@@ -11,6 +11,8 @@ import click
 
 from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
 
+SECTION = click.Choice(["controller", "limits", "interlocks", "prefilter", "model"])
+
 
 @click.command()
 @CONFIG
@@ -207,7 +209,7 @@ def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repe
 
 @ctl.command()
 @click.argument("axis")
-@click.argument("section", type=click.Choice(["controller", "limits", "interlocks", "prefilter", "model"]))
+@click.argument("section", type=SECTION)
 @click.argument("values")
 @click.pass_context
 @fails_clearly
@@ -218,6 +220,29 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
     """
     body = {"axis": axis, "section": section, "values": _inline_table(values)}
     click.echo(json.dumps(client_of(context).post("/tune", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("section", type=SECTION)
+@click.argument("values")
+@click.pass_context
+@fails_clearly
+def preview(context: click.Context, axis: str, section: str, values: str) -> int:
+    """What `tune` would make of AXIS: margins, step, tolerated shift; changes nothing."""
+    body = {"axis": axis, "section": section, "values": _inline_table(values)}
+    click.echo(json.dumps(client_of(context).post("/preview", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.pass_context
+@fails_clearly
+def undo(context: click.Context, axis: str) -> int:
+    """Go back to before the last change of AXIS by tune or controller, bumplessly."""
+    click.echo(json.dumps(client_of(context).post("/undo", {"axis": axis})))
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mimetypes
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from rtloop.panel.web.feed import Feed
 from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Live
 from rtloop.panel.web.loop import loop_for_pages
+from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy, decoded, limited_body
 from rtloop.panel.web.rates import Rate
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
@@ -84,6 +86,7 @@ def application(service: Service, sessions: Sessions) -> Starlette:
         Mount("/page", Pages(directory=PAGE, check_dir=False)),
         Route("/session", session, methods=["POST"]),
         Route("/api/panel", panel),
+        Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.engine.messages import Kind
+from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import RtloopError
 from rtloop.panel.reader import Reader
 from rtloop.panel.stretch import Stretch
+from rtloop.panel.web.events import Events
 from rtloop.panel.web.link import Description, Service
 from rtloop.panel.web.past import Past, ticks_kept
+from rtloop.panel.web.timing import Timing
 
 if TYPE_CHECKING:
     from rtloop.panel.web.viewer import Viewer
@@ -38,12 +40,16 @@ class Feed:
         self.loop: Description | None = None
         """That is read; None before there was one."""
         self.past: Past | None = None
+        self.timing: Timing | None = None
+        self.events = Events(service)
         self.fault: str | None = "nothing is read yet"
         """Why nothing can be read; None while it can."""
         self._reader: Reader | None = None
         self._viewers: list[Viewer] = []
         self._caught_up = -1
         """The run of which nothing was left to read."""
+        self._early: Messages = np.zeros(0, MESSAGE)
+        """Events whose ticks have not been read yet."""
         self._moved_s: float | None = None
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="feed", daemon=True)
@@ -105,7 +111,6 @@ class Feed:
             block = self._service.describe().block
             self._reader = Reader(block, lambda: self._service.describe_anew().names)
         reader = self._reader
-        ended = reader.messages()
         while (stretch := reader.read()) is not None:
             if stretch.run == self._caught_up:
                 self._moved_s = time.monotonic()
@@ -114,27 +119,37 @@ class Feed:
                 loop = self._service.describe()
                 with self.lock:
                     self._begin(loop)
-                    self._take(stretch, messages)
             else:
-                with self.lock:
-                    self._take(stretch, np.concatenate([ended, messages]))
-            ended = messages[:0]
+                messages = np.concatenate([self._early, messages])
+            with self.lock:
+                self._take(stretch, messages)
+            self._tell_events(messages)
+            self._early = messages[:0]
+        self._early = np.concatenate([self._early, reader.messages()])
         self._caught_up = self.run
+
+    def _tell_events(self, messages: Messages) -> None:
+        """Who asked is asked of the service before the lock is taken."""
+        if self.loop is not None and len(messages):
+            self.events.take(messages, self.loop, self.run)
 
     def _begin(self, loop: Description) -> None:
         """Another run."""
         before = self.loop
-        for viewer in self._viewers:
-            viewer.end_run(self.past)
+        if self.past is not None:
+            for viewer in self._viewers:
+                viewer.end_run(self.past)
         if self.past is None or before is None or (before.names, before.rate_hz) != (loop.names, loop.rate_hz):
             self.past = Past(loop.names, ticks_kept(len(loop.names), loop.rate_hz))
-        self.loop = loop
+        self.loop, self.timing = loop, Timing(loop)
         for viewer in self._viewers:
             viewer.begin(loop)
 
     def _take(self, stretch: Stretch, messages: Messages) -> None:
         assert self.past is not None
+        assert self.timing is not None
         commands = messages["tick"][messages["kind"] < Kind.REFUSED].tolist()
         self.past.take(stretch)
+        self.timing.feed(stretch)
         for viewer in self._viewers:
             viewer.feed(stretch, commands)

@@ -60,6 +60,11 @@ class Past:
         """The tick behind the newest one."""
         return self.history.end
 
+    @property
+    def begin(self) -> int:
+        """The first tick that can be kept still."""
+        return max(self.end - self._blocks * BLOCK, 0)
+
     def take(self, stretch: Stretch) -> None:
         """Add what was read. Raises ValueError, of an unknown signal."""
         history = self.history
@@ -70,6 +75,10 @@ class Past:
         values = history.between(first * BLOCK, end * BLOCK).reshape(len(history.signals), -1, BLOCK)
         places = np.arange(first, end) % self._blocks
         self._low[:, places], self._high[:, places] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
+
+    def values(self, signals: Sequence[str], first: int, end: int) -> Real:
+        """Every tick (signals, end − first); NaN for those that are not there. Raises ValueError."""
+        return self.history.between(first, end, [index_of(name, self.history.signals) for name in signals])
 
     def points(self, signals: Sequence[str], first: int, end: int, pixels: int) -> Points:
         """Of ticks `first` … `end` − 1 on `pixels` pixels; NaN for ticks that are lost, too old or still to come.

@@ -66,9 +66,9 @@ class Scope:
         """Whether it can go on with that loop."""
         return (loop.names, loop.rate_hz) == (self._names, self._rate_hz)
 
-    def redrawn(self, wish: ViewWish) -> bool:
+    def redrawn(self, wish: ViewWish, loop: Description) -> bool:
         """Take over `wish` where it differs by signals and pixels alone, which the trigger does not know of."""
-        if (wish.seconds, wish.trigger) != (self.wish.seconds, self.wish.trigger):
+        if (wish.seconds, wish.trigger) != (self.wish.seconds, self.wish.trigger) or not self.suits(loop):
             return False
         self.wish, self._shown = wish, None
         return True
