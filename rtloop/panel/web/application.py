@@ -18,6 +18,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
 from rtloop.errors import RtloopError
+from rtloop.panel.web import recordings
 from rtloop.panel.web.feed import Feed
 from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Live
@@ -83,11 +84,12 @@ def application(service: Service, sessions: Sessions) -> Starlette:
 
     routes: Sequence[BaseRoute] = [
         Route("/", index),
-        Mount("/page", Pages(directory=PAGE, check_dir=False)),
+        Mount("/page", Pages(directory=PAGE)),
         Route("/session", session, methods=["POST"]),
         Route("/api/panel", panel),
         Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
+        *recordings.routes(service, lambda: feed.run),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
     return Starlette(routes=routes, middleware=[Middleware(Guard, sessions=sessions)], lifespan=lifespan)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import RtloopError
-from rtloop.panel.reader import Reader
+from rtloop.panel.reader import MOST_TICKS, Reader
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.web.events import Events
 from rtloop.panel.web.link import Description, Service
@@ -106,7 +106,7 @@ class Feed:
         return POLL_S if self._viewers else IDLE_S
 
     def _read_all(self) -> None:
-        """All ticks that are there. Raises RtloopError, ValueError."""
+        """The ticks that are there, without waiting for those that come meanwhile. Raises RtloopError, ValueError."""
         if self._reader is None:
             block = self._service.describe().block
             self._reader = Reader(block, lambda: self._service.describe_anew().names)
@@ -125,6 +125,8 @@ class Feed:
                 self._take(stretch, messages)
             self._tell_events(messages)
             self._early = messages[:0]
+            if len(stretch) < MOST_TICKS:
+                break
         self._early = np.concatenate([self._early, reader.messages()])
         self._caught_up = self.run
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
+import anyio
 import anyio.to_thread
-from anyio import CapacityLimiter
+from anyio import CancelScope, CapacityLimiter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -20,6 +21,10 @@ TAKE_S = 10.0
 WISHES_PER_S = 50.0
 BUILDERS = 2
 """Threads that make frames, for all clients."""
+CLOSE_S = 1.0
+ENDS = (WebSocketDisconnect, TimeoutError, RuntimeError, OSError)
+"""How a client's going shows, or its taking nothing."""
+Work = Callable[[WebSocket, Viewer], Awaitable[None]]
 
 
 class Stream(WebSocketsSansIOProtocol):
@@ -28,7 +33,7 @@ class Stream(WebSocketsSansIOProtocol):
     async def run_asgi(self) -> None:
         """Serve it, then end it."""
         await super().run_asgi()
-        self.loop.call_later(1.0, self.transport.abort)
+        self.loop.call_later(CLOSE_S, self.transport.abort)
 
 
 class Live:
@@ -50,17 +55,21 @@ class Live:
             await socket.accept()
             self._feed.join(viewer)
             try:
-                tasks = {asyncio.create_task(work(socket, viewer)) for work in (self._listen, self._tell)}
-                _, pending = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-                for task in pending:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
+                async with anyio.create_task_group() as both:
+                    for work in (self._listen, self._tell):
+                        both.start_soon(self._until_its_end, work, socket, viewer, both.cancel_scope)
             finally:
                 self._feed.leave(viewer)
+            with suppress(*ENDS), anyio.move_on_after(CLOSE_S):
+                await socket.close(1001)
         finally:
             self._streams -= 1
-            with suppress(RuntimeError, OSError, WebSocketDisconnect, TimeoutError):
-                await asyncio.wait_for(socket.close(1001), 1.0)
+
+    async def _until_its_end(self, work: Work, socket: WebSocket, viewer: Viewer, both: CancelScope) -> None:
+        """The end of one is the end of the other."""
+        with suppress(*ENDS):
+            await work(socket, viewer)
+        both.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
         while True:
@@ -68,13 +77,14 @@ class Live:
             if message["type"] == "websocket.disconnect":
                 return
             await anyio.to_thread.run_sync(viewer.wish, message.get("text") or "", limiter=self._limiter)
-            await asyncio.sleep(1 / WISHES_PER_S)
+            await anyio.sleep(1 / WISHES_PER_S)
 
     async def _tell(self, socket: WebSocket, viewer: Viewer) -> None:
-        clock = asyncio.get_running_loop().time
+        clock = anyio.current_time
         due_s = clock()
         while True:
             for frame in await anyio.to_thread.run_sync(viewer.due, limiter=self._limiter):
-                await asyncio.wait_for(socket.send_bytes(frame), TAKE_S)
+                with anyio.fail_after(TAKE_S):
+                    await socket.send_bytes(frame)
             due_s = max(due_s + FRAME_S, clock())
-            await asyncio.sleep(due_s - clock())
+            await anyio.sleep(max(due_s - clock(), 0.0))
