@@ -10,21 +10,24 @@ from typing import Any
 import click
 
 from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
+from rtloop.cli.panel import beside, with_panel
 
 SECTION = click.Choice(["controller", "limits", "interlocks", "prefilter", "model"])
 
 
 @click.command()
 @CONFIG
+@with_panel
 @fails_clearly
-def serve(config: Path) -> int:
+def serve(config: Path, panel: bool, panel_port: int) -> int:
     """Run the loop of CONFIG as a daemon with a control API.
 
     It tells systemd how it is, and ends when it is told to.
     """
     from rtloop.service.daemon import serve as serve_configuration
 
-    return serve_configuration(config)
+    with beside(config, panel, panel_port):
+        return serve_configuration(config)
 
 
 @click.command()

@@ -35,6 +35,13 @@ class Stream(WebSocketsSansIOProtocol):
         await super().run_asgi()
         self.loop.call_later(CLOSE_S, self.transport.abort)
 
+    def handle_parser_exception(self) -> None:
+        """End what is no WebSocket, at once where it never was one."""
+        if self.conn.close_sent is None:
+            self.transport.abort()
+        else:
+            super().handle_parser_exception()
+
 
 class Live:
     """The endpoint."""

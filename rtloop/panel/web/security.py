@@ -89,8 +89,8 @@ class Guard:
         host, origin = headers.get("host", ""), headers.get("origin")
         if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:
             return 403, f"host {host[:100]!r}: 127.0.0.1 and localhost are allowed; from elsewhere go through ssh -L"
-        if origin is not None and origin.lower() != f"http://{host.lower()}":
-            return 403, f"origin {origin[:100]!r}: http://{host} is allowed"
+        if len(headers.getlist("origin")) > 1 or (origin is not None and origin.lower() != f"http://{host.lower()}"):
+            return 403, f"origin {str(origin)[:100]!r}: http://{host} is allowed"
         if origin is None:
             same = headers.get("sec-fetch-site") == "same-origin"
             if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not same):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import secrets
 import signal
@@ -45,7 +46,8 @@ def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str]
     token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else token_of(token_file)
     listener = _listen(port)
     port = listener.getsockname()[1]
-    os.nice(NICE)
+    with contextlib.suppress(OSError):
+        os.nice(NICE)
     address = f"http://{HOST}:{port}/#token={token}"
     say(address)
     if opens:

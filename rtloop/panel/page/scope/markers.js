@@ -13,6 +13,7 @@ export class Markers {
   #lines = [];
   #valueOf;
   #levels = null;
+  #shown = "";
   #changed;
   #setLevel;
   #view = null;
@@ -53,6 +54,7 @@ export class Markers {
   /** Put them where they belong on the axes as they are now. */
   place() {
     for (const { line, value, says } of this.#lines) line.place(value(), says(value()));
+    if (this.times) this.#say();
   }
 
   #within([from, to]) {
@@ -80,17 +82,17 @@ export class Markers {
     }
     const shown = this.#lanes.of(this.#valueOf.value);
     if (!shown) return;
-    this.#levels = this.#within(this.#lanes.limits.get(`${shown.lane.id}/${shown.key}`) ?? [-1, 1]);
+    this.#levels = null;
+    this.#shown = `${shown.lane.id}/${shown.key}`;
     for (const [number, text] of ["1", "2"].entries()) {
       const moved = (value) => this.#moved(this.#levels, number, value);
-      this.#add(shown.lane.chart, { key: shown.key, name: `Cursor ${text}`, text, moved }, () => this.#levels[number], (value) => `${quantity(value, shown.key)} ${shown.key}`);
+      const level = () => (this.#levels ??= this.#within(this.#lanes.limits.get(this.#shown)))[number];
+      this.#add(shown.lane.chart, { key: shown.key, name: `Cursor ${text}`, text, moved }, level, (value) => `${quantity(value, shown.key)} ${shown.key}`);
     }
-    this.#say();
   }
 
   #moved(values, number, value) {
     values[number] = value;
-    this.#say();
     this.#changed();
   }
 
