@@ -17,11 +17,11 @@ import numpy as np
 from rtloop import load
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.trigger import Sweep
-from rtloop.panel.web.feed import Feed
-from rtloop.panel.web.link import Description, Service
-from rtloop.panel.web.past import Past
-from rtloop.panel.web.scope import Scope
-from rtloop.panel.web.wishes import wish_of
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.link import Description, Service
+from rtloop.panel.views.past import Past
+from rtloop.panel.views.scope import Scope
+from rtloop.panel.views.wishes import wish_of
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
