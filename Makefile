@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -27,6 +27,12 @@ test: $(READY)
 viewers:
 	npm install --prefix build/node --no-save --no-package-lock --no-audit --no-fund \
 		@foxglove/ws-protocol @foxglove/rosmsg @foxglove/rosmsg2-serialization ws
+
+# What the tests of the panel's page need: Debian's Chromium (as root), Playwright, and axe, which judges accessibility.
+browser: $(READY)
+	command -v chromium >/dev/null || apt-get install --yes chromium
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[browser]'
+	npm install --prefix $(VENV)/lib --no-save --silent axe-core@4 || echo "axe-core could not be installed: its test will be skipped"
 
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)

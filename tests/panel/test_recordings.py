@@ -19,7 +19,7 @@ from starlette.applications import Starlette
 
 import rtloop
 from rtloop.panel.shelf.aside import Aside, Crowded, Failed
-from rtloop.panel.web.link import Service
+from rtloop.panel.views.link import Service
 from rtloop.panel.web.recordings import routes
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench

@@ -34,6 +34,7 @@ themes($("theme"), () => {
 for (const id of ["port", "port-there"]) $(id).textContent = location.port || "80";
 $("help").addEventListener("click", () => ($("help-dialog").open ? closeHelp() : $("help-dialog").show())); // not modal: STOP stays in reach
 $("close-help").addEventListener("click", closeHelp);
+live.addEventListener("refused", ({ detail }) => strip.tell(`${detail.wish}: ${detail.error}`));
 addEventListener("rtloop-session-lost", () => askForToken());
 
 const panel = await openSession(get);
@@ -47,6 +48,16 @@ const reference = new Reference(live, panel, drive, () => tuning.read());
 tuning = new Tuning(drive, () => reference.axis);
 tuning.read();
 live.connect();
+let run = null;
+live.addEventListener("state", async ({ detail }) => {
+  if (detail.run == null || detail.run === run) return;
+  const another = run !== null;
+  run = detail.run;
+  if (!another) return;
+  const now = await get("/api/panel").catch(() => panel);
+  if (JSON.stringify(now.columns) !== JSON.stringify(panel.columns)) location.reload(); // the loop that came has other signals
+  else tuning.read();
+});
 
 const press = (id) => () => $(id).click();
 const focus = (id) => () => {

@@ -9,8 +9,8 @@ import numpy as np
 
 from rtloop.hil.modal import Real
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.past import Past
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
 from rtloop.signals import COMMON, TICK
 
 

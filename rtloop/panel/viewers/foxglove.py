@@ -28,7 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rtloop.panel.viewers import cdr
 from rtloop.panel.viewers.digest import Digest, Taken
-from rtloop.panel.web.feed import Feed
+from rtloop.panel.views.feed import Feed
 from rtloop.panel.web.live import TAKE_S
 
 PATH = "/foxglove"

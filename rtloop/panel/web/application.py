@@ -19,16 +19,16 @@ from starlette.staticfiles import StaticFiles
 
 from rtloop.errors import RtloopError
 from rtloop.panel.viewers.foxglove import Foxglove
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.link import Service
+from rtloop.panel.views.state import State
 from rtloop.panel.web import recordings
-from rtloop.panel.web.feed import Feed
-from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Live
 from rtloop.panel.web.loop import loop_for_pages
 from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy, decoded, limited_body
 from rtloop.panel.web.rates import Rate
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
-from rtloop.panel.web.state import State
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
 MOST_TOKEN_BYTES = 4096

@@ -25,7 +25,7 @@ from rtloop.panel.capture import Run, present_run
 from rtloop.panel.shelf.aside import Aside, Crowded
 from rtloop.panel.shelf.reference import Wanted, sweep
 from rtloop.panel.shelf.shelf import Shelf
-from rtloop.panel.web.link import Service
+from rtloop.panel.views.link import Service
 from rtloop.panel.web.proxy import limited_body
 from rtloop.recording.file.ticks import LARGEST
 

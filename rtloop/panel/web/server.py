@@ -17,11 +17,11 @@ import uvicorn
 
 from rtloop.errors import OutputError, UnavailableError
 from rtloop.panel.viewers.foxglove import PATH, viewers_token
+from rtloop.panel.views.link import Service
+from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
 from rtloop.panel.web.application import application
-from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions
-from rtloop.panel.web.wishes import MAX_MESSAGE_BYTES
 from rtloop.service.api.connections import Bounded
 
 HOST = "127.0.0.1"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -53,10 +54,10 @@ def launched() -> Iterator[Any]:
             browser.close()
 
 
-def panel_of(bench: Bench) -> str:
-    """Start the panel of a service; its address, with the token."""
+def panel_of(bench: Bench) -> tuple[str, subprocess.Popen[str]]:
+    """Start the panel of a service; its address, with the token, and its process."""
     said = len(bench.log())
-    bench.rtloop("panel", bench.folder / "run" / f"{bench.config.stem}.sock", "--port", "0")
+    process = bench.rtloop("panel", bench.folder / "run" / f"{bench.config.stem}.sock", "--port", "0")
     found: list[str] = []
 
     def told() -> bool:
@@ -64,7 +65,7 @@ def panel_of(bench: Bench) -> str:
         return bool(found)
 
     wait_for(told, "the panel's address", START_S)
-    return found[0]
+    return found[0], process
 
 
 def opened(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT, scheme: str = "dark") -> Any:
@@ -84,6 +85,16 @@ def said(page: Any, selector: str, text: str) -> None:
     page.wait_for_function(
         "([selector, text]) => new RegExp(text).test(document.querySelector(selector)?.textContent)",
         arg=[selector, text],
+        timeout=1000 * START_S,
+    )
+
+
+def near(page: Any, selector: str, value: float, within: float = 0.1) -> None:
+    """Wait until an element shows a number."""
+    page.wait_for_function(
+        """([selector, value, within]) =>
+        Math.abs(parseFloat(document.querySelector(selector).textContent.replace("−", "-").replace("≈", "")) - value) < within""",
+        arg=[selector, value, within],
         timeout=1000 * START_S,
     )
 

@@ -23,7 +23,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.fixture(scope="module")
 def address(bench: Bench) -> str:
     """Of its panel."""
-    return panel_of(bench)
+    return panel_of(bench)[0]
 
 
 @pytest.fixture(scope="module")

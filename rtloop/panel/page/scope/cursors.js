@@ -20,7 +20,7 @@ export class Line {
     const slider = reachable
       ? { role: "slider", tabindex: "0", "aria-label": name, "aria-orientation": upright ? "horizontal" : "vertical" }
       : { "aria-hidden": "true" };
-    this.#element = make("div", { class: `cursor ${upright ? "upright" : "level"} ${kind}`, ...slider }, reachable ? make("b", {}, text) : null);
+    this.#element = make("div", { class: `cursor ${upright ? "upright" : "level"} ${kind}`, hidden: true, ...slider }, reachable ? make("b", {}, text) : null);
     this.#element.addEventListener("pointerdown", (event) => this.#grab(event));
     this.#element.addEventListener("keydown", (event) => this.#key_down(event));
     chart.over.append(this.#element);
@@ -33,6 +33,7 @@ export class Line {
     const upright = this.#key === "x";
     const seen = Math.min(Math.max(value, low), high); // beyond the edge it waits there to be fetched back
     this.#element.style[upright ? "left" : "top"] = `${this.#chart.at(seen, this.#key, true)}px`;
+    this.#element.hidden = false;
     this.#element.classList.toggle("beyond", seen !== value);
     if (!this.#element.hasAttribute("role")) return;
     this.#element.setAttribute("aria-valuemin", String(low));

@@ -2,30 +2,17 @@
 
 import { get } from "../api.js";
 import { $, calmly, complain, make, say } from "../dom.js";
-import { duration, frequency, fromField, quantity, significant } from "../numbers.js";
+import { duration, fromField, significant } from "../numbers.js";
 import { DASHES, palette } from "../palette.js";
 import { Picker } from "../picker.js";
-import { Line } from "./cursors.js";
 import { Lanes } from "./lanes.js";
+import { Markers } from "./markers.js";
+import { remember, remembered } from "./settings.js";
 import { isDecimated, Table } from "./table.js";
 import { Trigger } from "./trigger.js";
 
 const MOST_TRACES = 8;
 const OVERLAYS = [0, 1, 3, 7, 15, 31];
-const KEPT = "rtloop-scope";
-
-const defaults = (axes) => ({
-  signals: ["position_um", "reference_um", "drive_v"].map((name) => `${axes[0]}_${name}`),
-  seconds: 0.2,
-  stacked: false,
-  autoscale: true,
-  overlay: 0,
-  trigger: {
-    mode: "auto", kind: "step", source: `${axes[0]}_reference_um`, level: 0, slope: "rising", hysteresis: 0,
-    low: -1, high: 1, threshold: 0.1, holdoff_s: 0, pre_percent: 20,
-  },
-});
-
 export class Scope {
   #live;
   #panel;
@@ -34,21 +21,21 @@ export class Scope {
   #table = new Table();
   #older = [];
   #reference = null;
-  #lines = [];
-  #times = null;
-  #levels = null;
   #exact = null;
   #drawing = false;
+  #markers;
+  #add;
+  #overlays;
   sweep = null;
   held = false;
 
   constructor(live, panel) {
     this.#live = live;
     this.#panel = panel;
-    this.#view = this.#remembered();
+    this.#view = remembered(panel);
     this.trigger = new Trigger(this.#view, panel.columns, panel.longest_s, () => this.#asked());
     this.#add = new Picker($("add-trace"), (name) => this.#traces([...this.#view.signals, name]));
-    this.#valueOf = new Picker($("value-of"), () => this.#arrangeLines());
+    this.#markers = new Markers(this.#lanes, () => this.#later(), (level) => this.trigger.setLevel(level));
     this.#overlays = new Picker($("overlay"), (count) => this.#keep({ overlay: count }));
     this.#overlays.options = OVERLAYS.map((value) => ({ value, text: value ? `+ last ${value}` : "no overlay" }));
     this.#overlays.value = this.#view.overlay;
@@ -61,7 +48,7 @@ export class Scope {
       this.#lanes.limits.clear();
       this.arrange();
     });
-    $("cursors").addEventListener("click", () => this.toggleCursors());
+    $("cursors").addEventListener("click", () => this.#markers.toggle());
     $("hold").addEventListener("click", () => this.toggleHold());
     $("force").addEventListener("click", () => live.once({ force: true }));
     $("arm-single").addEventListener("click", () => live.once({ arm: true }));
@@ -71,10 +58,6 @@ export class Scope {
     this.arrange();
     this.#ask();
   }
-
-  #add;
-  #valueOf;
-  #overlays;
 
   get view() {
     return this.#view;
@@ -103,13 +86,6 @@ export class Scope {
     this.#measureSoon();
   }
 
-  toggleCursors() {
-    const [from_s, to_s] = this.#span();
-    this.#times = this.#times ? null : [from_s + 0.25 * (to_s - from_s), from_s + 0.75 * (to_s - from_s)];
-    this.#levels = null;
-    this.#arrangeLines();
-  }
-
   /** Lay out plots and tables anew, as after a change of the theme. */
   arrange() {
     const units = Object.fromEntries(this.#panel.columns.map(({ name, unit }) => [name, unit]));
@@ -122,26 +98,13 @@ export class Scope {
     this.#add.options = [{ value: "", text: "a trace…" }, ...free.map(({ name, unit }) => ({ value: name, text: unit === "1" ? name : `${name}, ${unit}` }))];
     this.#add.value = "";
     this.#add.disabled = this.#view.signals.length >= MOST_TRACES;
-    this.#valueOf.options = this.#view.signals.map((name) => ({ value: name, text: name }));
     this.#arrangeScales();
-    this.#arrangeLines();
-  }
-
-  #remembered() {
-    const fresh = defaults(this.#panel.axes);
-    const known = (name) => this.#panel.columns.some((column) => column.name === name);
-    try {
-      const kept = JSON.parse(localStorage.getItem(KEPT)) ?? {};
-      const view = { ...fresh, ...kept, trigger: { ...fresh.trigger, ...kept.trigger } };
-      return view.signals.length && view.signals.every(known) && known(view.trigger.source) ? view : fresh;
-    } catch {
-      return fresh;
-    }
+    this.#markers.arrange(this.#view, this.#span());
   }
 
   #keep(changes) {
     Object.assign(this.#view, changes);
-    localStorage.setItem(KEPT, JSON.stringify(this.#view));
+    remember(this.#view);
     this.#later();
   }
 
@@ -154,9 +117,8 @@ export class Scope {
 
   #asked() {
     this.#older = [];
-    this.#times = this.#times && this.#span().map((end, place, ends) => ends[0] + (place ? 0.75 : 0.25) * (ends[1] - ends[0]));
     this.#keep({});
-    this.#arrangeLines();
+    this.#markers.arrange(this.#view, this.#span());
     this.#ask();
   }
 
@@ -210,7 +172,7 @@ export class Scope {
       { sweep: this.sweep, faded: 1 },
     ];
     this.#lanes.show(sweeps, this.#span(), this.#view.autoscale);
-    for (const place of this.#lines) place();
+    this.#markers.place();
     this.#number();
   }
 
@@ -228,7 +190,7 @@ export class Scope {
   }
 
   #window() {
-    return this.#times ? [...this.#times].sort((a, b) => a - b) : this.#span();
+    return this.#markers.times ? [...this.#markers.times].sort((a, b) => a - b) : this.#span();
   }
 
   #stretch() {
@@ -274,56 +236,5 @@ export class Scope {
     };
     for (const field of fields) field.addEventListener("change", read);
     return make("span", { class: "field" }, make("span", {}, name), fields[0], "…", fields[1]);
-  }
-
-  #arrangeLines() {
-    for (const line of this.lines ?? []) line.remove();
-    this.lines = [];
-    this.#lines = [];
-    const on = this.#times !== null;
-    $("cursors").setAttribute("aria-pressed", String(on));
-    $("scope").classList.toggle("no-cursors", !on);
-    const add = (chart, options, value, says) => {
-      const line = new Line(chart, options);
-      this.lines.push(line);
-      this.#lines.push(() => line.place(value(), says(value())));
-    };
-    const { trigger } = this.#view;
-    const source = this.#lanes.of(trigger.source);
-    if (trigger.mode !== "roll" && trigger.kind === "edge" && source) {
-      add(source.lane.chart, { key: source.key, name: "Trigger level", text: "T", kind: "trigger", moved: (level) => this.trigger.setLevel(level) }, () => trigger.level, (level) => quantity(level, source.key));
-    }
-    if (on) {
-      for (const [number, text] of ["A", "B"].entries()) {
-        for (const [place, lane] of this.#lanes.lanes.entries()) {
-          const moved = (time_s) => this.#moved(this.#times, number, time_s);
-          add(lane.chart, { key: "x", name: `Cursor ${text}`, text, moved, reachable: place === 0 }, () => this.#times[number], (time_s) => duration(time_s));
-        }
-      }
-      const shown = this.#lanes.of(this.#valueOf.value);
-      if (shown) {
-        const [low, high] = this.#lanes.limits.get(`${shown.lane.id}/${shown.key}`) ?? [-1, 1];
-        this.#levels = [low + 0.25 * (high - low), low + 0.75 * (high - low)];
-        for (const [number, text] of ["1", "2"].entries()) {
-          const moved = (value) => this.#moved(this.#levels, number, value);
-          add(shown.lane.chart, { key: shown.key, name: `Cursor ${text}`, text, moved }, () => this.#levels[number], (value) => `${quantity(value, shown.key)} ${shown.key}`);
-        }
-      }
-      this.#sayCursors();
-    }
-    this.#later();
-  }
-
-  #moved(values, number, value) {
-    values[number] = value;
-    this.#sayCursors();
-    this.#later();
-  }
-
-  #sayCursors() {
-    const [a, b] = this.#times;
-    const unit = this.#lanes.of(this.#valueOf.value)?.key;
-    const levels = this.#levels && unit ? ` · 1 ${quantity(this.#levels[0], unit)}, 2 ${quantity(this.#levels[1], unit)}, Δ ${quantity(this.#levels[1] - this.#levels[0], unit)} ${unit}` : "";
-    say($("measured"), `A ${duration(a)}, B ${duration(b)}, Δt ${duration(b - a)}, 1/Δt ${frequency(1 / Math.abs(b - a))}${levels}`);
   }
 }

@@ -38,7 +38,7 @@ export class Table {
     for (const [name, { trace, cells }] of this.#rows) {
       const seen = measure(sweep, name, from_s, to_s);
       const all = exact?.[name];
-      const figures = all ? { ...all, deviation: Math.sqrt(Math.max(0, all.rms ** 2 - all.mean ** 2)), exact: true } : seen;
+      const figures = all ? { ...all, deviation: all.std, exact: true } : seen;
       if (figures) figures.peak_to_peak = figures.high - figures.low;
       const about = (figure) => (figures && !figures.exact && (figure === "rms" || figure === "deviation" || figure === "mean") ? "≈" : "");
       for (const [place, figure] of FIGURES.entries()) {

@@ -37,7 +37,7 @@ export class Recordings {
     const act = (text, action) => make("button", { type: "button", "aria-label": `${text} of ${file}`, click: () => this.#try(action) }, text);
     return make("tr", { "aria-current": this.#shown === file && "true" },
       make("th", { scope: "row" }, file),
-      make("td", {}, made), make("td", {}, duration(duration_s, 3)), make("td", {}, bytes(size)),
+      make("td", {}, made), make("td", {}, duration_s == null ? "—" : duration(duration_s, 3)), make("td", {}, bytes(size)),
       make("td", {}, trips == null ? "—" : String(trips)),
       make("td", {}, [captured ? "captured" : "", complete ? "" : "growing"].filter(Boolean).join(", ")),
       make("td", {}, make("span", { class: "bar" },
@@ -94,12 +94,11 @@ export class Recordings {
 
   async #compare(file, from_s) {
     const { signals, seconds, trigger } = this.#scope.view;
-    const info = await get(address(file, "/info"));
-    const rate_hz = info.rate_hz ?? this.#scope.sweep?.rate_hz ?? 1e4;
-    const first = (info.first_tick ?? 0) + Math.round(from_s * rate_hz);
+    const asked = `/sweep?signals=${signals}&pixels=${this.#scope.pixels}`;
+    const { first: begin, rate_hz } = await getArrays(address(file, asked));
+    const first = begin + Math.round(from_s * rate_hz);
     const ticks = Math.max(1, Math.round(seconds * rate_hz));
-    const sweep = await getArrays(address(file, `/sweep?signals=${signals}&first=${first}&ticks=${ticks}&pixels=${this.#scope.pixels}`));
-    sweep.rate_hz ??= rate_hz;
+    const sweep = await getArrays(address(file, `${asked}&first=${first}&ticks=${ticks}`));
     const before = trigger.mode === "roll" ? ticks : (ticks * trigger.pre_percent) / 100;
     const begins = sweep.arrays.offset[0] ?? 0;
     sweep.arrays.offset = sweep.arrays.offset.map((offset) => offset - begins - before);

@@ -77,8 +77,7 @@ export class Xy {
     showFigures($("xy-figures"), {
       "drive now": `${fixed(drive_v.at(-1), 3)} V`,
       "position now": `${fixed(position_um.at(-1), 3)} µm`,
-      "from the model": `${fixed(furthest(this.#loop.arrays), 3)} µm at most`,
-      points: String(drive_v.length),
+      ...(this.#loop.loop_percent == null ? {} : { "width of the loop": `${fixed(this.#loop.loop_percent, 1)} %` }),
     });
   }
 
@@ -100,10 +99,4 @@ export class Xy {
     ctx.arc(chart.at(drive_v.at(-1), "x"), chart.at(position_um.at(-1), "µm"), 4.5 * ratio, 0, 2 * Math.PI);
     ctx.fill();
   }
-}
-
-/** Greatest distance in µm of the model's position from the measured one, point by point. */
-function furthest({ position_um, model_position_um }) {
-  if (!model_position_um?.length || model_position_um.length !== position_um.length) return NaN;
-  return position_um.reduce((most, value, point) => Math.max(most, Math.abs(value - model_position_um[point]) || 0), 0);
 }

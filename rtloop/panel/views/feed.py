@@ -15,10 +15,10 @@ from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import RtloopError
 from rtloop.panel.reader import MOST_TICKS, Reader
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.events import Events
-from rtloop.panel.web.link import Description, Service
-from rtloop.panel.web.past import Past, ticks_kept
-from rtloop.panel.web.timing import Timing
+from rtloop.panel.views.events import Events
+from rtloop.panel.views.link import Description, Service
+from rtloop.panel.views.past import Past, ticks_kept
+from rtloop.panel.views.timing import Timing
 
 POLL_S = 1 / 60
 IDLE_S = 0.2

@@ -8,7 +8,7 @@ from typing import Any
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
-from rtloop.panel.web.link import Description, Service
+from rtloop.panel.views.link import Description, Service
 from rtloop.recording.file.events import Event, event_of
 
 KEPT = 200
