@@ -5,11 +5,15 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run test bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
 	$(BIN)/rtloop run deploy/paper.toml --duration 10
+
+# The loop on a simulated board with its panel in the browser, until Ctrl-C; prints the address.
+demo: $(READY)
+	deploy/demo $(abspath $(BIN)/rtloop)
 
 test: $(READY)
 	$(BIN)/ruff check .
@@ -18,6 +22,17 @@ test: $(READY)
 	$(BIN)/lint-imports
 	$(BIN)/python -m rtloop.commands.warm
 	$(BIN)/pytest -n 2 --dist loadfile
+
+# Foxglove's own client and decoders, with which `make test` reads what viewers get: needs node and npm.
+viewers:
+	npm install --prefix build/node --no-save --no-package-lock --no-audit --no-fund \
+		@foxglove/ws-protocol @foxglove/rosmsg @foxglove/rosmsg2-serialization ws
+
+# What the tests of the panel's page need: Debian's Chromium (as root), Playwright, and axe, which judges accessibility.
+browser: $(READY)
+	command -v chromium >/dev/null || apt-get install --yes chromium
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[browser]'
+	npm install --prefix $(VENV)/lib --no-save --silent axe-core@4 || echo "axe-core could not be installed: its test will be skipped"
 
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)
@@ -42,6 +57,14 @@ soak-flood: $(READY)
 # Two thousand silent and slow clients and every hostile request, while an operator stops and starts: a minute.
 soak-connections: $(READY)
 	$(BIN)/python -m tests.soak.connections
+
+# Ten thousand steps of one tick's width, each to be found by the panel's trigger at its tick: ten minutes.
+soak-panel-triggers: $(READY)
+	$(BIN)/python -m tests.soak.panel_triggers
+
+# What the panel costs: lateness of a paced run with four clients and with none, in pairs, CPU, bytes: as root, some minutes.
+panel-load: $(READY)
+	$(BIN)/python -m tests.soak.panel_load
 
 soak-swaps: $(READY)
 	$(BIN)/python -m tests.soak.swaps

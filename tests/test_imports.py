@@ -16,6 +16,7 @@ HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "
     [
         ("rtloop.cli", ("numpy", "pydantic")),
         ("rtloop.service.client", ("numpy", "pydantic")),
+        ("rtloop.panel.connection", ("numpy", "pydantic")),
         ("rtloop.commands.run", ("uvicorn",)),
         ("rtloop.commands.check", ()),
         ("rtloop.commands.experiment", ("uvicorn",)),

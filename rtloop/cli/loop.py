@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds, fails_clearly, require_text
+from rtloop.cli.panel import beside, with_panel
 
 
 class Positive(click.FloatRange):
@@ -30,12 +31,30 @@ POSITIVE = Positive(0.0, 1e6, min_open=True)
 @click.option("--unpaced", is_flag=True, help="In virtual time, as fast as the machine goes (simulated hardware only).")
 @click.option("--out", type=OUTPUT, help="Folder for the recording [the configuration's].")
 @JSON
+@with_panel
 @fails_clearly
-def run(config: Path, duration_s: float | None, unpaced: bool, out: Path | None, as_json: bool) -> int:
+def run(
+    config: Path,
+    duration_s: float | None,
+    unpaced: bool,
+    out: Path | None,
+    as_json: bool,
+    panel: bool,
+    panel_port: int,
+) -> int:
     """Run the loop of CONFIG and record every tick.
 
-    Ctrl-C ramps down, finishes the recording and ends with 0.
+    Ctrl-C ramps down, finishes the recording and ends with 0. With --panel it runs as `rtloop serve` does, with a
+    control socket.
     """
+    if panel:
+        if unpaced or out is not None or as_json:
+            raise click.UsageError("--panel: not allowed with --unpaced, --out and --json")
+        require_text(config)
+        from rtloop.service.daemon import serve
+
+        with beside(config, panel, panel_port):
+            return serve(config, duration_s)
     from rtloop.supervision.interruption import Interruption
 
     require_text(config)

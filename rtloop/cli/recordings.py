@@ -13,6 +13,7 @@ import click
 
 from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds, fails_clearly
 
+TICK = click.IntRange(min=0)
 TO = click.Choice(["csv", "parquet", "npz"])
 
 
@@ -110,6 +111,42 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
 
 @click.command()
 @FILES
+@click.option("--from", "from_s", type=Seconds(zero=True), help="Seconds since the start of the run [its beginning].")
+@click.option("--until", "until_s", type=Seconds(), help="Seconds since the start of the run [its end].")
+@click.option("--from-tick", "first", type=TICK, metavar="TICK", help="The first tick, instead of --from.")
+@click.option("--until-tick", "end", type=TICK, metavar="TICK", help="The tick behind the last, instead of --until.")
+@click.option("--out", type=OUTPUT, help="The recording to write [NAME.cut-TICK.mcap beside FILE].")
+@JSON
+@fails_clearly
+def cut(
+    files: tuple[Path, ...],
+    from_s: float | None,
+    until_s: float | None,
+    first: int | None,
+    end: int | None,
+    out: Path | None,
+    as_json: bool,
+) -> int:
+    """Make a recording of a stretch of one, which replays by itself.
+
+    It begins at the newest state of the law in front of the stretch, at most a second before. FILE may still grow
+    (NAME.mcap.part); it stays as it is, and every tick is copied bit for bit.
+    """
+    from rtloop.recording.file.cut import cut as cut_recording
+    from rtloop.terminal.progress import Counter
+    from rtloop.terminal.recordings import print_cut
+
+    for seconds, tick, name in ((from_s, first, "from"), (until_s, end, "until")):
+        if seconds is not None and tick is not None:
+            raise click.UsageError(f"--{name} and --{name}-tick: one of them is allowed")
+    with Counter("ticks copied", sys.stderr) as counter:
+        report = cut_recording(files, first, end, out, from_s=from_s, until_s=until_s, progress=counter.show)
+    _show(report, as_json, print_cut)
+    return 0
+
+
+@click.command()
+@FILES
 @click.option("--to", type=TO, required=True, help="Format; parquet needs the extra of this name.")
 @click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
 @JSON
@@ -165,4 +202,4 @@ def _show(result: dict[str, Any], as_json: bool, for_people: Callable[[dict[str,
         for_people(result)
 
 
-COMMANDS = (info, replay, recover, export, plot)
+COMMANDS = (info, replay, cut, recover, export, plot)

@@ -10,19 +10,24 @@ from typing import Any
 import click
 
 from rtloop.cli.options import CONFIG, OUTPUT, fails_clearly
+from rtloop.cli.panel import beside, with_panel
+
+SECTION = click.Choice(["controller", "limits", "interlocks", "prefilter", "model"])
 
 
 @click.command()
 @CONFIG
+@with_panel
 @fails_clearly
-def serve(config: Path) -> int:
+def serve(config: Path, panel: bool, panel_port: int) -> int:
     """Run the loop of CONFIG as a daemon with a control API.
 
     It tells systemd how it is, and ends when it is told to.
     """
     from rtloop.service.daemon import serve as serve_configuration
 
-    return serve_configuration(config)
+    with beside(config, panel, panel_port):
+        return serve_configuration(config)
 
 
 @click.command()
@@ -207,7 +212,7 @@ def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repe
 
 @ctl.command()
 @click.argument("axis")
-@click.argument("section", type=click.Choice(["controller", "limits", "interlocks", "prefilter", "model"]))
+@click.argument("section", type=SECTION)
 @click.argument("values")
 @click.pass_context
 @fails_clearly
@@ -218,6 +223,29 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
     """
     body = {"axis": axis, "section": section, "values": _inline_table(values)}
     click.echo(json.dumps(client_of(context).post("/tune", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.argument("section", type=SECTION)
+@click.argument("values")
+@click.pass_context
+@fails_clearly
+def preview(context: click.Context, axis: str, section: str, values: str) -> int:
+    """What `tune` would make of AXIS: margins, step, tolerated shift; changes nothing."""
+    body = {"axis": axis, "section": section, "values": _inline_table(values)}
+    click.echo(json.dumps(client_of(context).post("/preview", body)))
+    return 0
+
+
+@ctl.command()
+@click.argument("axis")
+@click.pass_context
+@fails_clearly
+def undo(context: click.Context, axis: str) -> int:
+    """Go back to before the last change of AXIS by tune or controller, bumplessly."""
+    click.echo(json.dumps(client_of(context).post("/undo", {"axis": axis})))
     return 0
 
 

@@ -9,6 +9,7 @@ there. None of them is met at the first tick of all, for nobody knows what came 
 from __future__ import annotations
 
 import math
+from collections import deque
 from enum import StrEnum
 from typing import Protocol
 
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.modal import Real
-from rtloop.signals import COMMON, FLAGS, MODE, PERIODS_MISSED, TRIP_MASK
+from rtloop.signals import COMMON, FLAGS, MODE, PERIODS_MISSED, TICK, TRIP_MASK
 
 Places = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -66,14 +67,16 @@ class Crossing:
 class Edge(Condition):
     """The source reaches `level`, after having been more than `hysteresis` away from it on the other side."""
 
-    def __init__(self, source: str, level: float, slope: Slope = Slope.RISING, hysteresis: float = 0.0) -> None:
+    def __init__(self, source: str, level: float, slope: Slope | str = Slope.RISING, hysteresis: float = 0.0) -> None:
+        if slope not in [*Slope]:
+            raise ValueError(f"trigger slope: {slope!r}; {', '.join(Slope)} are allowed")
         _require_finite("trigger level", level)
         _require_finite("trigger hysteresis", hysteresis)
         if hysteresis < 0:
             raise ValueError(f"trigger hysteresis: {hysteresis:g}; 0 or more is allowed")
         self.source, self._level, self._hysteresis = source, level, hysteresis
-        self._rising = Crossing() if slope is not Slope.FALLING else None
-        self._falling = Crossing() if slope is not Slope.RISING else None
+        self._rising = Crossing() if slope != Slope.FALLING else None
+        self._falling = Crossing() if slope != Slope.RISING else None
 
     def find(self, values: Real, gap: bool) -> Places:
         """Where the level is reached."""
@@ -163,6 +166,24 @@ class Stepped(Condition):
         self._before = float(values[-1])
         with np.errstate(invalid="ignore", over="ignore"):  # from infinity to infinity is no step
             return np.flatnonzero(np.abs(values - before) > self._threshold)
+
+
+class Commanded(Condition):
+    """A command took effect, as the events say; `ticks` are those at which one did, in order, and are taken away."""
+
+    source = COMMON[TICK].name
+
+    def __init__(self, ticks: deque[int]) -> None:
+        self._ticks = ticks
+
+    def find(self, values: Real, gap: bool) -> Places:
+        """The ticks at which one did; the first one there is, for those that are lost."""
+        found: list[int] = []
+        while self._ticks and self._ticks[0] <= values[-1]:
+            tick = self._ticks.popleft()
+            if tick >= values[0] or gap:
+                found.append(int(np.searchsorted(values, tick)))
+        return np.unique(np.array(found, np.intp))
 
 
 def _before(values: npt.NDArray, first: float | None) -> npt.NDArray:

@@ -36,10 +36,19 @@ class History:
             row[places] = column[begin - stretch.first :]
         self.end = stretch.end
 
-    def between(self, first: int, end: int) -> Real:
-        """Values (signals, end − first), a copy; NaN for ticks that are lost, too old or still to come."""
+    def between(self, first: int, end: int, rows: Sequence[int] | None = None) -> Real:
+        """Values (signals, end − first), a copy; NaN for ticks that are lost, too old or still to come.
+
+        `rows` says which of the signals, by their places among them; all by default.
+        """
         capacity = self._values.shape[1]
-        there = np.arange(max(first, self.end - capacity), min(end, self.end))
-        values = np.full((len(self.signals), max(end - first, 0)), np.nan)
-        values[:, there - first] = self._values[:, there % capacity]
+        kept = self._values if rows is None else [self._values[row] for row in rows]
+        values = np.full((len(kept), max(end - first, 0)), np.nan)
+        begin, beyond = max(first, self.end - capacity), min(end, self.end)
+        while begin < beyond:  # twice at most: up to the end of the array, and from its beginning on
+            place = begin % capacity
+            count = min(beyond - begin, capacity - place)
+            for value, row in zip(values, kept, strict=True):
+                value[begin - first : begin - first + count] = row[place : place + count]
+            begin += count
         return values

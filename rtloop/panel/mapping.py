@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rtloop.engine.memory import DIRECTORY_BYTES
+from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 from rtloop.supervision.paths import open_block
 
@@ -26,9 +27,15 @@ class Mapping:
         """The ring of ticks; its arrays cannot be written to."""
         return Ring(*(self._array(f"ticks_{part}") for part in Ring._fields))
 
-    def _array(self, name: str) -> np.ndarray:
-        offset, dtype, shape = self._directory[name]
-        return np.frombuffer(self._map, dtype, int(np.prod(shape)), offset).reshape(shape)
+    def events(self) -> Ring:
+        """The ring of events, likewise."""
+        head, marks = (self._array(f"events_{part}") for part in ("head", "marks"))
+        return Ring(head, marks, self._array("events_slots", MESSAGE))
+
+    def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
+        offset, described, shape = self._directory[name]
+        kind = np.dtype(described) if dtype is None else dtype
+        return np.frombuffer(self._map, kind, int(np.prod(shape)), offset).reshape(shape)
 
 
 def open_mapping(path: Path) -> Mapping | None:

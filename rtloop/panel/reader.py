@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring, drain
 from rtloop.errors import UnavailableError
 from rtloop.panel.mapping import Mapping, is_at, open_mapping
@@ -14,6 +16,7 @@ from rtloop.panel.stretch import Stretch
 
 MOST_TICKS = 1 << 14
 """In one stretch, so that whoever reads a full ring can do something else in between."""
+MOST_EVENTS = 1 << 12
 CLEARANCE = 16
 """Of a full ring one part in so many, the oldest, is left to the writer, which is about to overwrite it."""
 
@@ -30,7 +33,8 @@ class Reader:
         self._mapping: Mapping | None = None
         self._ring: Ring | None = None
         self._columns: tuple[str, ...] = ()
-        self._cursor = 0
+        self._events: Ring | None = None
+        self._cursor = self._event_cursor = 0
         self.run = -1
         """Number of the run that is read, from 0 on."""
         self.lost = 0
@@ -46,6 +50,15 @@ class Reader:
             stretch = self._take()
         return stretch
 
+    def messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
+        """The next events of the run that is read, (n,) of MESSAGE; those of a tick are there before it is."""
+        found = np.zeros(MOST_EVENTS, MESSAGE)
+        if self._events is None:
+            return found[:0]
+        copied, first, _ = drain(self._events, self._event_cursor, found)
+        self._event_cursor = first + copied
+        return found[:copied]
+
     def _follow(self) -> bool:
         """Go over to the block that lies there now; False while no loop has made one."""
         mapping = open_mapping(self._path)
@@ -60,6 +73,7 @@ class Reader:
         else:
             self._cursor = 0
         self._mapping, self._ring, self._columns = mapping, ring, columns
+        self._events, self._event_cursor = mapping.events(), 0
         self.run += 1
         return True
 

@@ -13,6 +13,7 @@ from rtloop.recording.file.events import Event
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.signals import COMMON, DEADLINE, PER_AXIS
+from rtloop.signals import Signal as Column
 
 Signal = np.ndarray[Any, Any]
 SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": "Hz"}
@@ -138,7 +139,15 @@ def load(path: Files) -> Recording:
 
 def unit_of(name: str) -> str:
     """Unit of a signal by its definition, or by the end of its name where the driver defined it."""
-    for signal in (*COMMON, *PER_AXIS):
-        if name == signal.name or name.endswith(f"_{signal.name}"):
-            return signal.unit
-    return SUFFIX_UNITS.get(name.rpartition("_")[2], "")
+    return described(name).unit
+
+
+def described(name: str) -> Column:
+    """A signal of a record: its unit, and its meaning where it is one that every loop has."""
+    for signal in COMMON:
+        if name == signal.name:
+            return signal
+    for signal in PER_AXIS:
+        if name.endswith(f"_{signal.name}"):
+            return Column(name, signal.unit, f"{name.removesuffix(f'_{signal.name}')}: {signal.meaning}")
+    return Column(name, SUFFIX_UNITS.get(name.rpartition("_")[2], ""), "")

@@ -1,4 +1,4 @@
-"""Another law, built in a process of its own: one that takes too long is killed, and whoever asked is told.
+"""Another law, built and judged in a process of its own: one that takes too long is killed, and whoever asked is told.
 
 The process is started once the loop runs, so that it does not delay the loop, and waits; a killed one is replaced by
 the next change. It reads pickled configurations on its stdin and writes pickled answers to its stdout, and ends with
@@ -16,17 +16,19 @@ import subprocess
 import sys
 import threading
 import time
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.service.preview import Figures, figures
 
 BUILD_S = 10.0
 """A law that is not built and verified within this is refused."""
 START_S = 120.0
 _LENGTH = struct.Struct("<Q")
+Job = Literal["prepare", "figures"]
 
 
 class Builder:
@@ -63,14 +65,21 @@ class Builder:
 
     def prepare(self, configuration: Configuration) -> Prepared:
         """As `configuration.prepare`. Raises ConfigError, DriverError, UnavailableError where it takes too long."""
+        return self._done("prepare", configuration)
+
+    def figures(self, configuration: Configuration, number: int) -> Figures:
+        """As `preview.figures`, of a configuration that is prepared first. Raises as `prepare`."""
+        return self._done("figures", configuration, number)
+
+    def _done(self, job: Job, configuration: Configuration, *arguments: Any) -> Any:
         with self._lock:
             self._start()
             if not self._ready:
                 self._answer(START_S)
                 self._ready = True
-            self._send(pickle.dumps(configuration))
+            self._send(pickle.dumps((job, configuration, *arguments)))
             kind, value = self._answer(self.build_s)
-        if kind == "prepared":
+        if kind == "done":
             return value
         if kind == "faults":
             raise ConfigError(configuration.name, value)
@@ -127,6 +136,11 @@ def prepare_limited(configuration: Configuration) -> Prepared:
     return _builder.prepare(configuration)
 
 
+def figures_limited(configuration: Configuration, number: int) -> Figures:
+    """What a configuration makes of axis `number`, found out in the process beside. Raises as `Builder.figures`."""
+    return _builder.figures(configuration, number)
+
+
 def expect_changes() -> None:
     """Have the process ready before it is needed."""
     _builder.start()
@@ -141,10 +155,11 @@ def builder_ended() -> Any:
         _builder.end()
 
 
-def _build(configuration: Configuration) -> tuple[str, Any]:
+def _build(job: Job, configuration: Configuration, *arguments: Any) -> tuple[str, Any]:
     """Kind and value of an answer."""
     try:
-        return "prepared", prepare(configuration)
+        prepared = prepare(configuration)
+        return "done", prepared if job == "prepare" else figures(prepared, *arguments)
     except ConfigError as error:
         return "faults", error.faults
     except DriverError as error:
@@ -161,7 +176,7 @@ def main() -> None:
         _write(answers, pickle.dumps(("ready", None)))
         while len(length := sys.stdin.buffer.read(_LENGTH.size)) == _LENGTH.size:
             data = sys.stdin.buffer.read(_LENGTH.unpack(length)[0])
-            _write(answers, pickle.dumps(_build(pickle.loads(data))))
+            _write(answers, pickle.dumps(_build(*pickle.loads(data))))
 
 
 if __name__ == "__main__":

@@ -29,10 +29,13 @@ from rtloop.supervision.paths import FOLDER_MODE, refusal, socket_path
 END_TIMEOUT_S = 5.0
 
 
-def serve(config: Path) -> int:
-    """Serve a configuration until SIGTERM or SIGINT; SIGHUP reloads. The exit code. Raises RtloopError."""
+def serve(config: Path, duration_s: float | None = None) -> int:
+    """Serve a configuration until SIGTERM or SIGINT, or until a loop has run so long; SIGHUP reloads. The exit code.
+
+    Raises RtloopError.
+    """
     _log_to_stderr()
-    service = Service(config)
+    service = Service(config, duration_s)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())

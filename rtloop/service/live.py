@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import tomllib
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -22,8 +23,9 @@ from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
-from rtloop.service.building import prepare_limited
+from rtloop.service.building import figures_limited, prepare_limited
 from rtloop.service.desk import Desk, Refused, Taken
+from rtloop.service.preview import Figures
 from rtloop.signals import MODE, Mode
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs")
@@ -31,6 +33,17 @@ FIXED = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs
 OTHER_AXES = "controller.axes: which axes share a controller changed, which needs a restart"
 SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
 """Of an axis, that may be tuned."""
+
+
+MOST_UNDONE = 100
+
+
+class Change(NamedTuple):
+    """Of axis `number`, as it was before, and what was changed."""
+
+    number: int
+    before: AxisOptions
+    what: str
 
 
 class LiveLaw:
@@ -50,6 +63,9 @@ class LiveLaw:
         self._places = [0] * len(prepared.plan.axes)
         self._unsettled_tick: int | None = None
         self._playing = [(int(one["kind"]), float(one["parameters"][0])) for one in prepared.plan.generators]
+        self._changes: deque[Change] = deque(maxlen=MOST_UNDONE)
+        self._figures: dict[int, tuple[Configuration, Figures]] = {}
+        """Of axes as a configuration had them."""
         self.references_set = [0] * len(prepared.plan.axes)
         """How often each axis was given another reference."""
 
@@ -70,28 +86,66 @@ class LiveLaw:
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
         """Change keys of [axis.SECTION]; returns the tick. Raises ConfigError, Refused."""
         with self._building:
-            number = self.axis_number(axis)
-            options = self.prepared.configuration.axes[number]
-            if section not in SECTIONS:
-                raise _unsuitable(f"section {section!r}: {', '.join(SECTIONS)} may change")
-            if section == "controller":
-                return self._swap_controller(number, changes, keep=True)
-            merged = options.model_dump(exclude_unset=True)
-            merged[section] = {**(merged.get(section) or {}), **changes}
-            return self._swap(number, self._validated_axis(merged))
+            return self._change(*self._tuned(axis, section, changes), f"{section}: {', '.join(changes)}")
 
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
         """Swap [axis.controller] as a whole; returns the tick. Raises ConfigError, Refused."""
         with self._building:
-            return self._swap_controller(self.axis_number(axis), controller, keep=False)
+            return self._change(*self._with_controller(self.axis_number(axis), controller, keep=False), "controller")
 
-    def _swap_controller(self, number: int, controller: Mapping[str, Any], keep: bool) -> int:
-        """As `_swap`, of the axis that has the controller of axis `number`; `keep` what is not said."""
+    def preview(self, axis: str, section: str, changes: Mapping[str, Any]) -> dict[str, Figures]:
+        """Figures of the loop as it is, and as `tune` would make it; changes nothing. Raises ConfigError, Refused."""
+        with self._building:
+            number, configuration = self.axis_number(axis), self.prepared.configuration
+            changed = self._configured(*self._tuned(axis, section, changes))
+            if (known := self._figures.get(number)) is None or known[0] is not configuration:
+                known = self._figures[number] = configuration, figures_limited(configuration, number)
+            return {"before": known[1], "after": figures_limited(changed, number)}
+
+    def undo(self, axis: str) -> tuple[int, str]:
+        """Go back to before the last change of an axis, or of the controller that it shares; the tick, and what that
+        change was. Raises ConfigError, and Refused where nothing was changed.
+        """
+        with self._building:
+            number, configuration = self.axis_number(axis), self.prepared.configuration
+            concerned = (number, configuration.owners[number])
+            change = next((one for one in reversed(self._changes) if one.number in concerned), None)
+            if change is None:
+                raise Refused(f"undo: axis {axis} was not changed since the loop started, or since a reload")
+            reference = configuration.axes[change.number].reference
+            tick = self._swap(change.number, change.before.model_copy(update={"reference": reference}))
+            self._changes.remove(change)
+            return tick, change.what
+
+    def _change(self, number: int, axis: AxisOptions, what: str) -> int:
+        """As `_swap`, and it can be undone."""
+        change = Change(number, self.prepared.configuration.axes[number], what)
+        try:
+            tick = self._swap(number, axis)
+        except Taken:
+            self._changes.append(change)
+            raise
+        self._changes.append(change)
+        return tick
+
+    def _tuned(self, axis: str, section: str, changes: Mapping[str, Any]) -> tuple[int, AxisOptions]:
+        """The axis whose section it is, with the changes. Raises ConfigError."""
+        number = self.axis_number(axis)
+        if section not in SECTIONS:
+            raise _unsuitable(f"section {section!r}: {', '.join(SECTIONS)} may change")
+        if section == "controller":
+            return self._with_controller(number, changes, keep=True)
+        merged = self.prepared.configuration.axes[number].model_dump(exclude_unset=True)
+        merged[section] = {**(merged.get(section) or {}), **changes}
+        return number, self._validated_axis(merged)
+
+    def _with_controller(self, number: int, controller: Mapping[str, Any], keep: bool) -> tuple[int, AxisOptions]:
+        """The axis that has the controller of axis `number`, with another one; `keep` what is not said."""
         configuration = self.prepared.configuration
         owner = configuration.owners[number]
         merged = configuration.axes[owner].model_dump(exclude_unset=True)
         merged["controller"] = {**((merged.get("controller") or {}) if keep else {}), **controller}
-        return self._swap(owner, self._validated_axis(merged))
+        return owner, self._validated_axis(merged)
 
     def set_reference(self, axis: str, reference: Mapping[str, Any]) -> int:
         """Change the generator of an axis; returns the tick. Raises ConfigError, Refused."""
@@ -171,6 +225,8 @@ class LiveLaw:
                 faults = error.faults if isinstance(error, ConfigError) else [str(error)]
                 raise Refused("; ".join([*faults, f"changed already: {', '.join(dict.fromkeys(changed))}"])) from None
             self.prepared = prepared
+            if changed:
+                self._changes.clear()
             return list(dict.fromkeys(changed))
 
     def _note(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
@@ -199,6 +255,12 @@ class LiveLaw:
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
         """Build the configuration with another axis, verify it, swap its coefficients."""
+        prepared = prepare_limited(self._configured(number, axis))
+        with self._lock:
+            return self._stage(number, prepared, axis)
+
+    def _configured(self, number: int, axis: AxisOptions) -> Configuration:
+        """The configuration with another axis. Raises ConfigError, and Refused for what needs a restart."""
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refused("feedforward: the actuator's memory belongs to it; change it and restart")
@@ -207,9 +269,7 @@ class LiveLaw:
             raise ConfigError("change", faults)
         if changed.owners != configuration.owners:
             raise Refused(OTHER_AXES)
-        prepared = prepare_limited(changed)
-        with self._lock:
-            return self._stage(number, prepared, axis)
+        return changed
 
     def _stage(self, number: int, prepared: Prepared, axis: AxisOptions) -> int:
         """Copy coefficients to where the loop takes them from, have it take them; note `axis`. Raises Taken, too.

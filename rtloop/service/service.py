@@ -62,15 +62,18 @@ class State(StrEnum):
 
 
 class Service:
-    """Serves one configuration until `end`. Methods named like API calls may come from any thread."""
+    """Serves one configuration until `end`, or until a loop has run for `duration_s`. Methods named like API calls may
+    come from any thread.
+    """
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, config: Path, duration_s: float | None = None) -> None:
         self.config = config
         self.configuration: Configuration = load(config)
         options = self.configuration.service
         if self.configuration.schedule and (options.tare_s > 0 or options.depolarise is not None):
             fault = "schedule: not allowed with service.tare_s or service.depolarise, which take the first ticks"
             raise ConfigError(str(config), [fault])
+        self._duration_s = duration_s
         self.notifier = Notifier()
         self.lock = Lock()
         self.faults: list[str] = []
@@ -217,6 +220,8 @@ class Service:
     def _watch(self, supervisor: Supervisor) -> RunResult:
         said: State | None = None
         while (result := supervisor.poll()) is None:
+            if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
+                self.end()
             if self._ending.is_set() and not self._stopping:
                 self._stopping = True
                 supervisor.stop()

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rtloop import signals
+from rtloop.recording.load import described
+from rtloop.service.desk import Refused
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
+from rtloop.supervision.paths import block_path
 from rtloop.supervision.recording_state import recording_state
 
 WINDOW_TICKS = 10_000
@@ -26,13 +30,28 @@ def status(service: Service) -> dict[str, Any]:
         "lock": service.lock.held,
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
-        "recording": {} if supervisor is None else recording_state(supervisor.block),
+        "recording": {} if supervisor is None else recording_state(supervisor.block) | supervisor.recorder.written,
         "recorder_replacements": 0 if supervisor is None else supervisor.recorder.replacements,
         "restarts": len(service.results),
     }
     if service.measured:
         report["measured"] = {axis: results.for_json() for axis, results in service.measured.items()}
     return report | timing(service) | newest_signals(service)
+
+
+def running_configuration(service: Service) -> dict[str, Any]:
+    """The configuration as it runs, what the records of its ticks hold, and where they lie. Raises Refused."""
+    live = service.live
+    if live is None:
+        raise Refused(f"no loop is running: the service is {service.state}")
+    plan, configuration = live.prepared.plan, service.configuration
+    return live.as_it_runs | {
+        "name": configuration.name,
+        "rate_hz": plan.pacing.rate_hz,
+        "columns": [described(name)._asdict() for name in plan.columns],
+        "block": str(block_path(configuration).resolve()),
+        "recordings": str(Path(configuration.recording.folder).resolve()),
+    }
 
 
 def timing(service: Service) -> dict[str, Any]:

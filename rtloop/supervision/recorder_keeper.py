@@ -6,7 +6,6 @@ waits for a file.
 
 from __future__ import annotations
 
-import glob
 import json
 import threading
 import time
@@ -17,6 +16,7 @@ from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
 from rtloop.recording.capture.names import Names
+from rtloop.recording.file.parts import files_of_run
 from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
 from rtloop.supervision.stall import StallWatch
@@ -57,6 +57,11 @@ class RecorderKeeper:
     def state(self) -> int:
         """Of the present recorder, a ProcessState."""
         return self._block.load(Word.RECORDER_STATE)
+
+    @property
+    def written(self) -> dict[str, Any]:
+        """{file: the run's recording, written_ticks: the tick behind those that are in its files, or lost}."""
+        return {"file": str(self._path.resolve()), "written_ticks": self._block.load(Word.FLUSHED_TICKS)}
 
     @property
     def exit_code(self) -> int | None:
@@ -136,9 +141,7 @@ class RecorderKeeper:
 
     def _files(self, suffix: str) -> list[Path]:
         """This run's files, in their order."""
-        folder, stem = self._path.parent, self._path.stem
-        stem = glob.escape(stem)
-        return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
+        return files_of_run(self._path, suffix)
 
     def _repair(self, part: Path) -> None:
         try:

@@ -101,6 +101,19 @@ def print_recovery(report: dict[str, Any]) -> None:
         out.print("the end of the run is not in it: what came after its last tick is not known")
 
 
+def print_cut(report: dict[str, Any]) -> None:
+    """What stretch is in which file, and what of it is missing."""
+    out = console()
+    span = f"{report['first']} to {report['end'] - 1}"
+    if report["begin"] < report["first"]:
+        span += f", and what leads to them from tick {report['begin']} on"
+    ticks = counted(report["ticks"], "tick")
+    out.print(f"{_name(report['output'])}: {ticks} of {_name(report['recording'])}: {span}")
+    for first, count in report["gaps"]:
+        out.print(f"missing: {counted(count, 'tick')} from tick {first} on")
+    _print_problems(out, report["problems"])
+
+
 def print_export(report: dict[str, Any]) -> None:
     """What was written where."""
     out = console()

@@ -96,6 +96,8 @@ def print_summary(summary: Summary) -> None:
     if any(summary.ticks_limited.values()):
         counts = ", ".join(f"{name} {count:,}" for name, count in summary.ticks_limited.items() if count)
         shown.add_row("limited", "", f"ticks by what: {counts}")
+    if cut := summary.cut:
+        shown.add_row("cut", f"{cut['first']} …", f"to tick {cut['end'] - 1}, of {escape(', '.join(cut['files']))}")
     if len(summary.parts) > 1:
         shown.add_row("parts", str(len(summary.parts)), "of a rotated recording")
     if summary.commands:

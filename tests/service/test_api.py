@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,9 @@ def recorded(bench: Bench, kind: str, tick: int) -> dict[str, Any]:
 def test_states_and_refusals(bench: Bench):
     status = bench.client.get("/status")
     assert (status["state"], status["armed"], status["mode"], status["trip"]) == ("stopped", False, "off", [])
+    written = status["recording"].pop("written_ticks")
+    assert 0 <= written <= bench.ticks
+    assert Path(status["recording"].pop("file")).parent == bench.folder / "recordings"
     assert status["recording"] == {"state": "recording", "reason": None, "since_tick": None, "ticks_lost": 0}
     for path, body in (("/start", {}), ("/mode", {"mode": "raw"})):
         code, said = answer(bench, "POST", path, body)

@@ -8,6 +8,7 @@ import numpy as np
 
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.file import format
+from rtloop.recording.file.ticks import missing
 from rtloop.signals import DEADLINE, TICK
 
 NS_PER_S = 1e9
@@ -72,8 +73,4 @@ class TickBuffer:
 
     def gaps(self, count: int, expected: int) -> list[tuple[int, int]]:
         """(first tick, ticks) of all that is missing in the first `count` rows, which are to begin at `expected`."""
-        ticks = self._rows[:count, TICK]
-        if count == 0 or (ticks[0] == expected and ticks[-1] == expected + count - 1):  # the usual case
-            return []
-        known = np.concatenate([[expected - 1], ticks]).astype(np.int64)
-        return [(int(known[i]) + 1, int(known[i + 1] - known[i]) - 1) for i in np.flatnonzero(np.diff(known) != 1)]
+        return missing(self._rows[:count, TICK], expected) if count else []

@@ -91,6 +91,12 @@ class _Extras(_Checked):
     outputs: Annotated[list[_Output], Field(max_length=MAX_EXTRAS)] = []
 
 
+class _Cut(_Checked):
+    first: Tick
+    end: Tick
+    files: list[Text]
+
+
 class _Header(_Checked):
     format: Annotated[int, Field(ge=1)]
     name: Text
@@ -109,6 +115,7 @@ class _Header(_Checked):
     extras: _Extras = _Extras()
     sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
     first_tick: Tick = 0
+    cut: _Cut | None = None
 
 
 class _Event(_Checked):

@@ -17,7 +17,7 @@ from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
 from rtloop.signals import Failure, Mode, trip_causes
 
 Event = dict[str, Any]
-GAP, FINISHED, ROTATED, RECOVERED = "gap", "finished", "rotated", "recovered"
+GAP, FINISHED, ROTATED, RECOVERED, CUT = "gap", "finished", "rotated", "recovered", "cut"
 RECORDING_FAILED, RECORDING_RESUMED = "recording_failed", "recording_resumed"
 """Kinds that the recorder itself writes; `who` is RECORDER."""
 RECORDER = "recorder"
@@ -37,7 +37,7 @@ UNITS = {
     **{"frozen": " ticks", "oscillation": " swings"},
 }
 """Of what trips, by its cause."""
-FINAL = (FINISHED, ROTATED, RECOVERED)
+FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 """One of these ends a file; its `what` holds the totals."""
 
 

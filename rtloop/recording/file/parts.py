@@ -32,6 +32,12 @@ def find_files(given: Files) -> list[Path]:
     return paths
 
 
+def files_of_run(path: Path, suffix: str) -> list[Path]:
+    """The files with an ending of the run whose recording is `path`, NAME.mcap, in their order."""
+    folder, stem = path.parent, glob.escape(path.stem)
+    return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
+
+
 class Parts(ExitStack):
     """Tolerant readers of the files of one run, in its order, closed together.
 

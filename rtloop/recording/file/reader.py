@@ -107,6 +107,22 @@ class Reader:
         return int(self.header["created_unix_ns"])
 
     @property
+    def entries(self) -> list[Entry]:
+        """All chunks, in the order of the file."""
+        return self._entries
+
+    def chunk(self, entry: Entry) -> Ticks | list[Message] | None:
+        """What a chunk holds: its ticks or its messages of the slow topics; None where it is damaged."""
+        try:
+            content = self._content(entry)
+            if is_ticks(content):
+                return self._layout.ticks(content, self.columns)
+            return self._checked(split_messages(content))
+        except DamagedChunk as reason:
+            self._leave_out(entry, reason)
+            return None
+
+    @property
     def tick_chunks(self) -> list[Entry]:
         """The chunks that may hold ticks."""
         return [entry for entry in self._entries if may_hold(entry, format.TICKS)]
@@ -139,7 +155,7 @@ class Reader:
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
         """The snapshots of the law behind tick `before`, in order, each verified by its digest."""
         for message in self._messages(format.LAW):
-            tick, data = _tick_of(message), message.payload[DIGEST_BYTES:]
+            tick, data = tick_of(message), message.payload[DIGEST_BYTES:]
             if tick > before:
                 yield Snapshot(tick, data)
             else:
@@ -251,11 +267,12 @@ class Reader:
                 problems.append(problem)
 
 
-def _tick_of(snapshot: Message) -> int:
+def tick_of(snapshot: Message) -> int:
+    """The tick that a message of `/law` was taken at."""
     return int.from_bytes(snapshot.payload[DIGEST_BYTES : DIGEST_BYTES + 8], "little")
 
 
 def _require_digest(snapshot: Message) -> None:
     digest, data = snapshot.payload[:DIGEST_BYTES], snapshot.payload[DIGEST_BYTES:]
-    if hashlib.sha256(data).digest() != digest or len(data) < 8 or _tick_of(snapshot) > LARGEST:
+    if hashlib.sha256(data).digest() != digest or len(data) < 8 or tick_of(snapshot) > LARGEST:
         raise Malformed("a snapshot of the law is damaged")

@@ -12,13 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import FINAL, FINISHED, RECOVERED, recorder_event
 from rtloop.recording.file.reader import Reader, Rows
+from rtloop.recording.file.ticks import missing
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 
@@ -34,7 +33,7 @@ def output_of(path: Path) -> Path:
 def leftovers(folder: Path) -> list[Path]:
     """Unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
     parts = sorted(folder.glob("*.mcap.part"))
-    return [part for part in parts if not output_of(part).exists() and not _grows(part)]
+    return [part for part in parts if not output_of(part).exists() and not grows(part)]
 
 
 class Recovery:
@@ -84,10 +83,8 @@ class Recovery:
         return message.channel != format.CONFIGURATION
 
     def _note_gaps(self, rows: Rows) -> None:
-        ticks = np.concatenate([[self.next_tick - 1], rows[:, TICK]]).astype(np.int64)
-        for index in np.flatnonzero(np.diff(ticks) != 1):
-            self.gaps.append((int(ticks[index]) + 1, int(ticks[index + 1] - ticks[index]) - 1))
-        self.next_tick = int(ticks[-1]) + 1
+        self.gaps += missing(rows[:, TICK], self.next_tick)
+        self.next_tick = int(rows[-1, TICK]) + 1
         self._end_ns = float(rows[-1, DEADLINE]) + 1e9 / self._reader.header["rate_hz"]
 
 
@@ -98,7 +95,7 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
     """
     path = Path(path)
     output = output_of(path) if output is None else Path(output)
-    if _grows(path):
+    if grows(path):
         raise RecordingError(f"{path}: is being written by a recorder right now")
     with Reader(path, tolerant=True) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
@@ -126,7 +123,7 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
         }
 
 
-def _grows(path: Path) -> bool:
+def grows(path: Path) -> bool:
     """Whether a recorder holds its lock on the file."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

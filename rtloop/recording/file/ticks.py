@@ -70,6 +70,14 @@ class TickLayout:
         return int(records["_log_time"][0]) - int(ticks.rows[0, 0])
 
 
+def missing(ticks: np.ndarray[Any, Any], expected: int) -> list[tuple[int, int]]:
+    """(first tick, how many) of all that is missing in `ticks` (n,), n > 0, which are to begin at `expected`."""
+    if ticks[0] == expected and ticks[-1] == expected + len(ticks) - 1:  # the usual case
+        return []
+    known = np.concatenate([[expected - 1], ticks]).astype(np.int64)
+    return [(int(known[i]) + 1, int(known[i + 1] - known[i]) - 1) for i in np.flatnonzero(np.diff(known) != 1)]
+
+
 def _require_whole(records: np.ndarray[Any, Any]) -> None:
     for name, (low, high) in WHOLE.items():
         values = records[name]

@@ -51,6 +51,8 @@ class Summary:
     parts: list[str]
     name: str | None
     ticks_expected: int | None
+    cut: dict[str, Any] | None
+    """Which stretch (`first`, `end`) of which `files` was asked for, where it is one."""
     ticks_logged: int
     ticks_lost: int
     periods_missed: int
@@ -177,6 +179,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         parts=[str(reader.path) for reader in readers],
         name=header.get("name"),
         ticks_expected=header.get("ticks_expected"),
+        cut=header.get("cut"),
         ticks_logged=totals.ticks,
         ticks_lost=lost,
         periods_missed=totals.periods_missed,

@@ -37,6 +37,7 @@ from rtloop.service.api.bodies import (
     ResponseBody,
     SetpointBody,
     TuneBody,
+    UndoBody,
     WaveformBody,
 )
 from rtloop.service.api.lanes import Lane, Lanes
@@ -47,7 +48,7 @@ from rtloop.service.learning import learn
 from rtloop.service.live import LiveLaw
 from rtloop.service.measurement import Asked, Results, measure
 from rtloop.service.service import Service, State
-from rtloop.service.status import newest_signals, status
+from rtloop.service.status import newest_signals, running_configuration, status
 from rtloop.supervision.supervisor import Supervisor
 
 WATCH_HZ = 20.0
@@ -94,10 +95,13 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
               lambda service, body: _tick(_live(service).tune(body.axis, body.section, body.values))),
     "/controller": (ControllerBody, "Verify another controller and swap it in bumplessly.",
                     lambda service, body: _tick(_live(service).load_controller(body.axis, body.controller))),
+    "/preview": (TuneBody, "What `/tune` would make of margins and step; changes nothing.",
+                 lambda service, body: _live(service).preview(body.axis, body.section, body.values)),
+    "/undo": (UndoBody, "Go back to before the last change of an axis.", lambda service, body: _undo(service, body)),
 }  # fmt: skip
 """Path → body, what it does, how. All are POST; a command's answer is the tick at which it took effect."""
 LANES = {"/response": Lane.MEASUREMENT, "/learn": Lane.MEASUREMENT, "/stop": Lane.SAFETY, "/reset": Lane.SAFETY,
-         "/tune": Lane.BUILD, "/controller": Lane.BUILD, "/reload": Lane.BUILD}  # fmt: skip
+         **dict.fromkeys(("/tune", "/controller", "/preview", "/undo", "/reload"), Lane.BUILD)}  # fmt: skip
 """The rest is ordinary."""
 
 
@@ -121,6 +125,12 @@ def _response(service: Service, body: ResponseBody) -> dict[str, Any]:
     found = measure(*_running(service, "response"), body.axis, Asked(**body.model_dump(exclude={"axis"})))
     service.measured.setdefault(body.axis, Results()).note(found)
     return found.for_json()
+
+
+def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
+    """The tick, and what was undone."""
+    tick, what = _live(service).undo(body.axis)
+    return _tick(tick) | {"undone": what}
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
@@ -164,9 +174,17 @@ def application(service: Service) -> Starlette:
         return JSONResponse(status(service))
 
     async def get_configuration(_: Request) -> Response:
-        if service.live is None:
-            return refused(409, f"no loop is running: the service is {service.state}")
-        return JSONResponse(service.live.as_it_runs)
+        try:
+            return JSONResponse(running_configuration(service))
+        except Refused as error:
+            return refusal(error)
+
+    async def get_asked_by(request: Request) -> Response:
+        """Of a command's identity, as its event has it."""
+        supervisor, identity = service.supervisor, request.query_params.get("identity", "")
+        if not (identity.isascii() and identity.isdigit() and len(identity) < 19):
+            return refused(422, "identity: that of a command, a number, is needed")
+        return JSONResponse({"name": None if supervisor is None else supervisor.names.of(int(identity))})
 
     async def get_metrics(_: Request) -> Response:
         return PlainTextResponse(metrics_text(service), media_type="text/plain; version=0.0.4")
@@ -205,6 +223,7 @@ def application(service: Service) -> Starlette:
     routes: list[Any] = [
         Route("/status", get_status),
         Route("/configuration", get_configuration),
+        Route("/asked_by", get_asked_by),
         Route("/metrics", get_metrics),
         Route("/openapi.json", get_openapi),
         WebSocketRoute("/watch", watch),
@@ -242,9 +261,11 @@ def openapi() -> dict[str, Any]:
     """An OpenAPI 3.1 description of the API."""
     paths: dict[str, Any] = {
         "/status": {"get": {"summary": "State, rate, faults, newest signals."}},
-        "/configuration": {"get": {"summary": "The configuration as it runs, with what was tuned since."}},
+        "/configuration": {"get": {"summary": "The configuration as it runs, with what was tuned since; what a record "
+                                              "holds, and where shared block and recordings lie."}},
+        "/asked_by": {"get": {"summary": "Who asked for a command, by the `identity` of its event; null: no name."}},
         "/metrics": {"get": {"summary": "Prometheus text."}},
-    }
+    }  # fmt: skip
     answers = {"200": {"description": "done; a command's `tick` is when it took effect"},
                "409": {"description": "refused in this state, or while somebody else drives, and withdrawn"},
                "413": {"description": "too large"},

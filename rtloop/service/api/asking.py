@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -33,7 +33,12 @@ def _name(connection: HTTPConnection) -> str:
 
 
 def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -> AbstractContextManager[None]:
-    """By whom, and with the lock: but stop waits for nobody's, and no name holds it up. Raises ConfigError, Refused."""
+    """By whom, and with the lock: but stop waits for nobody's, and no name holds it up. Raises ConfigError, Refused.
+
+    What changes nothing needs neither.
+    """
+    if path == "/preview":
+        return nullcontext()
     if path != "/stop" and not (path == "/mode" and body.mode == "off"):
         return service.lock.driving(_name(connection))
     try:

@@ -143,3 +143,9 @@ class ControllerBody(Body):
 
     axis: Name
     controller: Settings
+
+
+class UndoBody(Body):
+    """Whose last change is taken back."""
+
+    axis: Name

@@ -21,8 +21,9 @@ BACKLOG = 64
 
 
 class Bounded(H11Protocol):
-    """One of at most MAX_CONNECTIONS."""
+    """One of at most `most`."""
 
+    most = MAX_CONNECTIONS
     _open: dict[Bounded, None] = {}  # noqa: RUF012  (one event loop, one server)
     _timer: asyncio.TimerHandle | None = None
 
@@ -30,7 +31,7 @@ class Bounded(H11Protocol):
         """Make room, and wait for a request."""
         super().connection_made(transport)
         self._open[self] = None
-        if len(self._open) > MAX_CONNECTIONS:
+        if len(self._open) > self.most:
             oldest = next((one for one in self._open if one.is_idle), self)
             oldest.drop()
         self._expect()

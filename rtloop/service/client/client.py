@@ -103,20 +103,26 @@ class Client:
         except (OSError, WebSocketException) as error:
             raise UnavailableError(f"{self.path}: {error}") from None
 
-    def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
+    def exchange(
+        self, method: str, resource: str, body: str | bytes | None, timeout_s: float = TIMEOUT_S
+    ) -> tuple[int, str, bytes]:
+        """Status, type and body of an answer, whatever they are. Raises UnavailableError, HostRefused."""
         connection = _UnixConnection(self.path, timeout_s)
-        if self._name is not None and method != "GET":
-            resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
         try:
             connection.request(method, resource, body, {"Content-Type": "application/json"})
             response = connection.getresponse()
-            text = response.read().decode()
+            return response.status, response.getheader("Content-Type") or "", response.read()
         except (OSError, http.client.HTTPException) as error:
             reason = getattr(error, "strerror", None) or error
             raise UnavailableError(f"{self.path}: no service answers there ({reason})") from None
         finally:
             connection.close()
-        answer = json.loads(text) if "json" in (response.getheader("Content-Type") or "") else text
-        if response.status >= 400:
-            raise RtloopError(answer["error"] if isinstance(answer, dict) else f"{response.status} {answer}")
+
+    def _request(self, method: str, resource: str, body: str | None, timeout_s: float = TIMEOUT_S) -> Any:
+        if self._name is not None and method != "GET":
+            resource = f"{resource}?as={quote(self._name, safe='', errors='replace')}"
+        status, kind, data = self.exchange(method, resource, body, timeout_s)
+        answer = json.loads(data) if "json" in kind else data.decode()
+        if status >= 400:
+            raise RtloopError(answer["error"] if isinstance(answer, dict) else f"{status} {answer}")
         return answer

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtloop.errors import RtloopError
-from rtloop.service.client.client import Client
+from rtloop.service.client import Client
 from rtloop.service.client.finding import socket_of
+
+if TYPE_CHECKING:  # half a second of import, for those who capture
+    from rtloop.panel.conditions import Condition
+    from rtloop.recording.load import Recording
 
 
 class Connection:
@@ -54,6 +58,10 @@ class Connection:
         """Ramp the outputs to safe and stay there, whoever holds the lock."""
         return self._tick("/stop")
 
+    def mode(self, mode: str) -> int:
+        """Change the mode bumplessly: "off", "raw", "feedforward" or "closed_loop"."""
+        return self._tick("/mode", mode=mode)
+
     def reset(self) -> int:
         """Forget latched trips; the outputs stay off."""
         return self._tick("/reset")
@@ -69,6 +77,31 @@ class Connection:
     def tune(self, axis: str, section: str, **values: Any) -> int:
         """Change keys of [axis.SECTION]: `"controller", gain=0.012`; verified first, then swapped in bumplessly."""
         return self._tick("/tune", axis=axis, section=section, values=values)
+
+    def capture(
+        self,
+        seconds: float,
+        trigger: Condition | None = None,
+        *,
+        at: int | None = None,
+        pre_percent: float = 50.0,
+        timeout_s: float = 60.0,
+        folder: Path | str | None = None,
+    ) -> Recording:
+        """A stretch of `seconds`, every tick of it, as a recording of its own: what `rtloop.load` returns.
+
+        With `trigger`, an `rtloop.Edge("x_position_um", 5.0)`, `Window`, `Stepped`, `Tripped`, `ModeChanged` or
+        `Late`, it lies about the first tick from now on that meets it, looked for at the loop's full rate; no more
+        than `timeout_s` are waited. With `at` it lies about that tick, such as one that a command returned.
+        `pre_percent` of it, 0 … 100, come before that tick. With neither it is what comes from now on.
+
+        The file is NAME.capture-TICK.mcap beside the run's recording, or in `folder`. In front of the stretch it has
+        what leads to it from the last recorded state of the law, at most a second, so that it replays by itself.
+        Raises ValueError for arguments that are not allowed, RtloopError where no trigger came or nothing is recorded.
+        """
+        from rtloop.panel.triggered import captured
+
+        return captured(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
 
     def _tick(self, resource: str, **body: Any) -> int:
         return int(self._client.post(resource, body)["tick"])

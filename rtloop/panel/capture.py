@@ -1,0 +1,145 @@
+"""A stretch of a run that goes on, as a recording of its own, beside the run's.
+
+    python -m rtloop.panel.capture SOCKET FILE FIRST END
+
+waits until the ticks FIRST … END − 1 of the run with the recording FILE are written, cuts them out, replays them, and
+prints one JSON line: {file, first, end, ticks, gaps, problems, replay}, or {error}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.cut import cut, cut_path
+from rtloop.recording.file.parts import files_of_run
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.load import load
+from rtloop.recording.replay.replay import replay
+from rtloop.service.client import Client
+
+POLL_S = 0.1
+GRACE_S = 10.0
+"""Beyond the time that the ticks need to come about: the recorder writes twice a second."""
+KEPT_FREE_BYTES = 128 << 20
+"""Twice what the recorder keeps free: no capture costs it a tick."""
+ATTEMPTS = 5
+
+
+class Run(NamedTuple):
+    """What is recorded now: NAME.mcap of its recording, the newest tick, the tick behind those that are written."""
+
+    file: Path
+    tick: int
+    written: int
+    rate_hz: float
+
+
+def present_run(client: Client) -> Run:
+    """Of the service. Raises UnavailableError where nothing is recorded."""
+    said = client.get("/status")
+    recording = said["recording"]
+    if "file" not in recording or "rate_hz" not in said:
+        raise UnavailableError(f"{client.path}: nothing to capture from: no loop is recorded, it is {said['state']}")
+    if recording["state"] != "recording":
+        since = f"not recorded from tick {recording['since_tick']} on: {recording['reason']}"
+        raise UnavailableError(f"{client.path}: nothing to capture from: {since}")
+    return Run(Path(recording["file"]), int(said["tick"]), int(recording["written_ticks"]), float(said["rate_hz"]))
+
+
+def capture(client: Client, file: Path, first: int, end: int, folder: Path | None = None) -> dict[str, Any]:
+    """Ticks `first` to before `end` of the run that is recorded in `file`, once they are written; as `cut` returns it.
+
+    It goes into NAME.capture-FIRST.mcap beside the run's recording, or in `folder`. Raises RecordingError for ticks
+    that the run does not have, OutputError, UnavailableError where they are not recorded.
+    """
+    _await(client, file, end)
+    for _ in range(ATTEMPTS):
+        try:
+            return _cut(file, first, end, folder)
+        except RecordingError:
+            time.sleep(POLL_S)  # a file that is finished meanwhile has another name
+    return _cut(file, first, end, folder)
+
+
+def _await(client: Client, file: Path, end: int) -> None:
+    """Wait until the ticks before `end` are written, or the run is over. Raises UnavailableError."""
+    deadline_s = None
+    while True:
+        try:
+            run = present_run(client)
+        except UnavailableError:
+            if files_of_run(file, ".mcap.part"):
+                raise
+            return  # the run is over; its files say what they have
+        if run.file != file or run.written >= end:
+            return
+        if deadline_s is None:
+            deadline_s = time.monotonic() + max(end - run.tick, 0) / run.rate_hz + GRACE_S
+        if time.monotonic() > deadline_s:
+            raise UnavailableError(f"{file}: tick {end - 1} is not written yet; the recorder is at tick {run.written}")
+        time.sleep(POLL_S)
+
+
+def _cut(file: Path, first: int, end: int, folder: Path | None) -> dict[str, Any]:
+    return cut(_holding(file, first), first, end, _free(file, first, folder), min_free_bytes=KEPT_FREE_BYTES)
+
+
+def _holding(file: Path, tick: int) -> list[Path]:
+    """The last files of a run, from the one before that with `tick` on: a state of the law may stand in there."""
+    found = {*files_of_run(file, ".mcap"), *files_of_run(file, ".mcap.part")}
+    files = sorted(found, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
+    for place in reversed(range(len(files))):
+        with Reader(files[place], tolerant=True) as reader:
+            if reader.first_tick <= tick:
+                return files[max(place - 1, 0) :]
+    return files or [file]
+
+
+def _free(file: Path, tick: int, folder: Path | None) -> Path:
+    """A name that nothing has."""
+    path = cut_path(file if folder is None else folder / file.name, tick, "capture")
+    others = (path.with_name(f"{path.stem}-{number}.mcap") for number in count(2))
+    return path if not path.exists() else next(other for other in others if not other.exists())
+
+
+def _verdict(path: Path) -> str:
+    """What a replay says."""
+    try:
+        report = replay(load(path))
+    except RtloopError as error:
+        return f"not possible: {error}"
+    if report.identical:
+        return "identical"
+    if (found := report.first_difference) is not None:
+        return f"different: tick {found['tick']}, {found['signal']}"
+    return "; ".join(["no difference, but not verified as a whole", *(entry["why"] for entry in report.not_verified)])
+
+
+def main() -> int:
+    """Command line entry."""
+    parser = argparse.ArgumentParser(prog="rtloop.panel.capture", description="save a stretch of a running loop")
+    for name, kind in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
+        parser.add_argument(name, type=kind)
+    asked = parser.parse_args()
+    said: dict[str, Any]
+    try:
+        done = capture(Client(asked.socket), asked.file, asked.first, asked.end)
+        path = Path(done["output"])
+        said = {"file": path.name, **{key: done[key] for key in ("first", "end", "ticks", "gaps", "problems")}}
+        said["replay"] = _verdict(path)
+    except RtloopError as error:
+        said = {"error": str(error)}
+    print(json.dumps(said), flush=True)
+    return 1 if "error" in said else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+// Requests to the panel's server, which hands commands on to the service.
+
+import { decode } from "./message.js";
+
+/** What the service, or the server, said against a request; `status` is 0 where nobody answered. */
+export class Refusal extends Error {
+  constructor(status, text) {
+    super(text);
+    this.status = status;
+  }
+}
+
+/** Who drives here; kept by this browser. */
+export const who = {
+  get name() {
+    return localStorage.getItem("rtloop-name") ?? "";
+  },
+  set name(name) {
+    localStorage.setItem("rtloop-name", name.trim());
+  },
+};
+
+async function ask(path, options = {}) {
+  let response;
+  try {
+    response = await fetch(path, { cache: "no-store", ...options });
+  } catch {
+    throw new Refusal(0, "no answer from the panel's server: nothing was done");
+  }
+  if (response.ok) return response;
+  const text = await response.text();
+  let said = text;
+  try {
+    const answer = JSON.parse(text);
+    said = answer.error ?? answer.detail ?? text;
+  } catch {
+    // plain text is what was said
+  }
+  if (response.status === 401) dispatchEvent(new Event("rtloop-session-lost"));
+  throw new Refusal(response.status, String(said || `refused with ${response.status}`));
+}
+
+const posted = (body) => ({
+  method: "POST",
+  headers: { "Content-Type": "application/json" },
+  body: JSON.stringify(body),
+});
+
+const named = (path) => (who.name ? `${path}?as=${encodeURIComponent(who.name)}` : path);
+
+export const get = async (path) => (await ask(path)).json();
+
+export const post = async (path, body = {}) => {
+  const response = await ask(path, posted(body));
+  return response.status === 204 ? {} : response.json();
+};
+
+/** Arrays by name, as over the WebSocket. */
+export const getArrays = async (path) => decode(await (await ask(path)).arrayBuffer());
+
+/** A command under the name of who drives; returns what the service answers. Raises Refusal. */
+export const command = (name, body) => post(named(`/api/${name}`), body);
+
+export const releaseLock = async () => (await ask(named("/api/lock"), { method: "DELETE" })).json();
+
+/** STOP is asked for again until somebody answers, for five seconds; `report` hears of each failure. */
+export async function stop(report) {
+  const until_ms = performance.now() + 5000;
+  for (;;) {
+    try {
+      return await (await ask(named("/api/stop"), { ...posted({}), keepalive: true })).json();
+    } catch (error) {
+      report(error);
+      if (performance.now() > until_ms || (error.status >= 400 && error.status < 500)) throw error;
+      await new Promise((resolve) => setTimeout(resolve, 200));
+    }
+  }
+}

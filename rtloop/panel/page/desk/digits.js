@@ -1,0 +1,46 @@
+// The axes in large digits, as many times a second as an eye can follow.
+
+import { $, make, reducedMotion, say } from "../dom.js";
+import { fixed } from "../numbers.js";
+
+const EVERY_MS = 150;
+
+/** Show the axes of `panel` from the states that come. */
+export function showDigits(live, panel) {
+  const shown = panel.axes.map((axis) => {
+    const part = (name, unit) => {
+      const value = make("span", {}, "—");
+      return [value, make("div", {}, make("dt", {}, name), make("dd", {}, value, ` ${unit}`))];
+    };
+    const large = make("span", { id: `position-${axis}` }, "—");
+    const fill = make("i");
+    const [reference, first] = part("reference", "µm");
+    const [error, second] = part("error", "µm");
+    const [drive, third] = part("drive", "V");
+    const box = make("div", { role: "group", "aria-label": `Axis ${axis}` },
+      make("p", { class: "axis-name" }, `${axis} · position`),
+      make("p", { class: "large" }, large, make("small", {}, " µm")),
+      make("dl", { class: "lesser" }, first, second, third),
+      make("div", { class: "meter", "aria-hidden": "true" }, fill));
+    return { axis, box, large, reference, error, drive, fill };
+  });
+  $("digits").replaceChildren(...shown.map(({ box }) => box));
+  let last_ms = 0;
+  live.addEventListener("state", ({ detail }) => {
+    const now_ms = performance.now();
+    if (!detail.axes || now_ms - last_ms < EVERY_MS * (reducedMotion.matches ? 4 : 1)) return;
+    last_ms = now_ms;
+    for (const { axis, large, reference, error, drive, fill } of shown) {
+      const values = detail.axes[axis] ?? {};
+      say(large, fixed(values.position_um, 3));
+      say(reference, fixed(values.reference_um, 3));
+      say(error, fixed(values.error_um, 3));
+      say(drive, fixed(values.drive_v, 3));
+      const { lowest_v = -10, drive_v = 10 } = panel.limits?.[axis] ?? {};
+      const place = (volts) => Math.min(Math.max(((volts - lowest_v) / (drive_v - lowest_v)) * 100, 0), 100);
+      const [zero, now] = [place(0), place(values.drive_v ?? 0)];
+      fill.style.left = `${Math.min(zero, now)}%`;
+      fill.style.width = `${Math.abs(now - zero)}%`;
+    }
+  });
+}

@@ -1,0 +1,98 @@
+// Arm, start, stop, reset, the mode, and who drives.
+
+import { command, releaseLock, stop, who } from "../api.js";
+import { $, complain, say } from "../dom.js";
+import { HoldButton } from "../hold.js";
+import { Picker } from "../picker.js";
+
+const NEXT = { stopped: ["Arm", "arm"], armed: ["Start", "start"] };
+const MODES = ["closed_loop", "feedforward", "raw", "off"];
+
+export class Drive {
+  #strip;
+  #mode;
+  #next = null;
+
+  constructor(live, strip) {
+    this.#strip = strip;
+    this.go = new HoldButton($("go"), () => this.#next && this.driving(this.#next, {}, $("power-error")));
+    this.#mode = new Picker($("set-mode"), (mode) => this.driving("mode", { mode }, $("power-error")));
+    this.#mode.options = MODES.map((value) => ({ value, text: value.replace("_", " ") }));
+    $("stop").addEventListener("click", () => this.stop());
+    $("reset").addEventListener("click", () => this.driving("reset", {}, $("power-error")));
+    $("who").value = who.name;
+    $("who").addEventListener("change", () => (who.name = $("who").value));
+    $("lock").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.driving("lock", {}, $("lock-error"));
+    });
+    $("release").addEventListener("click", () => this.#release());
+    $("break").addEventListener("click", () => {
+      $("key-row").hidden = !$("key-row").hidden;
+      $("break").setAttribute("aria-expanded", String(!$("key-row").hidden));
+      if (!$("key-row").hidden) $("key").focus();
+    });
+    $("key-row").addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const key = $("key").value;
+      $("key").value = "";
+      if (await this.driving("lock", { emergency_key: key }, $("lock-error"))) $("key-row").hidden = true;
+    });
+    live.addEventListener("state", ({ detail }) => this.#show(detail));
+  }
+
+  /** Send a command under the name of who drives; its answer, or null with the refusal shown in `place`. */
+  async driving(name, body, place) {
+    who.name = $("who").value;
+    if (!who.name) {
+      complain($("lock-error"), "Say who drives: your name is recorded with what you do.");
+      $("who").focus();
+      return null;
+    }
+    try {
+      const answer = await command(name, body);
+      complain(place, null);
+      complain($("lock-error"), null);
+      return answer;
+    } catch (error) {
+      complain(place, error);
+      return null;
+    }
+  }
+
+  async stop() {
+    this.go.end();
+    this.#strip.tell("STOP is sent…", 2000);
+    try {
+      const { tick } = await stop((error) => say($("alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`));
+      say($("alarm"), "");
+      this.#strip.tell(`Stopped${tick == null ? "" : ` at tick ${tick}`}: the outputs ramp to safe.`);
+    } catch (error) {
+      if (error.status === 409) this.#strip.tell(error.message);
+      else say($("alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`);
+    }
+  }
+
+  async #release() {
+    try {
+      await releaseLock();
+      complain($("lock-error"), null);
+    } catch (error) {
+      complain($("lock-error"), error);
+    }
+  }
+
+  #show({ state, mode, lock }) {
+    const [word, next] = NEXT[state] ?? [state === "running" ? "Running" : "Start", null];
+    this.#next = next;
+    $("go").disabled = !next;
+    say($("go-word"), word);
+    $("reset").disabled = state !== "tripped";
+    if (mode) this.#mode.value = mode;
+    this.#mode.disabled = !["armed", "running"].includes(state);
+    if (!lock) return say($("drives"), "Nobody drives. The first command takes the lock; stop works for everybody.");
+    const left_s = Math.max(0, Math.round(lock.until_unix_s - Date.now() / 1000));
+    const mine = lock.name === who.name;
+    say($("drives"), `${mine ? "You drive" : `${lock.name} drives`}; free ${left_s > 0 ? `after ${left_s} s of silence` : "now"}.`);
+  }
+}

@@ -1,0 +1,135 @@
+// The reference of an axis: a setpoint, a jog, a generator, a waveform from a file.
+
+import { $, complain, make } from "../dom.js";
+import { fixed, fromField, parseNumber } from "../numbers.js";
+import { Picker } from "../picker.js";
+
+const KINDS = {
+  sine: { amplitude: ["amplitude, µm", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, µm", "0"], phase_deg: ["phase, °", "0"] },
+  triangle: { amplitude: ["amplitude, µm", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, µm", "0"], phase_deg: ["phase, °", "0"] },
+  steps: { levels: ["levels, µm (blanks or ; between)", "10; 0; -10; 0"], dwell_s: ["each held, s", "0.2"] },
+  chirp: { amplitude: ["amplitude, µm", "1"], start_hz: ["from, Hz", "1"], end_hz: ["to, Hz", "100"], duration_s: ["within, s", "10"], offset: ["offset, µm", "0"] },
+};
+const JOGS_UM = [0.01, 0.1, 1, 5, 10];
+
+/** Numbers with blanks, semicolons or lines between them. */
+const numbers = (text, what) => text.split(/[\s;]+/).filter(Boolean).map((part) => parseNumber(part.replace(/,$/, ""), what));
+
+/** One or two columns: {samples, command_um}; commas part columns where points are decimal. */
+export function columns(text) {
+  const lines = text.split(/\r?\n/).map((line) => line.replace(/#.*/, "").trim()).filter(Boolean);
+  const rows = lines.map((line, number) => {
+    const parts = line.split(/[;\t ]+/).length > 1 || !line.includes(".") ? line.split(/[;\t ]+/) : line.split(/[,\s]+/);
+    if (parts.length > 2) throw new Error(`line ${number + 1}: ${parts.length} columns; one or two are needed`);
+    return parts.map((part) => parseNumber(part.replace(/,$/, ""), `line ${number + 1}`));
+  });
+  if (!rows.length) throw new Error("the file holds no numbers; one to a line is needed");
+  if (rows.some((row) => row.length !== rows[0].length)) throw new Error("lines of one and of two columns; all need as many");
+  return { samples: rows.map((row) => row[0]), command_um: rows[0].length === 2 ? rows.map((row) => row[1]) : [] };
+}
+
+export class Reference {
+  #panel;
+  #drive;
+  #axis;
+  #kind;
+  #jog;
+  #fields = {};
+  #now = {};
+  #mode = null;
+
+  constructor(live, panel, drive, changed) {
+    this.#panel = panel;
+    this.#drive = drive;
+    this.#axis = new Picker($("desk-axis"), () => {
+      this.#limit();
+      changed();
+    });
+    this.#axis.options = panel.axes.map((value) => ({ value, text: `axis ${value}` }));
+    $("desk-axis").hidden = panel.axes.length < 2;
+    this.#jog = new Picker($("jog-step"));
+    this.#jog.options = JOGS_UM.map((value) => ({ value, text: `${value} µm` }));
+    this.#jog.value = 1;
+    this.#kind = new Picker($("generator-kind"), () => this.#arrange());
+    this.#kind.options = Object.keys(KINDS).map((value) => ({ value, text: value }));
+    this.#arrange();
+    this.#limit();
+    $("setpoint-slider").addEventListener("input", () => ($("setpoint").value = $("setpoint-slider").value));
+    $("setpoint-slider").addEventListener("change", () => this.set(Number($("setpoint-slider").value)));
+    const submitted = (id, action, place) => $(id).addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#try(action, $(place));
+    });
+    submitted("setpoint-form", () => this.set(fromField($("setpoint"))), "setpoint-error");
+    submitted("generator", () => this.#play(), "generator-error");
+    submitted("waveform", () => this.#upload(), "waveform-error");
+    for (const button of document.querySelectorAll("[data-jog]")) button.addEventListener("click", () => this.jog(Number(button.dataset.jog)));
+    live.addEventListener("state", ({ detail }) => {
+      if (!Number.isFinite(this.#now[this.axis]?.reference_um) && detail.axes) $("setpoint").value = $("setpoint-slider").value = (detail.axes[this.axis]?.reference_um ?? 0).toFixed(2);
+      this.#now = detail.axes ?? this.#now;
+      if (detail.mode === this.#mode) return;
+      this.#mode = detail.mode;
+      this.#limit();
+    });
+  }
+
+  get axis() {
+    return this.#axis.value;
+  }
+
+  /** Hold a value, in µm, in V in raw mode. */
+  async set(value) {
+    $("setpoint").value = String(value);
+    $("setpoint-slider").value = String(value);
+    await this.#drive.driving("setpoint", { axis: this.axis, value }, $("setpoint-error"));
+  }
+
+  /** From the reference as it is now, by the chosen distance. */
+  jog(sign) {
+    const from = this.#now[this.axis]?.reference_um;
+    if (!Number.isFinite(from)) return complain($("setpoint-error"), "jog: there is no reference yet to go on from");
+    return this.set(Number((from + sign * this.#jog.value).toFixed(6)));
+  }
+
+  async #try(action, place) {
+    try {
+      await action();
+    } catch (error) {
+      complain(place, error);
+    }
+  }
+
+  #limit() {
+    const { command_um = 40, position_um = 40, drive_v = 10, lowest_v = -drive_v } = this.#panel.limits?.[this.axis] ?? {};
+    const raw = this.#mode === "raw";
+    const most = raw ? drive_v : Math.min(command_um, position_um);
+    $("setpoint-slider").min = String(raw ? lowest_v : -most);
+    $("setpoint-slider").max = String(most);
+    $("setpoint-slider").step = raw ? "0.001" : "0.01";
+    $("setpoint-form").querySelector(".unit").textContent = raw ? "V" : "µm";
+  }
+
+  #arrange() {
+    this.#fields = {};
+    const shown = Object.entries(KINDS[this.#kind.value]).map(([key, [label, value]]) => {
+      this.#fields[key] = make("input", { value });
+      return make("label", { class: "field", "data-name": label }, label, this.#fields[key]);
+    });
+    $("generator-fields").replaceChildren(...shown);
+  }
+
+  async #play() {
+    const reference = { kind: this.#kind.value };
+    for (const [key, field] of Object.entries(this.#fields)) reference[key] = key === "levels" ? numbers(field.value, key) : fromField(field);
+    await this.#drive.driving("reference", { axis: this.axis, reference }, $("generator-error"));
+  }
+
+  async #upload() {
+    const [file] = $("waveform-file").files;
+    if (!file) throw new Error("choose a file of samples first");
+    const body = { axis: this.axis, ...columns(await file.text()), hold_ticks: fromField($("waveform-hold")), repeat: $("waveform-repeat").checked };
+    const answer = await this.#drive.driving("waveform", body, $("waveform-error"));
+    if (answer) complain($("setpoint-error"), null);
+    if (answer) $("waveform-file").title = `${file.name}: ${fixed(body.samples.length, 0)} samples from tick ${answer.tick} on`;
+  }
+}

@@ -1,0 +1,152 @@
+// Tuning: nothing of the controller or the model is applied before its margins, its step and what it bears were seen.
+
+import { command, get } from "../api.js";
+import { $, calmly, complain, make, say } from "../dom.js";
+import { fromField } from "../numbers.js";
+import { Picker } from "../picker.js";
+import { Preview } from "./preview.js";
+
+const SECTIONS = ["controller", "model", "prefilter", "limits", "interlocks"];
+const SLIDER_SPAN = 0.5;
+/** Of the value in force, up and down; the field takes any. */
+
+export class Tuning {
+  #drive;
+  #axis;
+  #section;
+  #key;
+  #values = {};
+  #asked = 0;
+  #shown = null;
+  #preview = new Preview();
+
+  /** `axis()` is the axis of the desk. */
+  constructor(drive, axis) {
+    this.#drive = drive;
+    this.#axis = axis;
+    this.#section = new Picker($("tune-section"), () => this.#arrange());
+    this.#section.options = SECTIONS.map((value) => ({ value, text: value }));
+    this.#key = new Picker($("tune-key"), () => this.#start());
+    $("tune-slider").addEventListener("input", () => {
+      $("tune-value").value = $("tune-slider").value;
+      this.#previewSoon();
+    });
+    $("tune-value").addEventListener("input", () => {
+      this.#withdraw();
+      $("tune-slider").value = $("tune-value").value.replace(",", ".");
+    });
+    $("tune").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#ask(() => ({ [this.#key.value]: fromField($("tune-value")) }));
+    });
+    $("tune-many").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#ask(() => fromJson($("tune-json").value));
+    });
+    $("apply").addEventListener("click", () => this.#apply());
+    $("discard").addEventListener("click", () => this.#start());
+    $("undo").addEventListener("click", () => this.undo());
+  }
+
+  /** Read the configuration as it runs. */
+  async read() {
+    try {
+      const { values } = await get("/api/configuration");
+      this.#values = values.axis.find(({ name }) => name === this.#axis()) ?? {};
+      complain($("tune-error"), null);
+      this.#arrange();
+    } catch (error) {
+      complain($("tune-error"), error);
+    }
+  }
+
+  /** Lay out the preview's plot anew, as after a change of the theme. */
+  arrange() {
+    this.#preview.arrange();
+  }
+
+  async undo() {
+    const answer = await this.#drive.driving("undo", { axis: this.#axis() }, $("tune-error"));
+    if (!answer) return;
+    say($("tune-done"), `undone at tick ${answer.tick}${answer.undone ? `: ${answer.undone}` : ""}`);
+    await this.read();
+  }
+
+  #numbersOf() {
+    return Object.entries(this.#values[this.#section.value] ?? {}).filter(([, value]) => typeof value === "number");
+  }
+
+  #arrange() {
+    const keys = this.#numbersOf();
+    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: "no number here" }];
+    this.#start();
+  }
+
+  #start() {
+    const value = Object.fromEntries(this.#numbersOf())[this.#key.value];
+    const none = value === undefined;
+    $("tune-value").disabled = $("tune-slider").disabled = $("show-preview").disabled = none;
+    $("tune-value").value = none ? "" : String(value);
+    say($("tune-now"), none ? "" : `now ${Number(value.toPrecision(6))}`);
+    const span = Math.abs(value || 1) * SLIDER_SPAN;
+    const step = 10 ** Math.floor(Math.log10(span / 100));
+    Object.assign($("tune-slider"), { step: String(Number(step.toPrecision(1))), min: String(Number(((value || 0) - span).toPrecision(6))), max: String(Number(((value || 0) + span).toPrecision(6))) });
+    $("tune-slider").value = String(value ?? 0);
+    $("tune-json").value = "{}";
+    this.#withdraw();
+  }
+
+  /** What was shown is no longer what would be applied. */
+  #withdraw() {
+    this.#asked += 1;
+    this.#shown = null;
+    $("preview").hidden = true;
+  }
+
+  #previewSoon = calmly(250, () => this.#ask(() => ({ [this.#key.value]: fromField($("tune-value")) })));
+
+  async #ask(read) {
+    this.#withdraw();
+    const number = this.#asked;
+    try {
+      const wanted = { axis: this.#axis(), section: this.#section.value, values: read() };
+      if (!Object.keys(wanted.values).length) throw new Error("keys: none given; one at least is needed");
+      $("tune").setAttribute("aria-busy", "true");
+      const { before, after } = await command("preview", wanted);
+      if (number !== this.#asked) return;
+      complain($("tune-error"), null);
+      this.#shown = wanted;
+      $("preview").hidden = false;
+      this.#preview.show(before, after);
+      $("apply").textContent = `Apply ${Object.entries(wanted.values).map(([key, value]) => (typeof value === "number" ? `${key} = ${value}` : key)).join(", ")}`;
+      $("preview").scrollIntoView({ block: "nearest" });
+    } catch (error) {
+      if (number === this.#asked) complain($("tune-error"), error);
+    } finally {
+      $("tune").removeAttribute("aria-busy");
+    }
+  }
+
+  async #apply() {
+    if (!this.#shown) return;
+    const wanted = this.#shown;
+    $("apply").disabled = true;
+    const answer = await this.#drive.driving("tune", wanted, $("tune-error"));
+    $("apply").disabled = false;
+    if (!answer) return;
+    say($("tune-done"), `applied at tick ${answer.tick}`);
+    this.#withdraw();
+    $("undo").focus();
+    await this.read();
+  }
+}
+
+function fromJson(text) {
+  try {
+    const values = JSON.parse(text);
+    if (values && typeof values === "object" && !Array.isArray(values)) return values;
+  } catch {
+    // said below
+  }
+  throw new Error('keys: an object as JSON is needed, such as {"gain": 0.012, "method": "tustin"}');
+}

@@ -1,0 +1,70 @@
+// The WebSocket: what the server sends goes out as events by kind; wishes are kept and said again after a break.
+
+import { get } from "./api.js";
+import { decode } from "./message.js";
+
+const SILENCE_MS = 600;
+/** State comes 20 times a second; without any for so long, what is shown is not the present. */
+const AGAIN_MS = [250, 500, 1000, 2000];
+
+export class Live extends EventTarget {
+  #socket = null;
+  #wishes = {};
+  #failures = 0;
+  #heard_ms = -Infinity;
+  #age_s = null;
+
+  constructor() {
+    super();
+    setInterval(() => this.#watch(), 100);
+  }
+
+  connect() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/live`);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      this.#failures = 0;
+      if (Object.keys(this.#wishes).length) socket.send(JSON.stringify(this.#wishes));
+    };
+    socket.onmessage = ({ data }) => this.#take(decode(data));
+    socket.onclose = () => {
+      if (this.#socket !== socket) return;
+      this.#socket = null;
+      this.#watch();
+      get("/api/panel").catch(() => {}); // says by itself where the session is over
+      const wait_ms = AGAIN_MS[Math.min(this.#failures++, AGAIN_MS.length - 1)];
+      setTimeout(() => this.connect(), wait_ms);
+    };
+    this.#socket = socket;
+  }
+
+  /** What is wanted from now on, by key. */
+  wish(wishes) {
+    Object.assign(this.#wishes, wishes);
+    this.once(wishes);
+  }
+
+  /** What is wanted one time. */
+  once(wishes) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(wishes));
+  }
+
+  #take(message) {
+    if (message.kind === "state") {
+      this.#heard_ms = performance.now();
+      this.#age_s = message.age_s;
+      this.#watch();
+    }
+    this.dispatchEvent(new CustomEvent(message.kind, { detail: message }));
+  }
+
+  /** Tells how old what is shown is, and whether it is the present. */
+  #watch() {
+    const silence_ms = performance.now() - this.#heard_ms;
+    const connected = this.#socket?.readyState === WebSocket.OPEN && silence_ms < SILENCE_MS;
+    const age_s = this.#age_s == null ? null : this.#age_s + (connected ? 0 : silence_ms / 1000);
+    const fresh = connected && age_s != null && age_s * 1000 < SILENCE_MS;
+    this.dispatchEvent(new CustomEvent("freshness", { detail: { connected, fresh, age_s, silence_s: silence_ms / 1000 } }));
+  }
+}

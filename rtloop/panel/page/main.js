@@ -1,0 +1,83 @@
+// The page: a session, a connection, and its parts.
+
+import { get } from "./api.js";
+import { showDigits } from "./desk/digits.js";
+import { Drive } from "./desk/drive.js";
+import { showEvents } from "./desk/events.js";
+import { Reference } from "./desk/reference.js";
+import { Tuning } from "./desk/tuning.js";
+import { $ } from "./dom.js";
+import { Keys } from "./keys.js";
+import { Live } from "./live.js";
+import { themes } from "./palette.js";
+import { Scope } from "./scope/scope.js";
+import { askForToken, openSession } from "./session.js";
+import { Strip } from "./strip.js";
+import { Views } from "./views/views.js";
+
+function closeHelp() {
+  if (!$("help-dialog").open) return;
+  $("help-dialog").close();
+  $("help").focus();
+}
+
+const live = new Live();
+const strip = new Strip(live);
+const drive = new Drive(live, strip);
+const keys = new Keys(() => drive.stop());
+let views = null;
+let tuning = null;
+themes($("theme"), () => {
+  views?.arrange();
+  tuning?.arrange();
+});
+for (const id of ["port", "port-there"]) $(id).textContent = location.port || "80";
+$("help").addEventListener("click", () => ($("help-dialog").open ? closeHelp() : $("help-dialog").show())); // not modal: STOP stays in reach
+$("close-help").addEventListener("click", closeHelp);
+live.addEventListener("refused", ({ detail }) => strip.tell(`${detail.wish}: ${detail.error}`));
+addEventListener("rtloop-session-lost", () => askForToken());
+
+const panel = await openSession(get);
+$("name").textContent = panel.name;
+strip.begin(get);
+showDigits(live, panel);
+showEvents(live);
+const scope = new Scope(live, panel);
+views = new Views(live, panel, scope, strip);
+const reference = new Reference(live, panel, drive, () => tuning.read());
+tuning = new Tuning(drive, () => reference.axis);
+tuning.read();
+live.connect();
+let run = null;
+live.addEventListener("state", async ({ detail }) => {
+  if (detail.run == null || detail.run === run) return;
+  const another = run !== null;
+  run = detail.run;
+  if (!another) return;
+  const now = await get("/api/panel").catch(() => panel);
+  if (JSON.stringify(now.columns) !== JSON.stringify(panel.columns)) location.reload(); // the loop that came has other signals
+  else tuning.read();
+});
+
+const press = (id) => () => $(id).click();
+const focus = (id) => () => {
+  $(id).focus();
+  $(id).select?.();
+};
+keys.on("g", () => drive.go.begin(), () => drive.go.end());
+keys.on("s", focus("setpoint"));
+keys.on("k", focus("tune-value"));
+keys.on("l", focus("who"));
+keys.on("u", press("undo"));
+keys.on("c", press("capture"));
+keys.on("h", press("hold"));
+keys.on("f", press("force"));
+keys.on("a", press("arm-single"));
+keys.on("m", press("cursors"));
+keys.on("[", () => reference.jog(-1));
+keys.on("]", () => reference.jog(1));
+for (const key of ["+", "="]) keys.on(key, press("longer"));
+for (const key of ["-", "−"]) keys.on(key, press("shorter"));
+for (const [place, button] of [...document.querySelectorAll("#views [data-view]:not(.narrow)")].entries()) keys.on(String(place + 1), () => button.click());
+keys.on("?", press("help"));
+keys.on("Escape", closeHelp);

@@ -1,0 +1,68 @@
+// Numbers as people type them, and as an instrument shows them.
+
+/** A number from "-5", "+5", "−5", "12,5" or "12.5"; raises Error in the panel's words. */
+export function parseNumber(text, what = "this") {
+  const plain = text.trim().replace(/^[−–]/, "-").replace(",", ".");
+  if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) || !Number.isFinite(Number(plain))) {
+    throw new Error(`${what}: “${text.trim()}” is no number; 12.5, 12,5, -5 and +5 are`);
+  }
+  return Number(plain);
+}
+
+/** As `parseNumber`, out of a field; the field is marked, and gets the focus, where it holds none. */
+export function fromField(field) {
+  try {
+    const value = parseNumber(field.value, field.labels?.[0]?.dataset.name ?? field.labels?.[0]?.textContent.trim());
+    field.removeAttribute("aria-invalid");
+    return value;
+  } catch (error) {
+    field.setAttribute("aria-invalid", "true");
+    field.focus();
+    throw error;
+  }
+}
+
+/** With a true minus, so that digits keep their places. */
+export function fixed(value, decimals) {
+  if (value == null || !Number.isFinite(value)) return "—";
+  const text = value.toFixed(decimals);
+  return (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "−");
+}
+
+/** So many significant digits, never in the form 1e-5 between 0.0001 and 10 million. */
+export function significant(value, digits = 4) {
+  if (value == null || !Number.isFinite(value)) return "—";
+  if (value === 0) return "0";
+  const power = Math.floor(Math.log10(Math.abs(value)));
+  if (power < -5 || power > 7) return value.toExponential(digits - 1).replace(/-/g, "−");
+  return fixed(value, Math.max(0, digits - 1 - power));
+}
+
+/** Decimals that a quantity of a unit is shown with, where it is measured. */
+export const DECIMALS = { "µm": 3, V: 3, "µs": 1, nm: 1, "1": 0, ns: 0 };
+
+export function quantity(value, unit) {
+  return fixed(value, DECIMALS[unit] ?? 3);
+}
+
+/** A duration with the unit that suits it. */
+export function duration(seconds, digits = 4) {
+  if (!Number.isFinite(seconds)) return "—";
+  const size = Math.abs(seconds);
+  if (size >= 1 || size === 0) return `${significant(seconds, digits)} s`;
+  if (size >= 1e-3) return `${significant(seconds * 1e3, digits)} ms`;
+  return `${significant(seconds * 1e6, digits)} µs`;
+}
+
+export function frequency(hz, digits = 4) {
+  if (!Number.isFinite(hz)) return "—";
+  return Math.abs(hz) >= 1000 ? `${significant(hz / 1000, digits)} kHz` : `${significant(hz, digits)} Hz`;
+}
+
+const LARGE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+export const counted = (value) => (value == null ? "—" : LARGE.format(value).replace(/,/g, "\u202f"));
+
+/** Like 3.2 MB. */
+export function bytes(count) {
+  return count >= 1e6 ? `${fixed(count / 1e6, 1)} MB` : `${fixed(count / 1e3, 1)} kB`;
+}

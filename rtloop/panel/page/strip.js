@@ -1,0 +1,80 @@
+// The strip on top: state, mode and vitals, alarms in words, and how old what is shown is.
+
+import { $, make, say } from "./dom.js";
+import { counted, fixed } from "./numbers.js";
+
+const words = (name) => String(name).replaceAll("_", " ");
+const STATUS_MS = 1000;
+
+export class Strip {
+  #state = null;
+  #tripped = "";
+
+  constructor(live) {
+    live.addEventListener("state", ({ detail }) => this.#take(detail));
+    live.addEventListener("freshness", ({ detail }) => this.#fresh(detail));
+  }
+
+  /** Ask for the vitals every second from now on. */
+  begin(get) {
+    const ask = async () => {
+      try {
+        this.#status(await get("/api/status"));
+      } catch {
+        // the age of the data says it
+      }
+      setTimeout(ask, STATUS_MS);
+    };
+    ask();
+  }
+
+  get state() {
+    return this.#state;
+  }
+
+  #take(state) {
+    const before = this.#state?.state;
+    this.#state = state;
+    $("state").dataset.state = state.state;
+    say($("state-word"), words(state.state));
+    say($("mode"), state.mode ? words(state.mode) : "");
+    say($("tick"), counted(state.tick));
+    if (before !== state.state) say($("spoken"), `${words(state.state)}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
+    const tripped = state.trip?.length ? `Tripped: ${state.trip.map(words).join(", ")}${state.trip_reason ? ` — ${state.trip_reason}` : ""}. Reset to go on.` : "";
+    if (tripped !== this.#tripped) {
+      this.#tripped = tripped;
+      say($("alarm"), tripped);
+    }
+    document.title = `${state.state === "running" ? "▶" : state.state === "tripped" ? "✕" : "■"} ${$("name").textContent} · rtloop`;
+  }
+
+  #status({ rate_hz, lateness_us, recording, periods_missed }) {
+    say($("rate"), rate_hz ? `${fixed(rate_hz / 1000, 3)} kHz` : "—");
+    say($("late"), lateness_us ? `${fixed(lateness_us.p99, 0)} µs${periods_missed ? `, ${periods_missed} missed` : ""}` : "—");
+    const ill = recording?.state && recording.state !== "recording";
+    $("recording").replaceChildren(ill ? make("span", { class: "error" }, `✕ ${recording.reason ?? recording.state}`) : recording?.state ? "● on" : "—");
+  }
+
+  #fresh({ connected, fresh, age_s, silence_s }) {
+    document.body.classList.toggle("stale", !fresh);
+    const old_s = age_s ?? (Number.isFinite(silence_s) ? silence_s : null);
+    const age = old_s == null ? "none yet" : `${fixed(old_s, old_s < 10 ? 1 : 0)} s old`;
+    say($("age"), fresh ? "live" : age);
+    const why = connected ? (this.#state?.error ?? "no new ticks") : "no connection to the panel's server";
+    const says = `${why[0].toUpperCase()}${why.slice(1)}; what is shown is ${age}`;
+    for (const veil of document.querySelectorAll(".veil")) if (!fresh) veil.dataset.says = says;
+    const spoken = connected ? (fresh ? "" : "No new ticks: what is shown is old.") : "No connection: what is shown is old, and STOP may not get through. Use the emergency stop.";
+    say($("said"), this.note && fresh ? this.note : spoken);
+  }
+
+  /** Tell something for a few seconds, in words that are read out. */
+  tell(text, for_ms = 8000) {
+    this.note = text;
+    say($("said"), text);
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => {
+      this.note = "";
+      say($("said"), "");
+    }, for_ms);
+  }
+}

@@ -1,0 +1,115 @@
+// The recordings that there are: what is in one, its plot, the file itself, a stretch of it behind the scope.
+
+import { get, getArrays } from "../api.js";
+import { $, complain, make } from "../dom.js";
+import { bytes, counted, duration, fromField } from "../numbers.js";
+
+const address = (file, what = "") => `/api/recordings/${encodeURIComponent(file)}${what}`;
+
+export class Recordings {
+  #scope;
+  #shown = null;
+
+  constructor(scope) {
+    this.#scope = scope;
+    $("reread").addEventListener("click", () => this.open());
+  }
+
+  canvases = [];
+
+  async open() {
+    try {
+      const list = await get("/api/recordings");
+      list.sort((a, b) => b.created_unix_s - a.created_unix_s);
+      $("recording-list").tBodies[0].replaceChildren(...list.map((one) => this.#row(one)));
+      complain($("recordings-error"), list.length ? null : "there are no recordings yet");
+    } catch (error) {
+      complain($("recordings-error"), error);
+    }
+  }
+
+  close() {}
+
+  arrange() {}
+
+  #row({ file, complete, duration_s, bytes: size, created_unix_s, trips, captured }) {
+    const made = created_unix_s ? new Date(created_unix_s * 1000).toLocaleString("sv") : "—";
+    const act = (text, action) => make("button", { type: "button", "aria-label": `${text} of ${file}`, click: () => this.#try(action) }, text);
+    return make("tr", { "aria-current": this.#shown === file && "true" },
+      make("th", { scope: "row" }, file),
+      make("td", {}, made), make("td", {}, duration_s == null ? "—" : duration(duration_s, 3)), make("td", {}, bytes(size)),
+      make("td", {}, trips == null ? "—" : String(trips)),
+      make("td", {}, [captured ? "captured" : "", complete ? "" : "growing"].filter(Boolean).join(", ")),
+      make("td", {}, make("span", { class: "bar" },
+        act("Info", () => this.#info(file)),
+        act("Plot", () => this.#plot(file)),
+        act("Compare", () => this.#offer(file)),
+        make("a", { href: address(file), download: file.replace(/\.part$/, ""), "aria-label": `Download ${file}` }, "Download"))));
+  }
+
+  async #try(action) {
+    try {
+      complain($("recordings-error"), null);
+      await action();
+    } catch (error) {
+      complain($("recordings-error"), error);
+    }
+  }
+
+  #show(file, ...content) {
+    this.#shown = file;
+    $("recording-shown").hidden = false;
+    const close = make("button", { type: "button", click: () => ($("recording-shown").hidden = true) }, "Close");
+    $("recording-shown").replaceChildren(make("div", { class: "bar" }, make("b", {}, file), make("span", { class: "gap" }), close), ...content);
+  }
+
+  async #info(file) {
+    const rows = Object.entries(flat(await get(address(file, "/info"))));
+    this.#show(file, make("table", { class: "numbers" }, make("tbody", {}, ...rows.map(([key, value]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, value))))));
+  }
+
+  async #plot(file) {
+    const picture = make("img", { src: address(file, "/plot.png"), alt: `Plot of ${file}: its signals over time` });
+    picture.addEventListener("error", () => complain($("recordings-error"), `${file}: no plot; is matplotlib installed (pip install 'rtloop[plot]')?`));
+    this.#show(file, picture);
+  }
+
+  /** Where in the recording the sweep begins is asked for; from there as long as the scope's screen. */
+  async #offer(file) {
+    const from = make("input", { value: "0", size: 8, id: "compare-from" });
+    const error = make("output", { class: "error", role: "alert" });
+    const form = make("form", { class: "bar", autocomplete: "off" }, make("label", { class: "field", "data-name": "From" }, "from ", from, " s on, as long as the scope's screen"), make("button", { type: "submit", class: "prime" }, "Compare"), error);
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      try {
+        await this.#compare(file, fromField(from));
+        complain(error, null);
+      } catch (failure) {
+        complain(error, failure);
+      }
+    });
+    this.#show(file, form);
+    from.focus();
+  }
+
+  async #compare(file, from_s) {
+    const { signals, seconds, trigger } = this.#scope.view;
+    const asked = `/sweep?signals=${signals}&pixels=${this.#scope.pixels}`;
+    const { first: begin, rate_hz } = await getArrays(address(file, asked));
+    const first = begin + Math.round(from_s * rate_hz);
+    const ticks = Math.max(1, Math.round(seconds * rate_hz));
+    const sweep = await getArrays(address(file, `${asked}&first=${first}&ticks=${ticks}`));
+    const before = trigger.mode === "roll" ? ticks : (ticks * trigger.pre_percent) / 100;
+    const begins = sweep.arrays.offset[0] ?? 0;
+    sweep.arrays.offset = sweep.arrays.offset.map((offset) => offset - begins - before);
+    this.#scope.compare(sweep, `Behind it, faded: ${file} from ${duration(from_s)} on (tick ${counted(first)}).`);
+  }
+}
+
+/** Nested values as "a.b": text; long lists by their length. */
+function flat(value, path = "", found = {}) {
+  if (Array.isArray(value) && value.length > 8) found[path] = `${value.length} values`;
+  else if (value && typeof value === "object") for (const [key, item] of Object.entries(value)) flat(item, path ? `${path}.${key}` : key, found);
+  else found[path] = value == null ? "—" : String(value);
+  return found;
+}

@@ -1,0 +1,77 @@
+"""A stretch of a recording as a sweep, to be compared with what the loop does now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from rtloop.panel.envelope import envelope
+from rtloop.panel.stretch import index_of
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.wishes import MAX_PIXELS
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.seek import Seeker
+from rtloop.recording.file.ticks import LARGEST
+from rtloop.signals import TICK
+
+MOST_VALUES = 10_000_000
+"""In memory for one sweep: 80 MB."""
+MOST_SIGNALS = 8
+
+
+class Wanted(BaseModel):
+    """What is asked for. Without `first` it is the stretch that a cut was asked for, or begins with the recording."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    signals: tuple[str, ...] = Field(min_length=1, max_length=MOST_SIGNALS)
+    first: int | None = Field(default=None, ge=0, le=int(LARGEST))
+    ticks: int | None = Field(default=None, ge=1, le=MOST_VALUES)
+    trigger: int | None = Field(default=None, ge=0, le=int(LARGEST))
+    """The tick that the offsets are counted from; the first one by default."""
+    pixels: int = Field(default=1200, ge=1, le=MAX_PIXELS)
+
+
+def sweep(path: Path, wanted: Wanted) -> bytes:
+    """The frame. Raises ValueError for what the recording does not have, RecordingError."""
+    with Reader(path, tolerant=True) as reader:
+        seeker = Seeker(reader)
+        first, end = _stretch(seeker, wanted)
+        values = _values(seeker, [index_of(name, reader.columns) for name in wanted.signals], first, end)
+        points = envelope(values, wanted.pixels)
+        trigger = first if wanted.trigger is None else wanted.trigger
+        arrays: dict[str, Any] = {"offset": points.sample + (first - trigger)}
+        for name, low, high in zip(wanted.signals, points.low, points.high, strict=True):
+            arrays |= {f"{name}:low": low, f"{name}:high": high}
+        header = {"run": -1, "first": first, "trigger": trigger, "end": end, "cause": "recording", "uncertain_ticks": 0}
+        beside = {"number": 0, "complete": True, "rate_hz": reader.header["rate_hz"], "signals": wanted.signals}
+        return pack("sweep", header | beside | {"file": path.name}, arrays)
+
+
+def _stretch(seeker: Seeker, wanted: Wanted) -> tuple[int, int]:
+    begin, last, cut = seeker.first(), seeker.last(), seeker.reader.header.get("cut")
+    if begin is None or last is None:
+        raise ValueError("the recording holds no ticks")
+    first, end = (begin.first, last.last + 1) if cut is None else (cut["first"], cut["end"])
+    first = first if wanted.first is None else wanted.first
+    end = end if wanted.ticks is None else first + wanted.ticks
+    if not begin.first <= first < end <= last.last + 1:
+        raise ValueError(f"ticks {first} to {end - 1}: not in the recording; {begin.first} to {last.last} are")
+    if (end - first) * len(wanted.signals) > MOST_VALUES:
+        most = MOST_VALUES // len(wanted.signals)
+        raise ValueError(f"ticks: {end - first}; at most {most} of {len(wanted.signals)} signals are shown at once")
+    return first, end
+
+
+def _values(seeker: Seeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
+    """(columns, end − first); NaN for ticks that are not there."""
+    values = np.full((len(columns), end - first), np.nan)
+    for place in range(seeker.reaching(first), min(seeker.reaching(end - 1) + 1, seeker.end)):
+        rows = seeker.rows(place, first, end)
+        if len(rows):
+            values[:, rows[:, TICK].astype(np.intp) - first] = rows[:, columns].T
+    return values

@@ -1,0 +1,97 @@
+"""The folder of recordings: what lies there, said in a line each, and nothing that lies elsewhere."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.errors import RtloopError
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.seek import Seeker
+
+ENDINGS = (".mcap", ".mcap.part")
+MOST_LISTED = 500
+"""The newest ones."""
+BUDGET_S = 1.5
+"""For opening files that were not seen before; of those that are left there is the size alone, until the next time."""
+COUNTED_BYTES = 64 << 20
+"""Of larger files the trips are not counted: for that all of their events would be read."""
+UNKNOWN: dict[str, Any] = dict.fromkeys(("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut"))
+
+
+class Lying(NamedTuple):
+    """A file as it lies there."""
+
+    name: str
+    bytes: int
+    changed_ns: int
+
+
+class Shelf:
+    """The recordings in `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._seen: dict[Lying, dict[str, Any]] = {}
+        self._lock = threading.Lock()
+
+    def listing(self) -> list[dict[str, Any]]:
+        """The newest first: {file, bytes, captured, complete, ticks, duration_s, created_unix_s, trips, cut}.
+
+        What is not known, or not yet, is None.
+        """
+        with self._lock:
+            lying = sorted(self._lying(), key=lambda one: one.changed_ns, reverse=True)[:MOST_LISTED]
+            until_s = time.monotonic() + BUDGET_S
+            seen = {}
+            for one in lying:
+                if one in self._seen:
+                    seen[one] = self._seen[one]
+                elif time.monotonic() < until_s:
+                    seen[one] = _summary(self.folder / one.name, one.bytes)
+            self._seen = seen
+            return [
+                {"file": one.name, "bytes": one.bytes, "captured": ".capture-" in one.name, **seen.get(one, UNKNOWN)}
+                for one in lying
+            ]
+
+    def path(self, name: str) -> Path | None:
+        """Of a recording by its name in the listing; None for everything else, wherever it may point."""
+        return self.folder / name if any(one.name == name for one in self._lying()) else None
+
+    def _lying(self) -> list[Lying]:
+        found = []
+        try:
+            with os.scandir(self.folder) as entries:
+                for entry in entries:
+                    if entry.name.endswith(ENDINGS) and entry.is_file(follow_symlinks=False):
+                        status = entry.stat(follow_symlinks=False)
+                        found.append(Lying(entry.name, status.st_size, status.st_mtime_ns))
+        except OSError:
+            return found  # the folder is not there yet, or a file went away
+        return found
+
+
+def _summary(path: Path, size: int) -> dict[str, Any]:
+    """Of one file, from its beginning and its end."""
+    try:
+        with Reader(path, tolerant=True) as reader:
+            seeker = Seeker(reader)
+            first, last, end, ticks, span_s = seeker.first(), seeker.last(), seeker.final(), 0, 0.0
+            if first is not None and last is not None:
+                ticks = last.last + 1 - first.first
+                span_s = (last.last_ns - first.first_ns) / 1e9 + 1 / reader.header["rate_hz"]
+            events = reader.events if size <= COUNTED_BYTES else None
+            return {
+                "complete": bool(end and end["complete"]),
+                "ticks": end["ticks_logged"] if end else ticks,
+                "duration_s": span_s,
+                "created_unix_s": reader.header["created_unix_ns"] / 1e9,
+                "trips": None if events is None else sum(event["kind"] == "tripped" for event in events),
+                "cut": reader.header.get("cut"),
+            }
+    except RtloopError:
+        return UNKNOWN

@@ -1,0 +1,47 @@
+"""What was commanded, tripped and changed, as the loop said it: the last of it, in words, for all clients."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+from rtloop.engine.messages import Kind, Origin
+from rtloop.errors import RtloopError
+from rtloop.panel.views.link import Description, Service
+from rtloop.recording.file.events import Event, event_of
+
+KEPT = 200
+
+
+class Events:
+    """The last KEPT, numbered from 1 on."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._kept: deque[tuple[int, Event]] = deque(maxlen=KEPT)
+        self._count = 0
+        self._lock = threading.Lock()
+
+    def take(self, messages: Any, loop: Description, run: int) -> None:
+        """Add records of MESSAGE, (n,), of the run that is read; who asked is asked of the service."""
+        for message in messages[-KEPT:]:
+            time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
+            event = event_of(message, tuple(loop.axes), time_ns, name=self._name(message))
+            with self._lock:
+                self._count += 1
+                self._kept.append((self._count, {**event, "run": run}))
+
+    def after(self, number: int) -> tuple[int, list[Event]]:
+        """The number of the newest, and those that are kept behind `number`."""
+        with self._lock:
+            return self._count, [event for at, event in self._kept if at > number]
+
+    def _name(self, message: Any) -> str | None:
+        """Of the operator; None where no name was given, or the service does not answer."""
+        if int(message["kind"]) >= Kind.REFUSED or int(message["origin"]) != Origin.OPERATOR:
+            return None
+        try:
+            return self._service.client.get(f"/asked_by?identity={int(message['identity'])}")["name"]
+        except (RtloopError, KeyError, TypeError):
+            return None

@@ -1,0 +1,81 @@
+"""The service that a panel looks at: its control socket, and what it says of the loop that runs."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.service.client import Client
+from rtloop.signals import Signal
+
+KEPT_S = 1.0
+
+
+@dataclass(frozen=True)
+class Description:
+    """Of a loop: what its records hold, where they lie, and what it is configured for."""
+
+    name: str
+    rate_hz: float
+    columns: tuple[Signal, ...]
+    block: Path
+    recordings: Path
+    values: dict[str, Any]
+    """The configuration as it runs."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns."""
+        return tuple(column.name for column in self.columns)
+
+    @property
+    def axes(self) -> dict[str, dict[str, Any]]:
+        """What is configured of each."""
+        return {axis["name"]: axis for axis in self.values["axis"]}
+
+    def unit(self, name: str) -> str:
+        """Of a signal. Raises ValueError for one that the loop does not have."""
+        for column in self.columns:
+            if column.name == name:
+                return column.unit
+        raise ValueError(f"signal {name!r}: not in the record; {', '.join(self.names)} are")
+
+
+class Service:
+    """The service behind the control socket at `path`, whether or not it runs now."""
+
+    def __init__(self, path: Path) -> None:
+        self.client = Client(path)
+        self._kept: tuple[float, Description] | None = None
+
+    def describe(self) -> Description:
+        """As it runs now, at most KEPT_S old. Raises UnavailableError where no loop runs."""
+        kept = self._kept
+        if kept is not None and time.monotonic() - kept[0] < KEPT_S:
+            return kept[1]
+        return self.describe_anew()
+
+    def describe_anew(self) -> Description:
+        """As `describe`, asked for now."""
+        try:
+            said = self.client.get("/configuration")
+            description = Description(
+                name=said["name"],
+                rate_hz=float(said["rate_hz"]),
+                columns=tuple(Signal(**column) for column in said["columns"]),
+                block=Path(said["block"]),
+                recordings=Path(said["recordings"]),
+                values=said["values"],
+            )
+        except UnavailableError:
+            raise
+        except RtloopError as error:
+            raise UnavailableError(str(error)) from None
+        except (KeyError, TypeError):
+            said = "a service of another version, which does not say where its ticks are"
+            raise UnavailableError(f"{self.client.path}: {said}") from None
+        self._kept = time.monotonic(), description
+        return description

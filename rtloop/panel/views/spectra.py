@@ -1,0 +1,58 @@
+"""One client's spectrum of a signal, averaged since it was asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.panel.spectrum import Spectrum
+from rtloop.panel.stretch import Stretch
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.wishes import SpectrumWish
+
+
+class Analyser:
+    """Of the signal that is wished. Raises ValueError for one that the loop does not have."""
+
+    def __init__(self, wish: SpectrumWish, loop: Description) -> None:
+        self._wish, self._rate_hz = wish, loop.rate_hz
+        self._spectrum = Spectrum(loop.rate_hz, loop.unit(wish.signal))
+        self._run = -1
+
+    def rewished(self, wish: SpectrumWish, loop: Description) -> bool:
+        """Take over `wish` where it is of the same signal: what was averaged stays."""
+        if (wish.signal, loop.rate_hz) != (self._wish.signal, self._rate_hz):
+            return False
+        loop.unit(wish.signal)
+        self._wish = wish
+        return True
+
+    def reset(self) -> None:
+        """Average anew."""
+        self._spectrum.reset()
+
+    def feed(self, stretch: Stretch) -> None:
+        """Average what came; another run begins anew."""
+        if stretch.run != self._run:
+            self._run = stretch.run
+            self.reset()
+        self._spectrum.feed(stretch[self._wish.signal], stretch.periods(self._rate_hz))
+
+    def frame(self) -> bytes:
+        """As it is now."""
+        density, wish = self._spectrum.density(), self._wish
+        averages = density.averages
+        return pack(
+            "spectrum",
+            {
+                "signal": wish.signal,
+                "unit": density.unit,
+                "rms": density.rms(wish.low_hz, wish.high_hz),
+                "low_hz": wish.low_hz,
+                "high_hz": wish.high_hz,
+                "averages_least": int(np.min(averages, initial=averages.max(initial=0))),
+                "averages_most": int(averages.max(initial=0)),
+                "bridged": self._spectrum.bridged,
+            },
+            {"hz": density.hz, "amplitude": density.amplitude, "averages": averages},
+        )

@@ -1,0 +1,46 @@
+"""What the service says of itself twenty times a second, heard once for all clients."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from rtloop.errors import RtloopError
+from rtloop.service.client import Client
+
+AGAIN_S = 0.5
+SILENT_S = 1.0
+"""A service that says nothing for so long is not there."""
+UNREACHABLE = "unreachable"
+
+
+class State:
+    """Listens to `/watch` in a thread of its own, and again where that ends."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._said: dict[str, Any] = {}
+        self._heard_s = float("-inf")
+        self._fault = "nothing was heard yet"
+        self._thread = threading.Thread(target=self._listen, name="state", daemon=True)
+
+    def start(self) -> None:
+        """Begin to listen, for as long as the process lives."""
+        self._thread.start()
+
+    @property
+    def now(self) -> dict[str, Any]:
+        """What was said last; `state` is unreachable, with an `error`, where nothing is said any more."""
+        if time.monotonic() - self._heard_s > SILENT_S:
+            return {"state": UNREACHABLE, "lock": None, "error": self._fault}
+        return self._said
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                for said in self._client.watch():
+                    self._said, self._heard_s = said, time.monotonic()
+            except RtloopError as error:
+                self._fault = str(error)
+            time.sleep(AGAIN_S)

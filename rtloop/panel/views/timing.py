@@ -1,0 +1,127 @@
+"""How late the ticks of the last minute woke, for all clients: a histogram a second, and what it says of the host."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.panel.stretch import Stretch
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.signals import COMMON, DEADLINE, EXEC, LATENESS, PERIODS_MISSED
+
+WINDOW_S = 60
+FINE_PER_DECADE, SHOWN_PER_DECADE = 100, 10
+DECADES = (-1, 6)
+"""Of µs: what is below the first is counted with it, what is beyond the last likewise."""
+LATE_SHARE = 0.001
+"""More ticks than that later than a period speak against a host, as `rtloop doctor` has it."""
+WORSE = 2.0
+"""p99 of the last ten seconds against that of the minute."""
+RECENT_S = 10
+MATTERS = 0.05
+"""Of a period: less does not matter, however much worse it got."""
+EDGES_US = 10.0 ** np.linspace(*DECADES, (DECADES[1] - DECADES[0]) * FINE_PER_DECADE + 1)
+_LATENESS, _EXEC, _DEADLINE, _MISSED = (COMMON[i].name for i in (LATENESS, EXEC, DEADLINE, PERIODS_MISSED))
+
+
+class Second:
+    """What is kept of a second."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.late, self.executed = np.zeros((2, EDGES_US.size - 1))
+        self.worst_us = self.missed = self.beyond = 0.0
+
+
+class Timing:
+    """Of the ticks that are fed."""
+
+    def __init__(self, loop: Description) -> None:
+        self._period_us = 1e6 / loop.rate_hz
+        self._seconds: deque[Second] = deque(maxlen=WINDOW_S)
+
+    def feed(self, stretch: Stretch) -> None:
+        """Count them, each in its second."""
+        seconds = (stretch[_DEADLINE] // 1_000_000_000).astype(np.int64)
+        ends = np.append(np.flatnonzero(np.diff(seconds)) + 1, seconds.size)
+        first = 0
+        for end in ends.tolist():
+            part = slice(first, end)
+            second = self._second(int(seconds[first]))
+            late_us = stretch[_LATENESS][part]
+            second.late += _counted(late_us)
+            second.executed += _counted(stretch[_EXEC][part])
+            second.worst_us = max(second.worst_us, float(np.nan_to_num(late_us).max()))
+            second.beyond += float(np.count_nonzero(late_us > self._period_us))
+            second.missed += float(stretch[_MISSED][part].sum())
+            first = end
+
+    def frame(self) -> bytes:
+        """The last minute."""
+        kept = [one for one in self._seconds if one.number > self._seconds[-1].number - WINDOW_S]
+        late, executed = (sum((getattr(one, name) for one in kept), _none()) for name in ("late", "executed"))
+        step = FINE_PER_DECADE // SHOWN_PER_DECADE
+        return pack(
+            "timing",
+            {
+                "window_s": len(kept),
+                "ticks": int(late.sum()),
+                "worst_us": max((one.worst_us for one in kept), default=0.0),
+                "periods_missed": int(sum(one.missed for one in kept)),
+                "p50_us": quantile_us(late, 0.5),
+                "p99_us": quantile_us(late, 0.99),
+                "exec_p50_us": quantile_us(executed, 0.5),
+                "exec_p99_us": quantile_us(executed, 0.99),
+                "advice": self._advice(kept, late),
+            },
+            {"edges_us": EDGES_US[::step], "counts": late.reshape(-1, step).sum(axis=1)},
+        )
+
+    def _second(self, number: int) -> Second:
+        if self._seconds and number < self._seconds[-1].number:
+            self._seconds.clear()
+        if not self._seconds or self._seconds[-1].number != number:
+            self._seconds.append(Second(number))
+        return self._seconds[-1]
+
+    def _advice(self, kept: list[Second], late: Real) -> list[str]:
+        """What `rtloop doctor` would say of these ticks; empty where nothing speaks against the host."""
+        ticks, found = late.sum(), []
+        worst_us = max((one.worst_us for one in kept), default=0.0)
+        beyond, missed = sum(one.beyond for one in kept), int(sum(one.missed for one in kept))
+        if ticks and beyond / ticks >= LATE_SHARE:
+            found.append(f"{100 * beyond / ticks:.2f} % of the ticks were late by more than a period")
+        elif worst_us > self._period_us:
+            found.append(f"a tick was {worst_us:.0f} µs late, and {missed} periods were missed")
+        recent = sum((one.late for one in kept[-RECENT_S:]), _none())
+        now_us, all_us = quantile_us(recent, 0.99), quantile_us(late, 0.99)
+        if (
+            len(kept) > 2 * RECENT_S
+            and now_us
+            and all_us
+            and now_us > WORSE * all_us
+            and now_us > 0.05 * self._period_us
+        ):
+            found.append(f"it gets worse: one tick in a hundred of the last {RECENT_S} s was {now_us:.0f} µs late")
+        if found:
+            found.append("`rtloop doctor CONFIG` looks for the cause on this host, and says what mends it")
+        return found
+
+
+def quantile_us(counts: Real, part: float) -> float | None:
+    """Within the bin by a straight line; None without ticks, as in virtual time."""
+    below = np.concatenate([[0.0], np.cumsum(counts)])
+    return float(np.interp(part * below[-1], below, EDGES_US)) if below[-1] else None
+
+
+def _counted(values_us: Real) -> Real:
+    values_us = values_us[np.isfinite(values_us)]
+    places = np.searchsorted(EDGES_US, values_us, side="right") - 1
+    return np.bincount(np.clip(places, 0, EDGES_US.size - 2), minlength=EDGES_US.size - 1).astype(float)
+
+
+def _none() -> Real:
+    return np.zeros(EDGES_US.size - 1)

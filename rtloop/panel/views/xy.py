@@ -1,0 +1,88 @@
+"""Drive against position of an axis, and the loop that its model of the hysteresis draws over the same drive."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.hysteresis.loop_shape import loop_shape
+from rtloop.hysteresis.plays import model_output
+from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
+from rtloop.panel.views.wishes import XyWish
+
+KIND = "prandtl_ishlinskii"
+BINS = 1000
+"""Stretches of time, of each of which the extremes of drive and position are shown: 4 points at most."""
+MODEL_BINS = 400
+WARM_BINS = 400
+"""The drive before, as coarse, is what the model remembers."""
+
+
+class Drawn:
+    """What `wish` shows. Raises ValueError for an axis that the loop does not have."""
+
+    def __init__(self, wish: XyWish, loop: Description) -> None:
+        if wish.axis not in loop.axes:
+            raise ValueError(f"xy.axis: {wish.axis!r}; {', '.join(loop.axes)} are there")
+        self._wish = wish
+        self._ticks = max(round(wish.seconds * loop.rate_hz), 2)
+        self._signals = [f"{wish.axis}_drive_v", f"{wish.axis}_position_um"]
+        self._model = play_model(loop.axes[wish.axis])
+
+    def frame(self, past: Past) -> bytes:
+        """The last seconds."""
+        first, end = past.end - self._ticks, past.end
+        drive, position = past.values(self._signals, first, end)
+        good = np.isfinite(drive) & np.isfinite(position)
+        drive, position = drive[good], position[good]
+        shown = extremes([drive, position], BINS)
+        header: dict[str, Any] = {"axis": self._wish.axis, "run": past.run, "end": end, "loop_percent": None}
+        arrays = {"drive_v": drive[shown], "position_um": position[shown]}
+        if drive.size and np.ptp(drive) > 0:
+            percent = loop_shape(drive[shown], position[shown]).percent
+            header["loop_percent"] = percent if np.isfinite(percent) else None
+        if self._model is not None and drive.size:
+            arrays |= self._modelled(past, first, drive, position, header)
+        return pack("xy", header, arrays)
+
+    def _modelled(self, past: Past, first: int, drive: Real, position: Real, header: dict[str, Any]) -> dict[str, Real]:
+        """The model's loop, moved to where the measured one lies; `offset_um` says by how much."""
+        assert self._model is not None
+        turns = extremes([drive], MODEL_BINS)
+        before = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), max(first, 1), WARM_BINS // 2)
+        warm = np.stack([before.low[0], before.high[0]], axis=-1).ravel()
+        warm = warm[np.isfinite(warm)]
+        whole = model_output(self._model, np.concatenate([warm, drive[turns]]))[warm.size :]
+        offset_um = float(np.mean(position[turns]) - np.mean(whole))
+        header["offset_um"] = offset_um
+        return {"model_drive_v": drive[turns], "model_position_um": whole + offset_um}
+
+
+def play_model(axis: dict[str, Any]) -> PlayModel | None:
+    """That of an axis's feedforward; None where it has none."""
+    feedforward = axis.get("feedforward") or {}
+    if feedforward.get("kind", KIND) != KIND:
+        return None
+    try:
+        return PrandtlIshlinskiiOptions.model_validate(feedforward).actuator()
+    except ValueError:
+        return None
+
+
+def extremes(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+    """Places of the smallest and the largest of each signal (n,) in each of `bins` stretches, in order; all of few."""
+    count = signals[0].size
+    if count <= 2 * len(signals) * bins:
+        return np.arange(count)
+    first = -(-np.arange(bins + 1) * count // bins)
+    lengths = np.diff(first)
+    places = first[:-1, None] + np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
+    rows = np.arange(bins)
+    found = [places[rows, pick(signal[places], axis=-1)] for signal in signals for pick in (np.argmin, np.argmax)]
+    return np.unique(np.concatenate(found))

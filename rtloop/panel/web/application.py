@@ -1,0 +1,100 @@
+"""The panel's application: pages, sessions, what the loop is, the control API, and `/live`."""
+
+from __future__ import annotations
+
+import mimetypes
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import anyio.to_thread
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+
+from rtloop.errors import RtloopError
+from rtloop.panel.viewers.foxglove import Foxglove
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.link import Service
+from rtloop.panel.views.state import State
+from rtloop.panel.web import recordings
+from rtloop.panel.web.live import Live
+from rtloop.panel.web.loop import loop_for_pages
+from rtloop.panel.web.measure import measure
+from rtloop.panel.web.proxy import Proxy, decoded, limited_body
+from rtloop.panel.web.rates import Rate
+from rtloop.panel.web.security import Guard, Sessions, session_cookie
+
+PAGE = Path(__file__).resolve().parents[1] / "page"
+MOST_TOKEN_BYTES = 4096
+
+
+class Pages(StaticFiles):
+    """Files of the page, asked for again each time: they change with the program."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        """The file, or that it has not changed."""
+        response = super().file_response(*args, **kwargs)
+        response.headers["cache-control"] = "no-cache"
+        return response
+
+
+def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
+    """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
+    feed, state, tries = Feed(service), State(service.client), Rate(per_s=5.0, burst=20)
+    mimetypes.add_type("text/javascript", ".js")
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        feed.start()
+        state.start()
+        yield
+        await anyio.to_thread.run_sync(feed.end)
+
+    async def index(_: Request) -> Response:
+        return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
+
+    async def session(request: Request) -> Response:
+        if not tries.allows():
+            return JSONResponse({"error": f"more than {tries} tries; try again"}, status_code=429)
+        try:
+            body = await limited_body(request, MOST_TOKEN_BYTES)
+            said = decoded(body or b"")
+        except ClientDisconnect:
+            return Response()
+        except ValueError:
+            said = None
+        token = said.get("token") if isinstance(said, dict) else None
+        secret = sessions.begin(token) if isinstance(token, str) else None
+        if secret is None:
+            return JSONResponse({"error": "this is not the token of the panel that runs"}, status_code=401)
+        answer = Response(status_code=204)
+        answer.set_cookie(**session_cookie(sessions, secret))
+        return answer
+
+    def panel(_: Request) -> Response:
+        try:
+            return JSONResponse(loop_for_pages(service.describe()))
+        except RtloopError as error:
+            return JSONResponse({"error": str(error)}, status_code=503)
+
+    routes: Sequence[BaseRoute] = [
+        Route("/", index),
+        Mount("/page", Pages(directory=PAGE)),
+        Route("/session", session, methods=["POST"]),
+        Route("/api/panel", panel),
+        Route("/api/measure", partial(measure, feed)),
+        *Proxy(service).routes(),
+        *recordings.routes(service, lambda: feed.run),
+        WebSocketRoute("/live", Live(feed, state).serve),
+    ]
+    guard = Middleware(Guard, sessions=sessions)
+    if viewers_token is not None:
+        foxglove = Foxglove(feed, viewers_token)
+        routes, guard = [*routes, foxglove.route], Middleware(Guard, sessions=sessions, also=foxglove.admits)
+    return Starlette(routes=routes, middleware=[guard], lifespan=lifespan)

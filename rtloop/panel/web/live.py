@@ -1,0 +1,97 @@
+"""`/live`: one task takes what a client wishes, one sends it what is due. A client that takes nothing is dropped."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+
+import anyio
+import anyio.to_thread
+from anyio import CancelScope, CapacityLimiter
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.state import State
+from rtloop.panel.views.viewer import FRAME_S, Viewer
+
+MAX_STREAMS = 16
+TAKE_S = 10.0
+"""A client that takes nothing for so long is dropped."""
+WISHES_PER_S = 50.0
+BUILDERS = 2
+"""Threads that make frames, for all clients."""
+CLOSE_S = 1.0
+ENDS = (WebSocketDisconnect, TimeoutError, RuntimeError, OSError)
+"""How a client's going shows, or its taking nothing."""
+Work = Callable[[WebSocket, Viewer], Awaitable[None]]
+
+
+class Stream(WebSocketsSansIOProtocol):
+    """A WebSocket that is cut off soon after it was closed, whatever its client has not taken by then."""
+
+    async def run_asgi(self) -> None:
+        """Serve it, then end it."""
+        await super().run_asgi()
+        self.loop.call_later(CLOSE_S, self.transport.abort)
+
+    def handle_parser_exception(self) -> None:
+        """End what is no WebSocket, at once where it never was one."""
+        if self.conn.close_sent is None:
+            self.transport.abort()
+        else:
+            super().handle_parser_exception()
+
+
+class Live:
+    """The endpoint."""
+
+    def __init__(self, feed: Feed, state: State) -> None:
+        self._feed, self._state = feed, state
+        self._streams = 0
+        self._limiter = CapacityLimiter(BUILDERS)
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Serve one client; refuse it where there are MAX_STREAMS."""
+        if self._streams >= MAX_STREAMS:
+            await socket.close(1013)
+            return
+        self._streams += 1
+        viewer = Viewer(self._feed, self._state)
+        try:
+            await socket.accept()
+            self._feed.join(viewer)
+            try:
+                async with anyio.create_task_group() as both:
+                    for work in (self._listen, self._tell):
+                        both.start_soon(self._until_its_end, work, socket, viewer, both.cancel_scope)
+            finally:
+                self._feed.leave(viewer)
+            with suppress(*ENDS), anyio.move_on_after(CLOSE_S):
+                await socket.close(1001)
+        finally:
+            self._streams -= 1
+
+    async def _until_its_end(self, work: Work, socket: WebSocket, viewer: Viewer, both: CancelScope) -> None:
+        """The end of one is the end of the other."""
+        with suppress(*ENDS):
+            await work(socket, viewer)
+        both.cancel()
+
+    async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
+        while True:
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            await anyio.to_thread.run_sync(viewer.wish, message.get("text") or "", limiter=self._limiter)
+            await anyio.sleep(1 / WISHES_PER_S)
+
+    async def _tell(self, socket: WebSocket, viewer: Viewer) -> None:
+        clock = anyio.current_time
+        due_s = clock()
+        while True:
+            for frame in await anyio.to_thread.run_sync(viewer.due, limiter=self._limiter):
+                with anyio.fail_after(TAKE_S):
+                    await socket.send_bytes(frame)
+            due_s = max(due_s + FRAME_S, clock())
+            await anyio.sleep(max(due_s - clock(), 0.0))

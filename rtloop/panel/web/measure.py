@@ -1,0 +1,64 @@
+"""What lies between two cursors: exact figures of every tick there, which no envelope knows."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+
+from rtloop.panel.views.feed import Feed
+
+MOST_SIGNALS = 8
+
+
+class Gone(Exception):
+    """The ticks are not kept any more, or not yet there."""
+
+
+def figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
+    """Of ticks `first` … `end` − 1, those that were lost left out. Raises Gone, and ValueError for bad requests."""
+    if not 0 < len(signals) <= MOST_SIGNALS:
+        raise ValueError(f"signals: {len(signals)} are asked for; 1 to {MOST_SIGNALS} are allowed")
+    if not first < end:
+        raise ValueError(f"end: {end}; more than first, {first}, is needed")
+    with feed.lock:
+        past = feed.past
+        if past is None or past.run != run or first < past.begin or end > past.end:
+            raise Gone("these ticks are not kept any more")
+        values = past.values(signals, first, end)
+    found = {}
+    for name, row in zip(signals, values, strict=True):
+        there = row[np.isfinite(row)]
+        if there.size == 0:
+            raise Gone("these ticks are lost")
+        low, high = float(there.min()), float(there.max())
+        found[name] = {
+            "rms": float(np.sqrt(np.mean(there**2))),
+            "mean": float(there.mean()),
+            "std": float(there.std()),
+            "low": low,
+            "high": high,
+            "peak_to_peak": high - low,
+        }
+    return found
+
+
+async def measure(feed: Feed, request: Request) -> Response:
+    """`/api/measure?run=R&first=TICK&end=TICK&signals=a,b`."""
+    query = request.query_params
+    try:
+        run, first, end = (_integer(name, query.get(name, "")) for name in ("run", "first", "end"))
+        signals = query.get("signals", "").split(",")
+        return JSONResponse(await asyncio.to_thread(figures, feed, run, first, end, signals))
+    except Gone as error:
+        return JSONResponse({"error": str(error)}, status_code=410)
+    except ValueError as error:
+        return JSONResponse({"error": str(error)}, status_code=422)
+
+
+def _integer(name: str, text: str) -> int:
+    if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) < 16):
+        raise ValueError(f"{name}: {text[:40]!r}; a whole number is needed")
+    return int(text)

@@ -1,0 +1,90 @@
+"""The control API for pages: requests are handed to the control socket as they are, and so are its answers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from rtloop.errors import HostRefused, UnavailableError
+from rtloop.panel.views.link import Service
+from rtloop.panel.web.rates import Rate
+from rtloop.service.api.bodies import MAX_BODY_BYTES
+from rtloop.service.api.lanes import Busy, Lane, Lanes
+
+READ = ("status", "configuration", "metrics", "openapi.json")
+COMMANDS = {
+    **dict.fromkeys(("arm", "start", "mode", "reference", "setpoint", "waveform", "lock"), Lane.ORDINARY),
+    **dict.fromkeys(("tune", "controller", "preview", "undo"), Lane.BUILD),
+    **dict.fromkeys(("stop", "reset"), Lane.SAFETY),
+    "response": Lane.MEASUREMENT,
+}
+SMALL_BYTES = 1 << 16
+LARGE = {"waveform": MAX_BODY_BYTES}
+"""Bodies that may have more than SMALL_BYTES."""
+TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: 150.0}
+
+
+class Proxy:
+    """Hands requests on, each kind in threads of its own: a stop waits for no other request."""
+
+    def __init__(self, service: Service) -> None:
+        self._service, self._lanes = service, Lanes()
+        self._rate = Rate(per_s=50.0, burst=100)
+
+    def routes(self) -> Sequence[BaseRoute]:
+        """Of what is handed on."""
+        return [
+            *(Route(f"/api/{name}", self._read) for name in READ),
+            *(Route(f"/api/{name}", self._command, methods=["POST"]) for name in COMMANDS),
+            Route("/api/lock", self._command, methods=["DELETE"]),
+        ]
+
+    async def _read(self, request: Request) -> Response:
+        return await self._hand_on(request, Lane.ORDINARY, b"")
+
+    async def _command(self, request: Request) -> Response:
+        name = request.url.path.rpartition("/")[2]
+        lane = COMMANDS[name]
+        if lane is not Lane.SAFETY and not self._rate.allows():
+            return JSONResponse({"error": f"more than {self._rate} commands; try again"}, status_code=429)
+        most = LARGE.get(name, SMALL_BYTES)
+        try:
+            body = await limited_body(request, most)
+        except ClientDisconnect:
+            return Response()
+        if body is None:
+            return JSONResponse({"error": f"request body: more than {most} bytes"}, status_code=413)
+        return await self._hand_on(request, lane, body)
+
+    async def _hand_on(self, request: Request, lane: Lane, body: bytes) -> Response:
+        resource = request.url.path.removeprefix("/api")
+        if request.url.query:
+            resource += f"?{request.url.query}"
+        exchange = self._service.client.exchange
+        try:
+            code, kind, data = await self._lanes.run(lane, exchange, request.method, resource, body, TIMEOUT_S[lane])
+        except (UnavailableError, HostRefused, Busy) as error:
+            return JSONResponse({"error": str(error)}, status_code=503)
+        return Response(data, code, media_type=kind)
+
+
+async def limited_body(request: Request, most: int) -> bytes | None:
+    """The body; None where it has more than `most` bytes, whose rest is not read. Raises ClientDisconnect."""
+    data = bytearray()
+    async for part in request.stream():
+        data += part
+        if len(data) > most:
+            return None
+    return bytes(data)
+
+
+def decoded(data: bytes) -> object:
+    """What JSON says. Raises ValueError for what is none, or too deep."""
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("too many tables and lists within each other") from None

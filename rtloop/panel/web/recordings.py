@@ -1,0 +1,224 @@
+"""Recordings for pages: the list, files, figures, pictures, sweeps to compare with, and captures of what runs.
+
+What takes long runs in a process of its own, few at a time; a sweep reads of a file what it shows.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, Self
+from urllib.parse import quote
+
+import anyio.to_thread
+from anyio import CapacityLimiter
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Route
+
+from rtloop.configuration.file import describe
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.panel.capture import Run, present_run
+from rtloop.panel.shelf.aside import Aside, Crowded
+from rtloop.panel.shelf.reference import Wanted, sweep
+from rtloop.panel.shelf.shelf import Shelf
+from rtloop.panel.views.link import Service
+from rtloop.panel.web.proxy import limited_body
+from rtloop.recording.file.ticks import LARGEST
+
+READING_AT_A_TIME = 2
+MOST_BODY_BYTES = 4096
+LONGEST_S, AHEAD_S = 600.0, 60.0
+BLOCK_BYTES = 1 << 16
+
+Handler = Callable[[Any, Request], Awaitable[Response]]
+
+
+class Refused(Exception):
+    """An answer that is no success: its code, and why."""
+
+    def __init__(self, code: int, error: str) -> None:
+        super().__init__(error)
+        self.code = code
+
+
+class CaptureBody(BaseModel):
+    """Ticks `first` to before `end` of the run with a number, or the last `seconds`."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    run: int | None = None
+    first: int | None = Field(default=None, ge=-LARGEST, le=LARGEST)
+    end: int | None = Field(default=None, ge=1, le=LARGEST)
+    seconds: float | None = Field(default=None, gt=0, le=LONGEST_S)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.seconds is None) != (self.first is not None and self.end is not None):
+            raise ValueError("one of `seconds`, and `first` with `end`, is needed")
+        if self.first is not None and self.end is not None and self.end <= self.first:
+            raise ValueError(f"end: {self.end}; more than first, {self.first}, is allowed")
+        return self
+
+
+class Span(BaseModel):
+    """Of a picture, in s since the start of the run."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    from_s: float = Field(default=0.0, ge=0, le=1e9, alias="from")
+    until: float | None = Field(default=None, gt=0, le=1e9)
+
+
+def _answers(handler: Handler) -> Handler:
+    """What goes wrong becomes an answer that says why."""
+
+    @wraps(handler)
+    async def answering(self: Any, request: Request) -> Response:
+        try:
+            return await handler(self, request)
+        except ClientDisconnect:
+            return Response()
+        except (Refused, Crowded, RtloopError, ValueError) as error:
+            return JSONResponse({"error": str(error)}, _code_of(error))
+
+    return answering
+
+
+def _code_of(error: Exception) -> int:
+    if isinstance(error, Refused):
+        return error.code
+    return 503 if isinstance(error, Crowded | UnavailableError) else 422
+
+
+class Recordings:
+    """The recordings of a service; `run` is the number of the run that is shown now."""
+
+    def __init__(self, service: Service, run: Callable[[], int]) -> None:
+        self._service, self._run = service, run
+        self._aside, self._readers = Aside(), CapacityLimiter(READING_AT_A_TIME)
+        self._shelf: Shelf | None = None
+
+    def routes(self) -> Sequence[BaseRoute]:
+        """Of all of them."""
+        one = "/api/recordings/{file}"
+        return [
+            Route("/api/recordings", self.listing),
+            Route(one, self.download),
+            Route(f"{one}/info", self.info),
+            Route(f"{one}/plot.png", self.plot),
+            Route(f"{one}/sweep", self.sweep),
+            Route("/api/capture", self.capture, methods=["POST"]),
+        ]
+
+    @_answers
+    async def listing(self, _: Request) -> Response:
+        """What lies in the folder."""
+        return JSONResponse(await self._read(lambda: self._folder().listing()))
+
+    @_answers
+    async def download(self, request: Request) -> Response:
+        """A file; of one that grows, what it holds now."""
+        path = await self._path(request)
+        if path.suffix == ".mcap":
+            return FileResponse(path, filename=path.name, media_type="application/octet-stream")
+        size = path.stat().st_size
+        named = f"attachment; filename*=utf-8''{quote(path.name)}"
+        headers = {"content-length": str(size), "content-disposition": named}
+        return StreamingResponse(_blocks(path, size), headers=headers, media_type="application/octet-stream")
+
+    @_answers
+    async def info(self, request: Request) -> Response:
+        """What `rtloop info --json` says."""
+        return JSONResponse(await self._aside.run("rtloop", "info", await self._path(request), "--json"))
+
+    @_answers
+    async def plot(self, request: Request) -> Response:
+        """What `rtloop plot` draws; `from` and `until` in s."""
+        path = await self._path(request)
+        asked = _checked(Span, dict(request.query_params))
+        span = [f"--{name}={value}" for name, value in asked.model_dump(by_alias=True, exclude_none=True).items()]
+        with tempfile.TemporaryDirectory(prefix="rtloop-panel-") as folder:
+            picture = Path(folder) / "plot.png"
+            await self._aside.run("rtloop", "plot", path, "--out", picture, "--json", *span)
+            return Response(await anyio.to_thread.run_sync(picture.read_bytes), media_type="image/png")
+
+    @_answers
+    async def sweep(self, request: Request) -> Response:
+        """A stretch as the scope shows it."""
+        path, asked = await self._path(request), dict(request.query_params)
+        wanted = _checked(Wanted, asked | {"signals": tuple(asked.get("signals", "").split(","))})
+        return Response(await self._read(lambda: sweep(path, wanted)), media_type="application/octet-stream")
+
+    @_answers
+    async def capture(self, request: Request) -> Response:
+        """A stretch of the run that is shown as a recording of its own, replayed."""
+        data = await limited_body(request, MOST_BODY_BYTES)
+        if data is None:
+            raise Refused(413, f"request body: more than {MOST_BODY_BYTES} bytes")
+        body = _checked(CaptureBody, data)
+        if body.run not in (None, self._run()):
+            raise Refused(410, f"run {body.run}: the loop was started anew since; its recording is in the list")
+        run = await self._read(lambda: present_run(self._service.client))
+        first, end = await self._read(lambda: self._stretch(body, run))
+        socket = self._service.client.path.resolve()
+        return JSONResponse(await self._aside.run("rtloop.panel.capture", socket, run.file, first, end))
+
+    def _stretch(self, body: CaptureBody, run: Run) -> tuple[int, int]:
+        rate_hz = self._service.describe().rate_hz
+        if body.first is None or body.end is None:
+            assert body.seconds is not None
+            return max(run.tick + 1 - round(body.seconds * rate_hz), 0), run.tick + 1
+        if body.end - body.first > LONGEST_S * rate_hz:
+            raise ValueError(f"ticks {body.first} to {body.end}: at most {LONGEST_S:g} s are captured at once")
+        if body.end > run.tick + AHEAD_S * rate_hz:
+            raise ValueError(
+                f"end: {body.end}; at most {AHEAD_S:g} s behind the newest tick, {run.tick}, are waited for"
+            )
+        return max(body.first, 0), body.end
+
+    def _folder(self) -> Shelf:
+        """Where the service has its recordings, or had them when it answered last. Raises UnavailableError."""
+        try:
+            folder = self._service.describe().recordings
+        except UnavailableError:
+            if self._shelf is None:
+                raise
+            return self._shelf
+        if self._shelf is None or self._shelf.folder != folder:
+            self._shelf = Shelf(folder)
+        return self._shelf
+
+    async def _path(self, request: Request) -> Path:
+        name = request.path_params["file"]
+        path = await self._read(lambda: self._folder().path(name))
+        if path is None:
+            raise Refused(404, f"{name[:100]!r}: no recording of this name is in the folder of recordings")
+        return path
+
+    async def _read(self, action: Callable[[], Any]) -> Any:
+        return await anyio.to_thread.run_sync(action, limiter=self._readers)
+
+
+def routes(service: Service, run: Callable[[], int]) -> Sequence[BaseRoute]:
+    """The routes of a service's recordings."""
+    return Recordings(service, run).routes()
+
+
+def _blocks(path: Path, size: int) -> Iterator[bytes]:
+    """The first `size` bytes of a file."""
+    with path.open("rb") as file:
+        while size > 0 and (block := file.read(min(size, BLOCK_BYTES))):
+            size -= len(block)
+            yield block
+
+
+def _checked(model: type[Any], given: Any) -> Any:
+    """What was asked for. Raises ValueError."""
+    try:
+        return model.model_validate_json(given) if isinstance(given, bytes) else model.model_validate(given)
+    except ValidationError as error:
+        raise ValueError("; ".join(describe(error, "", None))) from None

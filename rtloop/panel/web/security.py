@@ -1,0 +1,125 @@
+"""Who may talk to the panel: whoever knows its token, from a page of its own, on this host.
+
+A browser sends requests for any page that is open in it. So the host must be named as this one (else a name that its
+owner points here would do), the origin must be this page's, and a session is a cookie that no other site's page is
+allowed to send along.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+LOOPBACK = frozenset(("127.0.0.1", "localhost", "::1"))
+MAX_SESSIONS = 256
+TOKEN_BYTES = 24
+SAFE_METHODS = frozenset(("GET", "HEAD"))
+HEADERS = {
+    "content-security-policy": "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; "
+    "form-action 'self'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+
+
+class Sessions:
+    """The token, and the sessions that it was exchanged for: the newest MAX_SESSIONS; they end with the panel."""
+
+    def __init__(self, token: str, port: int) -> None:
+        self._token, self.cookie = token, f"rtloop-{port}"
+        self._open: OrderedDict[str, None] = OrderedDict()
+
+    def begin(self, token: str) -> str | None:
+        """The secret of a new session; None where this is not the token."""
+        if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
+            return None
+        session = secrets.token_urlsafe(TOKEN_BYTES)
+        self._open[session] = None
+        while len(self._open) > MAX_SESSIONS:
+            self._open.popitem(last=False)
+        return session
+
+    def knows(self, headers: Headers) -> bool:
+        """Whether a request belongs to a session."""
+        try:
+            sent = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
+        except CookieError:
+            return False
+        return sent is not None and sent.value in self._open
+
+
+class Guard:
+    """Lets requests through that come from this host's own pages and, but for the pages themselves, from a session.
+
+    `also` tells of a request to this host that has another right to come in, from wherever its page is.
+    """
+
+    def __init__(self, app: ASGIApp, sessions: Sessions, also: Callable[[Scope], bool] = lambda _: False) -> None:
+        self._app, self._sessions, self._also = app, sessions, also
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer 403 or 401, or hand on."""
+        if scope["type"] not in ("http", "websocket"):
+            return await self._app(scope, receive, send)
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+                headers.setdefault("cache-control", "no-store")
+            await send(message)
+
+        if refusal := self._refusal(scope):
+            if scope["type"] == "websocket":
+                return await send({"type": "websocket.close", "code": 1008})
+            code, why = refusal
+            return await JSONResponse({"error": why}, status_code=code)(scope, receive, send_guarded)
+        return await self._app(scope, receive, send_guarded)
+
+    def _refusal(self, scope: Scope) -> tuple[int, str] | None:
+        headers, path = Headers(scope=scope), scope["path"]
+        host, origin = headers.get("host", ""), headers.get("origin")
+        if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:
+            return 403, f"host {host[:100]!r}: 127.0.0.1 and localhost are allowed; from elsewhere go through ssh -L"
+        if self._also(scope):
+            return None
+        if len(headers.getlist("origin")) > 1 or (origin is not None and origin.lower() != f"http://{host.lower()}"):
+            return 403, f"origin {str(origin)[:100]!r}: http://{host} is allowed"
+        if origin is None:
+            same = headers.get("sec-fetch-site") == "same-origin"
+            if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not same):
+                return 403, "origin: none is said; that of the page is needed"
+        if is_public(path) or self._sessions.knows(headers):
+            return None
+        return 401, "no session: open the panel by the address with its token"
+
+
+def is_public(path: str) -> bool:
+    """Whether a path needs no session: pages hold no data."""
+    return path in ("/", "/session", "/favicon.ico") or path.startswith("/page/")
+
+
+def host_name(host: str) -> str:
+    """The name in a Host header, without its port; empty for what is none."""
+    try:
+        parts = urlsplit(f"//{host}")
+        return (parts.hostname or "") if parts.netloc == host and parts.port != 0 and "@" not in host else ""
+    except ValueError:
+        return ""
+
+
+def session_cookie(sessions: Sessions, session: str) -> dict[str, Any]:
+    """Arguments of `Response.set_cookie`."""
+    return {"key": sessions.cookie, "value": session, "path": "/", "httponly": True, "samesite": "strict"}

@@ -1,0 +1,122 @@
+"""`rtloop panel`: a web server for this host alone, until SIGINT or SIGTERM."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import stat
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+
+from rtloop.errors import OutputError, UnavailableError
+from rtloop.panel.viewers.foxglove import PATH, viewers_token
+from rtloop.panel.views.link import Service
+from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
+from rtloop.panel.web.application import application
+from rtloop.panel.web.live import Stream
+from rtloop.panel.web.security import TOKEN_BYTES, Sessions
+from rtloop.service.api.connections import Bounded
+
+HOST = "127.0.0.1"
+NICE = 10
+MAX_CONNECTIONS = 32
+BACKLOG = 64
+SEND_BUFFER_BYTES = 1 << 17
+"""Of the kernel, for each client: what is old by the time that it is read."""
+TOKEN_MODE = 0o640
+
+
+class Few(Bounded):
+    """One of MAX_CONNECTIONS; WebSockets are counted where they are served."""
+
+    most = MAX_CONNECTIONS
+
+
+def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str], None], opens: bool,
+          foxglove: bool = False) -> int:  # fmt: skip
+    """The panel of the service at `control` on 127.0.0.1:`port`; `say` is told its address with the token.
+
+    `foxglove` serves viewers as well; `say` is told theirs.
+
+    Raises UnavailableError where the port is taken, OutputError where the token's file cannot be read or made.
+    """
+    token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else token_of(token_file)
+    listener = _listen(port)
+    port = listener.getsockname()[1]
+    with contextlib.suppress(OSError):
+        os.nice(NICE)
+    address = f"http://{HOST}:{port}/#token={token}"
+    say(address)
+    viewers = viewers_token(token) if foxglove else None
+    if viewers is not None:
+        say(f"ws://{HOST}:{port}{PATH}?token={viewers}")
+    if opens:
+        webbrowser.open(address)
+    server = uvicorn.Server(_settings(application(Service(control), Sessions(token, port), viewers)))
+    for number in (signal.SIGINT, signal.SIGTERM):  # the server takes them, and hands them on when it has ended
+        signal.signal(number, lambda *_: None)
+    try:
+        asyncio.run(server.serve(sockets=[listener]))
+    finally:
+        listener.close()
+    return 0
+
+
+def token_of(file: Path) -> str:
+    """The token in a file, which is made, with TOKEN_MODE, where there is none. Raises OutputError."""
+    try:
+        fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, TOKEN_MODE)
+        try:
+            os.fchmod(fd, TOKEN_MODE)
+            os.write(fd, (secrets.token_urlsafe(TOKEN_BYTES) + "\n").encode())
+        finally:
+            os.close(fd)
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise OutputError(f"{file}: cannot make the panel's token: {error.strerror}") from None
+    try:
+        mode, token = file.stat().st_mode, file.read_text(encoding="ascii").strip()
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{file}: cannot read the panel's token: {error}") from None
+    if stat.S_IMODE(mode) & 0o007:
+        raise OutputError(f"{file}: others may read or write the panel's token; mode {TOKEN_MODE:o} is needed")
+    if len(token) < TOKEN_BYTES:
+        raise OutputError(f"{file}: a token of {len(token)} characters; at least {TOKEN_BYTES} are needed")
+    return token
+
+
+def _listen(port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        listener.bind((HOST, port))
+        listener.listen(BACKLOG)
+    except OSError as error:
+        listener.close()
+        raise UnavailableError(f"{HOST}:{port}: {error.strerror}; --port says which other one") from None
+    return listener
+
+
+def _settings(application: object) -> uvicorn.Config:
+    return uvicorn.Config(
+        application,  # type: ignore[arg-type]
+        http=Few,
+        ws=Stream,
+        ws_max_size=MAX_MESSAGE_BYTES,
+        ws_per_message_deflate=False,
+        log_level="warning",
+        log_config=None,
+        proxy_headers=False,
+        server_header=False,
+        backlog=BACKLOG,
+        timeout_graceful_shutdown=1,
+    )

@@ -1,0 +1,116 @@
+"""Where a tick is in a file, without reading all of it: by halving, a chunk is opened only where it is looked at."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.format import EVENTS
+from rtloop.recording.file.reader import Reader, Rows
+from rtloop.recording.file.ticks import Ticks
+from rtloop.signals import DEADLINE, TICK
+
+REMEMBERED = 1 << 14
+
+
+class Span(NamedTuple):
+    """The ticks of a chunk, and when the first and the last of them were due, in ns since the start."""
+
+    first: int
+    last: int
+    first_ns: float
+    last_ns: float
+
+
+class Seeker:
+    """Places of chunks in an open file. What is damaged is passed over, and named in the reader's problems."""
+
+    def __init__(self, reader: Reader) -> None:
+        self.reader = reader
+        self.span = lru_cache(REMEMBERED)(self._span)
+        self.chunk = lru_cache(2)(self._chunk)
+        self.damage: dict[int, list[str]] = {}
+        """What is wrong with a chunk that was looked at, by its place."""
+
+    @property
+    def end(self) -> int:
+        """The place behind the last chunk."""
+        return len(self.reader.entries)
+
+    def first(self) -> Span | None:
+        """The first chunk with ticks."""
+        return next(filter(None, map(self.span, range(self.end))), None)
+
+    def last(self) -> Span | None:
+        """The last chunk with ticks."""
+        return next(filter(None, map(self.span, reversed(range(self.end)))), None)
+
+    def final(self) -> dict[str, Any] | None:
+        """What was counted at the end of the file; None where it was not finished."""
+        found = self.chunk(self.end - 1)
+        events = [json.loads(one.payload) for one in found if one.channel == EVENTS] if isinstance(found, list) else []
+        return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
+
+    def reaching(self, tick: int) -> int:
+        """Place of the first chunk that has `tick` or a later one; `end` where none has."""
+        return self._first_place(lambda span: span.last >= tick)
+
+    def has(self, tick: int) -> bool:
+        """Whether a tick is there."""
+        return len(self.rows(self.reaching(tick), tick, tick + 1)) > 0
+
+    def due(self, time_ns: float) -> int | None:
+        """The first tick that was due at `time_ns` since the start, or later; None where all were due before."""
+        place = self._first_place(lambda span: span.last_ns >= time_ns)
+        rows = self._rows(place)
+        behind = rows[rows[:, DEADLINE] >= time_ns] if len(rows) else rows
+        return int(behind[0, TICK]) if len(behind) else None
+
+    def rows(self, place: int, first: int, end: int) -> Rows:
+        """The ticks from `first` to before `end` (n, columns) of the chunk at a place; (0, 0) where it holds none."""
+        span = self.span(place) if place < self.end else None
+        if span is None or span.last < first or span.first >= end:
+            return np.empty((0, 0))
+        rows = self._rows(place)
+        begin, behind = np.searchsorted(rows[:, TICK], [first, end])
+        return rows[begin:behind]
+
+    def _rows(self, place: int) -> Rows:
+        found = self.chunk(place) if place < self.end else None
+        return found.rows if isinstance(found, Ticks) else np.empty((0, 0))
+
+    def _chunk(self, place: int) -> Ticks | list[Message] | None:
+        """What the chunk at a place holds; None where it is damaged."""
+        before = len(self.reader.left_out)
+        found = self.reader.chunk(self.reader.entries[place])
+        if place not in self.damage:
+            self.damage[place] = self.reader.left_out[before:]
+        return found
+
+    def _span(self, place: int) -> Span | None:
+        """Of the chunk at a place; None where it holds no ticks."""
+        rows = self._rows(place)
+        return (
+            Span(*(int(rows[row, TICK]) for row in (0, -1)), *rows[[0, -1], DEADLINE].tolist()) if len(rows) else None
+        )
+
+    def _first_place(self, met: Callable[[Span], bool]) -> int:
+        """The first place whose span meets a condition that all behind it meet as well."""
+        low, high, found = 0, self.end, self.end
+        while low < high:
+            middle = (low + high) // 2
+            place = next((at for at in range(middle, high) if self.span(at)), None)
+            span = None if place is None else self.span(place)
+            if place is None or span is None:
+                high = middle
+            elif met(span):
+                high, found = middle, place
+            else:
+                low = place + 1
+        return found

@@ -1,0 +1,122 @@
+"""What a stretch of a recording is taken from: the open files of a run, of which only what is needed is read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.engine.memory import ring_ticks
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file import format
+from rtloop.recording.file.contents import Message, may_hold
+from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.reader import Rows, tick_of
+from rtloop.recording.file.seek import Seeker
+from rtloop.signals import TICK
+
+OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "cut")
+"""What a header says of the one file that it stands in."""
+
+
+class Stretch(NamedTuple):
+    """Ticks from `first` to before `end`."""
+
+    first: int
+    end: int
+
+
+class Source:
+    """The files of one run, in its order."""
+
+    def __init__(self, seekers: Sequence[Seeker]) -> None:
+        self._seekers = seekers
+        header = seekers[0].reader.header
+        self.header: dict[str, Any] = {key: value for key, value in header.items() if key not in OF_THE_FILE}
+        self._reach = ring_ticks(header["rate_hz"])
+        self.problems: list[str] = []
+        """What turned out to be damaged in `contents`."""
+
+    @property
+    def path(self) -> Path:
+        """Of the first file."""
+        return self._seekers[0].reader.path
+
+    @property
+    def start_unix_ns(self) -> int:
+        """When the run started, by the first file that has a tick."""
+        return next((one for one in self._seekers if one.first()), self._seekers[0]).reader.start_unix_ns
+
+    @property
+    def whole(self) -> Stretch:
+        """From the first tick to the last one. Raises RecordingError where there is none."""
+        first = next(filter(None, (seeker.first() for seeker in self._seekers)), None)
+        last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
+        if first is None or last is None:
+            raise RecordingError(f"{self.path}: holds no ticks")
+        return Stretch(first.first, last.last + 1)
+
+    def due(self, time_s: float) -> int:
+        """The first tick that was due `time_s` after the start or later. Raises RecordingError where there is none."""
+        found = next((tick for seeker in self._seekers if (tick := seeker.due(time_s * 1e9)) is not None), None)
+        if found is None:
+            last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
+            end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
+            raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
+        return found
+
+    def begin(self, tick: int) -> int:
+        """The newest snapshot at or before `tick` whose own tick is there. Raises RecordingError."""
+        for seeker in reversed(self._seekers):
+            for place in reversed(range(min(seeker.reaching(tick) + 1, seeker.end))):
+                found = [tick_of(one) for one in self._slow(seeker, place) if one.channel == format.LAW]
+                for begin in sorted((one for one in found if one <= tick), reverse=True):
+                    if any(one.has(begin) for one in self._seekers):
+                        return begin
+        raise RecordingError(f"{self.path}: tick {tick}: no state of the law to begin from stands at it or before it")
+
+    def files(self, stretch: Stretch) -> list[str]:
+        """The names of the files that hold ticks of it."""
+        return [
+            seeker.reader.path.name
+            for seeker in self._seekers
+            if (first := seeker.first()) and first.first < stretch.end and seeker.reaching(stretch.first) < seeker.end
+        ]
+
+    def contents(self, stretch: Stretch) -> Iterator[tuple[list[Message], Rows]]:
+        """Messages of the slow topics and ticks of a stretch: chunk by chunk, in the order of the files."""
+        begin = stretch.first
+        for seeker in self._seekers:
+            # a message stands before the tick that it precedes, by no more ticks than the ring holds
+            first, ticks = seeker.reaching(stretch.first - self._reach) - 1, seeker.reaching(stretch.first)
+            for place in range(max(first, 0), min(seeker.reaching(stretch.end - 1) + 1, seeker.end)):
+                if place < ticks and not _may_be_slow(seeker, place):
+                    continue
+                rows = seeker.rows(place, begin, stretch.end)
+                messages = [one for one in self._slow(seeker, place) if _belongs(one, stretch)]
+                self.problems += seeker.damage.get(place, [])
+                if len(rows):
+                    begin = int(rows[-1, TICK]) + 1
+                if len(rows) or messages:
+                    yield messages, rows
+
+    def _slow(self, seeker: Seeker, place: int) -> list[Message]:
+        """The messages of the slow topics in a chunk."""
+        found = seeker.chunk(place) if _may_be_slow(seeker, place) else None
+        return found if isinstance(found, list) else []
+
+
+def _may_be_slow(seeker: Seeker, place: int) -> bool:
+    entry = seeker.reader.entries[place]
+    return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW))
+
+
+def _belongs(message: Message, stretch: Stretch) -> bool:
+    """Whether an event or a snapshot is of a stretch; the end of the file is not."""
+    if message.channel == format.LAW:
+        return stretch.first <= tick_of(message) < stretch.end
+    if message.channel != format.EVENTS:
+        return False
+    event = json.loads(message.payload)
+    return stretch.first <= event["tick"] < stretch.end and event["kind"] not in FINAL

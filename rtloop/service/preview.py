@@ -1,0 +1,70 @@
+"""What a change would make of an axis's loop on its model: margins, step, how far its resonance may shift."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rtloop.analysis.loop_analysis import LoopAnalysis
+from rtloop.analysis.perturbation import changes, until_unstable
+from rtloop.analysis.step_response import step_response
+from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.prepare import Prepared
+
+STEP_POINTS = 400
+STEP_SETTLINGS = 3.0
+"""A step is shown for so many times as long as it settles."""
+LEAST_STEP_PERIODS = 30
+
+Figures = dict[str, Any]
+
+
+def figures(prepared: Prepared, number: int) -> Figures:
+    """Of the loop of axis `number` as it will run on its model; null for what does not exist.
+
+    The shift of the resonance is looked for up to ∓50 %. `problems` are warnings of the axis.
+    """
+    axis = prepared.configuration.axes[number]
+    check = prepared.checks[number]
+    found: Figures = dict.fromkeys(
+        ("gain_margin_db", "phase_margin_deg", "modulus_margin", "crossover_hz", "tolerated_shift_percent",
+         "overshoot_percent", "settling_ms", "step")
+    )  # fmt: skip
+    found["problems"] = [warning for warning in prepared.warnings if warning.startswith(f"axis.{axis.name}.")]
+    running = check.running
+    if running is None:
+        return found
+    found |= {
+        "crossover_hz": running.crossover_hz,
+        "phase_margin_deg": running.phase_margin_deg,
+        "gain_margin_db": 20 * math.log10(running.gain_margin),
+        "modulus_margin": 1 / running.max_sensitivity,
+        "overshoot_percent": running.overshoot_percent,
+        "settling_ms": 1e3 * running.settling_time_s,
+        "tolerated_shift_percent": _tolerated_shift_percent(check),
+        "step": _step(check, running),
+    }
+    return {name: None if isinstance(one, float) and not math.isfinite(one) else one for name, one in found.items()}
+
+
+def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
+    """Of the model's resonance, downwards and upwards; None where it has none."""
+    resonance = None if check.plant is None else changes(check.plant).get("resonance")
+    if check.plant is None or resonance is None:
+        return None
+    down, up = until_unstable(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
+    return [-(resonance.down if down is None else down), resonance.up if up is None else up]
+
+
+def _step(check: AxisCheck, running: LoopAnalysis) -> dict[str, list[float]] | None:
+    """Of 1 µm, at STEP_POINTS moments; None for a loop that does not settle."""
+    loop = check.on_model
+    if loop is None or loop.period_s is None or not math.isfinite(running.settling_time_s):
+        return None
+    duration_s = max(STEP_SETTLINGS * running.settling_time_s, LEAST_STEP_PERIODS * loop.period_s)
+    response = step_response(loop, duration_s)
+    time_s = np.linspace(0.0, duration_s, STEP_POINTS)
+    position_um = np.interp(time_s, response.time_s, response.position)
+    return {"t_ms": (1e3 * time_s).round(6).tolist(), "y": position_um.round(9).tolist()}

@@ -1,0 +1,195 @@
+"""A person at the bench, with a real browser on a real service."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rtloop
+from tests.faults.bench import Bench
+from tests.panel.page.browser import hold, near, number, opened, panel_of, said, started, stopped
+
+
+def position(page: Any) -> float:
+    return number(page, "#position-x")
+
+
+def trace(page: Any, name: str, figure: int) -> float:
+    """A figure of a trace as the table beneath the plot says it: 1 low, 2 high, 3 mean."""
+    return number(page, f"#traces tbody tr:has-text('{name}') td:nth-of-type({figure + 1})")
+
+
+def test_whoever_arms_starts_sets_tunes_undoes_captures_and_stops_sees_all_of_it(
+    page: Any, bench: Bench, tmp_path: Path
+) -> None:
+    started(page)
+    said(page, "#drives", "You drive")
+
+    page.fill("#setpoint", "12,5")
+    page.keyboard.press("Enter")
+    near(page, "#position-x", 12.5)
+    near(page, "#traces tbody tr:nth-of-type(1) td:nth-of-type(4)", 12.5)
+    assert trace(page, "x_reference_um", 1) == trace(page, "x_reference_um", 2) == 12.5
+    assert trace(page, "x_position_um", 3) == pytest.approx(12.5, abs=0.1)
+
+    page.fill("#tune-value", "0.012")
+    assert page.is_hidden("#apply")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#apply", timeout=60_000)
+    margins = page.inner_text("#preview-figures")
+    assert all(figure in margins for figure in ("phase margin", "resonance may shift", "settles in"))
+    assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.016
+    page.click("#apply")
+    said(page, "#tune-done", r"applied at tick \d+")
+    assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.012
+    page.click("#undo")
+    said(page, "#tune-done", r"undone at tick \d+")
+    assert bench.client.get("/configuration")["values"]["axis"][0]["controller"]["gain"] == 0.016
+    said(page, "#tune-now", "0.016")
+
+    with page.expect_download() as download:
+        page.click("#capture")
+    picture = tmp_path / "screen.png"
+    download.value.save_as(picture)
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 5_000
+    said(page, "#said", "replay identical")
+    captured = rtloop.load(next((bench.folder / "recordings").glob("*.capture-*.mcap")))
+    assert abs(float(np.mean(captured["x_position_um"])) - 12.5) < 0.1
+
+    page.click("#stop")
+    said(page, "#state-word", "stopped")
+    page.click("#release")
+    said(page, "#drives", "Nobody")
+
+
+def test_space_stops_whatever_has_the_focus(page: Any) -> None:
+    page.fill("#who", "ada")
+    page.keyboard.press("Escape")
+    for place in ("#setpoint", "#go", "#trigger-source button", "#setpoint-slider", "#waveform-repeat", "#stacked"):
+        started(page)
+        if place == "#waveform-repeat":
+            page.click("summary:has-text('Waveform')")
+        page.focus(place)
+        if place == "#trigger-source button":
+            page.keyboard.press("Enter")
+            assert page.is_visible("#trigger-source-list")
+        before = page.evaluate("[document.activeElement.value, document.querySelector('#stacked').ariaPressed]")
+        page.keyboard.press("Space")
+        said(page, "#state-word", "stopped")
+        assert page.evaluate("[document.activeElement.value, document.querySelector('#stacked').ariaPressed]") == before
+        assert not page.is_checked("#waveform-repeat")
+        page.keyboard.press("Escape")
+    page.focus("#who")  # free text: a blank is a blank, and the button says what stops instead
+    started(page)
+    page.focus("#who")
+    page.keyboard.press("End")
+    page.keyboard.press("Space")
+    assert page.input_value("#who") == "ada "
+    assert page.inner_text("#state-word") == "running"
+    page.keyboard.press("Shift+Space")
+    said(page, "#state-word", "stopped")
+    page.click("#release")
+
+
+def test_the_keyboard_alone_drives(page: Any) -> None:
+    keys = page.keyboard
+    keys.press("l")
+    keys.type("ada")
+    keys.press("Escape")
+    for state in ("armed", "running"):
+        keys.down("g")
+        page.wait_for_timeout(1200)
+        keys.up("g")
+        said(page, "#state-word", state)
+    keys.press("s")
+    keys.type("+5,25")
+    keys.press("Enter")
+    near(page, "#position-x", 5.25)
+    keys.press("Escape")
+    keys.press("]")
+    near(page, "#position-x", 6.25)
+    keys.press("m")
+    page.focus("[role=slider][aria-label='Cursor A']")
+    at_s = float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow"))
+    keys.press("Shift+ArrowRight")
+    assert float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow")) > at_s
+    keys.press("3")
+    assert page.is_visible("#spectrum")
+    keys.press("?")
+    assert page.is_visible("#help-dialog")
+    keys.press("Space")
+    said(page, "#state-word", "stopped")
+    keys.press("Escape")
+    assert page.is_hidden("#help-dialog")
+    page.click("#release")
+
+
+def test_a_hold_that_is_too_short_does_nothing_and_no_name_drives(page: Any, bench: Bench) -> None:
+    page.hover("#go")
+    page.mouse.down()
+    page.wait_for_timeout(400)
+    page.mouse.up()
+    page.wait_for_timeout(900)
+    assert bench.status()["state"] == "stopped" and not bench.status()["armed"]
+    page.fill("#who", "")
+    hold(page, "#go")
+    said(page, "#lock-error", "Say who drives")
+    assert not bench.status()["armed"]
+
+
+def test_what_the_service_refuses_is_said_beside_the_field(page: Any) -> None:
+    started(page)
+    for text, words in (("twelve", "no number"), ("1.2.3", "no number"), ("1e300", "")):
+        page.fill("#setpoint", text)
+        page.keyboard.press("Enter")
+        said(page, "#setpoint-error", words or "refer")
+    page.fill("#setpoint", "−3,5")
+    page.keyboard.press("Enter")
+    said(page, "#setpoint-error", "^$")
+    said(page, "#digits", r"−3\.5")
+    stopped(page)
+
+
+def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, address: str) -> None:
+    started(page)
+    other = opened(browser, address)
+    other.fill("#who", "bob")
+    said(other, "#drives", "ada drives")
+    other.fill("#setpoint", "3")
+    other.keyboard.press("Enter")
+    said(other, "#setpoint-error", "ada has driven since")
+    other.keyboard.press("Space")
+    said(page, "#state-word", "stopped")
+    said(page, "#events", "bob")
+    other.context.close()
+    page.click("#release")
+
+
+def test_a_lost_connection_greys_what_is_shown_and_a_stop_that_got_nowhere_says_so(browser: Any, bench: Bench) -> None:
+    address, process = panel_of(bench)
+    page = opened(browser, address)
+    process.kill()
+    page.wait_for_selector("body.stale")
+    said(page, "#said", "No connection: .* Use the emergency stop")
+    said(page, "#age", "s old")
+    assert "what is shown is" in page.get_attribute("#scope-plot .veil", "data-says")
+    assert page.evaluate("getComputedStyle(document.querySelector('#scope-plot .uplot')).filter") != "none"
+    page.keyboard.press("Space")
+    said(page, "#alarm", "STOP did not get through.*emergency stop")
+    page.context.close()
+
+
+def test_the_modules_read_numbers_as_people_type_them(page: Any) -> None:
+    read = "async (text) => (await import('/page/numbers.js')).parseNumber(text)"
+    for text, value in {"-5": -5, "+5": 5, "−5": -5, "12,5": 12.5, "12.5": 12.5, " .5 ": 0.5, "1e-3": 1e-3}.items():
+        assert page.evaluate(read, text) == value
+    for text in ("", "5 5", "1.000,5", "0x10", "Infinity", "NaN", "--5"):
+        with pytest.raises(Exception, match="no number"):
+            page.evaluate(read, text)
+    columns = "async (text) => JSON.stringify((await import('/page/desk/reference.js')).columns(text))"
+    assert json.loads(page.evaluate(columns, "1,5\n2,5\n")) == {"samples": [1.5, 2.5], "command_um": []}
+    assert json.loads(page.evaluate(columns, "# two\n1.5, 2\n3.5;4")) == {"samples": [1.5, 3.5], "command_um": [2, 4]}

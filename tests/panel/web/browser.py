@@ -1,0 +1,101 @@
+"""What a browser does to a panel, by hand: requests with exactly these headers, a session, messages unpacked."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import struct
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from websockets.sync.client import ClientConnection, connect
+
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+
+TIMEOUT_S = 30.0
+
+
+def unpacked(message: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a binary message, by the words of its description alone."""
+    size = struct.unpack_from("<I", message)[0]
+    header = json.loads(message[4 : 4 + size])
+    offset, arrays = 4 + size, {}
+    assert offset % 8 == 0
+    for name, length in header["arrays"]:
+        arrays[name] = np.frombuffer(message, "<f4", length, offset)
+        offset += 4 * length
+    assert offset == len(message)
+    return header, arrays
+
+
+class Browser:
+    """Talks to the panel of a bench; `process` is the panel's."""
+
+    def __init__(self, bench: Bench, *options: str) -> None:
+        (bench.folder / "log").touch()
+        mark = len(bench.log())
+        self.process: subprocess.Popen[str] = bench.rtloop("panel", bench.client.path, "--port", "0", *options)
+        said = wait_for(
+            lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#token=(\S+)", bench.log()[mark:]), "a panel", 120
+        )
+        self.port, self.token = int(said[1]), said[2]
+        self.origin = f"http://127.0.0.1:{self.port}"
+        self.cookie = ""
+
+    def request(
+        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None
+    ) -> tuple[int, dict[str, str], bytes]:
+        """Status, headers and body; asked as a page does, but for the `headers` given; None leaves one out."""
+        mine: dict[str, Any] = {"Origin": self.origin, "Cookie": self.cookie} | (headers or {})
+        data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)
+        try:
+            connection.putrequest(method, path, skip_host="Host" in mine)
+            for name, value in ({"Content-Length": str(len(data or b""))} | mine).items():
+                if value is not None:
+                    connection.putheader(name, value)
+            connection.endheaders(data)
+            response = connection.getresponse()
+            return response.status, {k.lower(): v for k, v in response.getheaders()}, response.read()
+        finally:
+            connection.close()
+
+    def json(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
+        """Status and JSON of an answer."""
+        status, _, data = self.request(method, path, body)
+        return status, json.loads(data) if data else None
+
+    def log_in(self) -> None:
+        """Exchange the token for a session."""
+        status, headers, _ = self.request("POST", "/session", {"token": self.token})
+        assert status == 204
+        self.cookie = headers["set-cookie"].split(";")[0]
+
+    @contextmanager
+    def live(self, *wishes: dict[str, Any], headers: dict[str, str] | None = None) -> Iterator[ClientConnection]:
+        """The stream, with wishes."""
+        mine = {"Origin": self.origin, "Cookie": self.cookie} | (headers or {})
+        address = f"ws://127.0.0.1:{self.port}/live"
+        limits: dict[str, Any] = {
+            "compression": None,
+            "max_size": None,
+            "open_timeout": TIMEOUT_S,
+            "close_timeout": 1.0,
+        }
+        with connect(address, additional_headers=mine, **limits) as live:
+            for wish in wishes:
+                live.send(json.dumps(wish))
+            yield live
+
+    def first(self, live: ClientConnection, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """The next message of a kind."""
+        for message in live:
+            header, arrays = unpacked(message)
+            if header["kind"] == kind:
+                return header, arrays
+        raise AssertionError(f"no {kind} any more")

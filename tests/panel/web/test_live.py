@@ -1,0 +1,152 @@
+"""What a page sees of a service that runs, against the recording of the same ticks; and what the panel does to them."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from rtloop import load
+from tests.faults.account import account
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.panel.web.browser import Browser
+
+EDGE = {"mode": "normal", "kind": "edge", "source": "x_reference_um", "level": 20.0, "pre_percent": 25}
+VIEW = {"signals": ["x_reference_um", "x_position_um", "tick"], "seconds": 0.05, "pixels": 1000, "trigger": EDGE}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    with Bench(tmp_path_factory.mktemp("live")) as bench:
+        bench.await_drive()
+        yield bench
+
+
+@pytest.fixture(scope="module")
+def browser(bench: Bench) -> Browser:
+    browser = Browser(bench)
+    browser.log_in()
+    return browser
+
+
+def test_what_the_page_is_told(bench: Bench, browser: Browser):
+    status, said = browser.json("GET", "/api/panel")
+    assert status == 200
+    assert (said["name"], said["rate_hz"], said["axes"], said["longest_s"]) == ("lab", 4000.0, ["x"], 60.0)
+    assert said["limits"] == {"x": {"drive_v": 10.0, "lowest_v": -10.0, "command_um": 42.0, "position_um": 60.0}}
+    by_name = {column["name"]: column for column in said["columns"]}
+    assert (by_name["x_drive_v"]["unit"], by_name["lateness_us"]["unit"]) == ("V", "µs")
+    assert "drive u" in by_name["x_drive_v"]["meaning"]
+    assert browser.json("GET", "/api/status")[1]["state"] == "running"
+    assert browser.json("GET", "/api/configuration")[1]["block"] == str(bench.folder / "run" / "lab.block")
+
+
+def test_commands_are_handed_on(bench: Bench, browser: Browser):
+    status, said = browser.json("POST", "/api/setpoint?as=ada", {"axis": "x", "value": 12.5})
+    assert (status, set(said)) == (200, {"tick"})
+    assert bench.status()["lock"]["name"] == "ada"
+    status, refused = browser.json("POST", "/api/setpoint?as=bob", {"axis": "x", "value": 12.5})
+    assert status == 409
+    assert "ada has driven" in refused["error"]
+    assert browser.json("POST", "/api/setpoint?as=ada", {"axis": "y", "value": 12.5})[0] == 422
+    with browser.live() as live:
+        who: dict[int, str] = {}
+        while said["tick"] not in who:
+            header, _ = browser.first(live, "events")
+            who |= {event["tick"]: event["who"] for event in header["events"] if event["kind"] == "set_reference"}
+        assert who[said["tick"]] == "ada"
+    assert browser.json("DELETE", "/api/lock?as=ada")[0] == 200
+    sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
+    assert browser.json("POST", "/api/reference", {"axis": "x", "reference": sine})[0] == 200
+
+
+def test_sweeps_spectra_and_the_rest(browser: Browser):
+    wishes = {
+        "view": VIEW,
+        "timing": True,
+        "xy": {"axis": "x", "seconds": 1.0},
+        "spectrum": {"signal": "x_position_um", "low_hz": 2.0, "high_hz": 20.0},
+    }
+    with browser.live(wishes) as live:
+        state, _ = browser.first(live, "state")
+        assert state["state"] == "running"
+        header, arrays = browser.first(live, "sweep")
+        assert (header["cause"], header["complete"]) == ("trigger", True)
+        offset, reference = arrays["offset"], arrays["x_reference_um:low"]
+        assert offset[0] == header["first"] - header["trigger"] == -round(199 * 0.25)
+        at = int(np.flatnonzero(offset == 0)[0])
+        assert reference[at - 1] < 20.0 <= reference[at]
+        assert np.array_equal(arrays["tick:low"].astype(int) - header["trigger"], offset.astype(int))
+        xy, loop = browser.first(live, "xy")
+        assert xy["axis"] == "x"
+        assert 0 < len(loop["drive_v"]) <= 4000
+        assert np.corrcoef(loop["model_position_um"], np.interp(
+            np.arange(len(loop["model_drive_v"])), np.linspace(0, len(loop["model_drive_v"]), len(loop["position_um"])),
+            loop["position_um"]))[0, 1] > 0.9  # fmt: skip
+        timing, counted = browser.first(live, "timing")
+        assert timing["ticks"] == counted["counts"].sum() > 0
+        assert timing["p50_us"] <= timing["p99_us"] <= timing["worst_us"] * 1.1
+
+        def rms_nm() -> float:
+            spectrum, bands = browser.first(live, "spectrum")
+            return spectrum["rms"] if len(bands["hz"]) and bands["hz"].min() < 1.0 else 0.0
+
+        # a sine of 8 µm at 5 Hz, followed to within a tenth
+        assert wait_for(rms_nm, "a spectrum") == pytest.approx(8000 / np.sqrt(2), rel=0.1)
+        status, figures = browser.json(
+            "GET", f"/api/measure?run={header['run']}&first={header['first']}&end={header['end']}&signals=tick"
+        )
+        ticks = np.arange(header["first"], header["end"])
+        assert status == 200
+        assert figures["tick"] == pytest.approx(
+            {"rms": np.sqrt(np.mean(ticks.astype(float) ** 2)), "mean": ticks.mean(), "std": ticks.std(),
+             "low": ticks[0], "high": ticks[-1], "peak_to_peak": len(ticks) - 1})  # fmt: skip
+    for query, code in (("run=9&first=0&end=1&signals=tick", 410), ("run=0&first=5&end=5&signals=tick", 422),
+                        ("run=0&first=x&end=5&signals=tick", 422), ("run=0&first=0&end=999999999&signals=tick", 410),
+                        (f"run=0&first={header['first']}&end={header['end']}&signals=no", 422)):  # fmt: skip
+        assert browser.json("GET", f"/api/measure?{query}")[0] == code, query
+
+
+def test_what_the_panel_does_changes_no_tick(bench: Bench, browser: Browser):
+    """Stopped, killed, started again, with clients that look; then the service starts anew under it."""
+    other = Browser(bench)
+    other.log_in()
+    with browser.live({"view": VIEW}) as live, other.live({"view": VIEW}) as its:
+        other.first(its, "sweep")
+        other.process.send_signal(signal.SIGSTOP)
+        ticks = bench.ticks
+        wait_for(lambda: bench.ticks > ticks + 2000, "ticks beside a panel that stands still")
+        other.process.kill()
+        other.process.wait()
+        found = [browser.first(live, "sweep")[0] for _ in range(5)]
+        run = found[-1]["run"]
+        assert bench.stop() == 0
+        state = browser.first(live, "state")[0]
+        while state["state"] != "unreachable":
+            state = browser.first(live, "state")[0]
+        assert state["error"]
+        bench.start_service()
+        bench.await_drive()
+        header = browser.first(live, "sweep")[0]
+        while header["run"] == run:
+            header = browser.first(live, "sweep")[0]
+        assert header["trigger"] < bench.ticks
+        assert browser.first(live, "state")[0]["state"] == "running"
+    browser.process.send_signal(signal.SIGTERM)
+    assert browser.process.wait(30) == 0
+    first, *_ = sorted((bench.folder / "recordings").glob("*.mcap"))
+    recording = load(first)
+    assert np.array_equal(recording["tick"], np.arange(len(recording)))
+    reference = recording["x_reference_um"]
+    for sweep in found:
+        assert reference[sweep["trigger"] - 1] < 20.0 <= reference[sweep["trigger"]]
+    numbers = [sweep["number"] for sweep in found]
+    edges = 1 + np.flatnonzero((reference[:-1] < 20.0) & (reference[1:] >= 20.0))
+    seen = [int(np.flatnonzero(edges == sweep["trigger"])[0]) for sweep in found]
+    assert np.diff(seen).tolist() == np.diff(numbers).tolist()  # none was missed between those that were shown
+    assert bench.stop() == 0
+    found_there = account(bench.folder / "recordings", bench.blocks)
+    assert (found_there.problems, found_there.lost) == ([], 0)

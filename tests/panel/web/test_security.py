@@ -1,0 +1,256 @@
+"""Who is let in, and what whoever is not let in, or means harm, can do: nothing, and others are served meanwhile.
+
+The panel here has no service: what is handed on is answered by 503, what is not by anything else.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from rtloop.errors import OutputError
+from rtloop.panel.web.live import MAX_STREAMS
+from rtloop.panel.web.rates import Rate
+from rtloop.panel.web.security import host_name
+from rtloop.panel.web.server import token_of
+from tests.faults.bench import Bench
+from tests.panel.web.browser import Browser, unpacked
+
+STOP = ("POST", "/api/stop")
+HANDED_ON, REFUSED, UNKNOWN = 503, 403, 401
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Logged in."""
+    folder = tmp_path_factory.mktemp("panel")
+    (folder / "run").mkdir(mode=0o700)
+    bench = Bench(folder)
+    try:
+        browser = Browser(bench)
+        browser.log_in()
+        yield browser
+    finally:
+        bench.__exit__()
+
+
+def resident_mib(browser: Browser) -> float:
+    fields = Path(f"/proc/{browser.process.pid}/statm").read_text().split()
+    return int(fields[1]) * 4096 / 2**20
+
+
+def test_who_is_let_in(browser: Browser):
+    assert browser.request(*STOP)[0] == HANDED_ON
+    for host in ("localhost", f"localhost:{browser.port}", "127.0.0.1:9000", "LOCALHOST:9000", "[::1]:80"):
+        assert browser.request(*STOP, headers={"Host": host, "Origin": f"http://{host}"})[0] == HANDED_ON, host
+    assert browser.request(*STOP, headers={"Origin": None, "Sec-Fetch-Site": "same-origin"})[0] == HANDED_ON
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8321", "127.0.0.1@evil.example", "",
+     "192.168.0.7", "evil.example#127.0.0.1", "127.0.0.1:x", "0.0.0.0:8321", "127.1"],
+)  # fmt: skip
+def test_other_hosts(browser: Browser, host: str):
+    for method, path in (STOP, ("GET", "/api/status"), ("GET", "/"), ("POST", "/session")):
+        assert (
+            browser.request(method, path, {"token": browser.token}, {"Host": host, "Origin": f"http://{host}"})[0]
+            == 403
+        )
+        assert browser.request(method, path, {"token": browser.token}, {"Host": host, "Origin": None})[0] == REFUSED
+    assert host_name(host) not in ("127.0.0.1", "localhost", "::1")
+
+
+def test_other_origins(browser: Browser):
+    own = f"http://127.0.0.1:{browser.port}"
+    others = ["http://evil.example", "null", "", own.replace("http", "https"), f"{own}.evil.example", f"{own}/"]
+    others += [own.replace("127.0.0.1", "localhost"), "http://127.0.0.1", f"http://127.0.0.1:{browser.port + 1}"]
+    for origin in others:
+        headers = {"Origin": origin, "Host": f"127.0.0.1:{browser.port}"}
+        for method, path in (STOP, ("DELETE", "/api/lock"), ("POST", "/session"), ("GET", "/api/status")):
+            assert browser.request(method, path, {"token": browser.token}, headers)[0] == REFUSED, origin
+        with pytest.raises(InvalidStatus, match=r"40[03]"), browser.live(headers=headers):
+            pass
+
+
+def test_no_origin_at_all(browser: Browser):
+    for site in (None, "cross-site", "same-site", "none"):
+        headers = {"Origin": None, "Sec-Fetch-Site": site}
+        assert browser.request(*STOP, headers=headers)[0] == REFUSED
+        assert browser.request("DELETE", "/api/lock", headers=headers)[0] == REFUSED
+
+
+def test_no_session_and_a_stale_one(browser: Browser):
+    name, _, session = browser.cookie.partition("=")
+    for cookie in (None, "", f"{name}=", f"{name}=x", f"other={session}", f"{name}={session}x", f"{name}={'x' * 9000}",
+                   "\x01=;;;=,", f"rtloop-1={session}"):  # fmt: skip
+        headers = {"Cookie": cookie}
+        for path in ("/api/status", "/api/panel", "/api/recordings", "/api/measure", "/live"):
+            assert browser.request("GET", path, headers=headers)[0] == UNKNOWN, cookie
+        assert browser.request(*STOP, headers=headers)[0] == UNKNOWN
+        with pytest.raises((InvalidStatus, EOFError, OSError)), browser.live(headers={"Cookie": cookie or "none=1"}):
+            pass
+    assert browser.request("GET", "/", headers={"Cookie": None})[0] == 200
+    assert browser.request("GET", "/page/../web/security.py", headers={"Cookie": None})[0] in (401, 404)
+    assert browser.request("GET", "/page/%2e%2e/web/security.py", headers={"Cookie": None})[0] in (401, 404)
+
+
+def test_tokens_that_are_none(browser: Browser):
+    wrong = [browser.token + "x", "", 7, None, "x" * 5000, "\ud800"]
+    for said in (*({"token": token} for token in wrong), [], b"{", b"[" * 4000, b""):
+        status, headers, _ = browser.request("POST", "/session", said, {"Cookie": None})
+        assert (status, "set-cookie" in headers) == (UNKNOWN, False)
+    codes = {browser.request("POST", "/session", {"token": "guess"})[0] for _ in range(40)}
+    assert codes == {401, 429}
+    time.sleep(1.0)
+    status, headers, _ = browser.request("POST", "/session", {"token": browser.token}, {"Cookie": None})
+    cookie = headers["set-cookie"].lower()
+    assert status == 204
+    assert all(word in cookie for word in ("httponly", "samesite=strict", "path=/"))
+
+
+def test_what_pages_may_do(browser: Browser):
+    _, headers, _ = browser.request("GET", "/")
+    policy = headers["content-security-policy"]
+    assert policy.startswith("default-src 'self'")
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy
+    assert (headers["x-content-type-options"], headers["referrer-policy"]) == ("nosniff", "no-referrer")
+    assert browser.request("GET", "/api/status")[1]["cache-control"] == "no-store"
+    with socket.create_connection(("127.0.0.1", browser.port)) as one:
+        assert one.getpeername()[0] == "127.0.0.1"
+    listening = Path("/proc/net/tcp").read_text().lower()
+    assert f"0100007f:{browser.port:04x} 00000000:0000 0a" in listening
+    assert f"00000000:{browser.port:04x} 00000000:0000 0a" not in listening
+
+
+def test_bodies_that_are_too_large(browser: Browser):
+    for path, size, code in (("setpoint", 1 << 17, 413), ("waveform", 1 << 17, 503), ("waveform", 5 << 20, 413)):
+        try:
+            assert browser.request("POST", f"/api/{path}", b"x" * size)[0] == code
+        except (BrokenPipeError, ConnectionResetError):
+            assert code == 413  # it hung up before all of it was sent
+    assert browser.request("POST", "/api/exec", b"{}")[0] in (404, 405)
+
+
+@pytest.mark.parametrize(
+    "message",
+    ["", "no json", "[" * 60_000, '{"view":' * 8000, '{"view": NaN}',
+     '{"view": {"signals": [], "seconds": 1e308, "pixels": 1}}',
+     '{"view": {"signals": ["x"], "seconds": 1, "pixels": 1e308}}', '{"spectrum": {"signal": 7}}', b"\x00\xff" * 100,
+     '{"__init__": 1, "xy": []}', '{"view": {"trigger": {"trigger": {"trigger": {}}}}}', '{"\\ud800": "\\udfff"}'],
+)  # fmt: skip
+def test_malformed_messages_are_refused_and_the_stream_goes_on(browser: Browser, message: Any):
+    with browser.live() as live:
+        live.send(message)
+        header, _ = browser.first(live, "refused")
+        assert header["error"]
+        assert browser.first(live, "state")[0]["state"] == "unreachable"
+
+
+def test_a_message_that_is_too_large_ends_its_stream(browser: Browser):
+    with browser.live() as live:
+        live.send("x" * 70_000)
+        with suppress(ConnectionClosed):
+            for _ in live:
+                pass
+        assert live.close_code in (1009, 1006)
+
+
+def test_two_hundred_connections_and_one_that_is_served(browser: Browser):
+    before_mib = resident_mib(browser)
+    with ExitStack() as stack:
+        opened = [stack.enter_context(socket.create_connection(("127.0.0.1", browser.port))) for _ in range(200)]
+        for one in opened[::2]:
+            one.send(b"POST /api/setpoint HTTP/1.1\r\nHost: localhost\r\nContent-Length: 60000\r\n\r\n{")
+        assert browser.request(*STOP)[0] == HANDED_ON
+        assert browser.request("GET", "/")[0] == 200
+    assert resident_mib(browser) < before_mib + 64
+
+
+def test_more_streams_than_there_may_be(browser: Browser):
+    with ExitStack() as stack:
+        for _ in range(MAX_STREAMS):
+            stack.enter_context(browser.live())
+        with pytest.raises(InvalidStatus, match="403"), browser.live():
+            pass
+        assert browser.request(*STOP)[0] == HANDED_ON
+    deadline_s = time.monotonic() + 20
+    while time.monotonic() < deadline_s:
+        try:
+            with browser.live() as live:
+                browser.first(live, "state")
+                return
+        except InvalidStatus:
+            time.sleep(0.1)
+    raise AssertionError("no stream again")
+
+
+def test_messages_without_end_are_taken_slowly(browser: Browser):
+    """Whoever floods is not read any faster; the kernel's buffers hold what they hold, and the others are served."""
+    before_mib = resident_mib(browser)
+    with browser.live() as flood, browser.live() as other:
+        flood.socket.settimeout(2.0)
+        wish = json.dumps({"view": {"signals": ["x" * 50] * 8, "seconds": 1, "pixels": 1}, "nothing": "x" * 50_000})
+        try:
+            for _ in range(300):
+                flood.send(wish)
+        except (TimeoutError, ConnectionClosed, OSError):
+            pass
+        for _ in range(20):
+            browser.first(other, "state")
+    assert resident_mib(browser) < before_mib + 64
+
+
+def test_a_client_that_never_reads_is_dropped(browser: Browser):
+    """Meanwhile the others are served, and nothing is kept for it."""
+    before_mib = resident_mib(browser)
+    with socket.socket() as silent, browser.live() as other:
+        silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        silent.connect(("127.0.0.1", browser.port))
+        silent.send(
+            f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{browser.port}\r\nOrigin: {browser.origin}\r\n"
+            f"Cookie: {browser.cookie}\r\n"
+            "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+        )
+        for message in other:
+            if unpacked(message)[0]["unix_s"] > 0:
+                break
+        for _ in range(40):
+            browser.first(other, "state")
+    assert resident_mib(browser) < before_mib + 64
+
+
+def test_the_tokens_file(tmp_path: Path):
+    token = token_of(tmp_path / "token")
+    assert token_of(tmp_path / "token") == token
+    assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o640
+    assert len(token) >= 32
+    assert token_of(tmp_path / "other") != token
+    (tmp_path / "token").chmod(0o644)
+    with pytest.raises(OutputError, match="others may read"):
+        token_of(tmp_path / "token")
+    (tmp_path / "short").write_text("1234")
+    (tmp_path / "short").chmod(0o600)
+    with pytest.raises(OutputError, match="4 characters"):
+        token_of(tmp_path / "short")
+    with pytest.raises(OutputError, match="cannot make"):
+        token_of(tmp_path / "no" / "token")
+
+
+def test_a_rate_is_kept():
+    now = [0.0]
+    rate = Rate(10.0, 3, lambda: now[0])
+    assert [rate.allows() for _ in range(5)] == [True] * 3 + [False] * 2
+    now[0] = 0.25
+    assert [rate.allows() for _ in range(4)] == [True] * 2 + [False] * 2

@@ -1,0 +1,78 @@
+"""What a change would do, before it is applied, and the way back: figures, ticks, refusals, and nothing on the way."""
+
+from __future__ import annotations
+
+import pytest
+
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
+from rtloop.service.preview import figures
+from tests.faults.bench import Bench
+from tests.paper_configuration import PAPER, TEXT
+from tests.service.http import answer
+
+
+def axis_as_it_runs(bench: Bench) -> dict:
+    return bench.client.get("/configuration")["values"]["axis"][0]
+
+
+def test_figures_are_those_of_check():
+    """Of the paper's loop, by the analysis that `rtloop check` prints."""
+    prepared = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
+    found, running = figures(prepared, 0), prepared.checks[0].running
+    assert running is not None
+    assert found["phase_margin_deg"] == running.phase_margin_deg
+    assert 10 ** (found["gain_margin_db"] / 20) == pytest.approx(running.gain_margin)
+    assert found["modulus_margin"] == pytest.approx(1 / running.max_sensitivity)
+    low, high = found["tolerated_shift_percent"]
+    assert low < 0 < high
+    step = found["step"]
+    assert len(step["t_ms"]) == len(step["y"]) <= 400
+    assert max(step["y"]) == pytest.approx((1 + running.overshoot_percent / 100) * step["y"][-1], rel=0.02)
+    assert step["t_ms"][-1] >= 1e3 * running.settling_time_s
+
+
+def test_a_preview_changes_nothing_and_takes_no_lock(running: Bench):
+    before = axis_as_it_runs(running)
+    body = {"axis": "x", "section": "controller", "values": {"gain": 0.008}}
+    found = running.client.post("/preview", body)
+    assert found["after"]["crossover_hz"] < 0.7 * found["before"]["crossover_hz"]
+    assert found["after"]["gain_margin_db"] > found["before"]["gain_margin_db"] + 3
+    assert axis_as_it_runs(running) == before
+    running.client.delete("/lock")
+    running.client.post("/preview", body)
+    assert running.status()["lock"] is None
+    # as `tune` would be refused
+    unstable = {"axis": "x", "section": "controller", "values": {"gain": 5.0}}
+    for path in ("/preview", "/tune"):
+        code, said = answer(running, "POST", path, unstable)
+        assert code == 422
+        assert "unstable" in said["error"]
+    assert answer(running, "POST", "/preview", body | {"axis": "y"})[0] == 422
+    assert answer(running, "POST", "/preview", body | {"section": "driver"})[0] == 422
+    assert axis_as_it_runs(running) == before
+
+
+def test_back_step_by_step(running: Bench):
+    before = axis_as_it_runs(running)
+    code, said = answer(running, "POST", "/undo", {"axis": "x"})
+    assert code == 409
+    assert "was not changed" in said["error"]
+    ticks = [
+        running.client.post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})["tick"],
+        running.client.post("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}})["tick"],
+    ]
+    running.client.post("/setpoint", {"axis": "x", "value": 12.5})
+    undone = [running.client.post("/undo", {"axis": "x"}) for _ in range(2)]
+    assert [one["undone"] for one in undone] == ["limits: command_um", "controller: gain"]
+    assert ticks[0] < ticks[1] < undone[0]["tick"] < undone[1]["tick"]
+    assert axis_as_it_runs(running)["controller"] == before["controller"]
+    assert axis_as_it_runs(running)["limits"] == before["limits"]
+    assert running.status()["axes"]["x"]["reference_um"] == 12.5
+    assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
+
+
+def test_a_refused_change_is_none_to_undo(running: Bench):
+    assert answer(running, "POST", "/tune", {"axis": "x", "section": "controller", "values": {"gain": 5.0}})[0] == 422
+    assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
+    assert answer(running, "POST", "/undo", {"axis": "y"})[0] == 422
