@@ -19,6 +19,8 @@ from rtloop.panel.views.wishes import XyWish
 KIND = "prandtl_ishlinskii"
 BINS = 1000
 """Stretches of time, of each of which the extremes of drive and position are shown: 4 points at most."""
+NEW_PART = 50
+"""One part in so many of what is shown."""
 MODEL_BINS, SHAPE_BINS = 150, 500
 WARM_BINS = 100
 """The drive before, as coarse as that, is what the model remembers."""
@@ -34,10 +36,15 @@ class Drawn:
         self._ticks = max(round(wish.seconds * loop.rate_hz), 2)
         self._signals = [f"{wish.axis}_drive_v", f"{wish.axis}_position_um"]
         self._model = play_model(loop.axes[wish.axis])
+        self._shown = (-1, 0)
+        """Run and last tick of what was shown."""
 
-    def frame(self, past: Past) -> bytes:
-        """The last seconds."""
+    def frame(self, past: Past) -> bytes | None:
+        """The last seconds; None before a part of them is new."""
         first, end = past.end - self._ticks, past.end
+        if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
+            return None
+        self._shown = past.run, end
         drive, position = past.values(self._signals, first, end)
         good = np.isfinite(drive) & np.isfinite(position)
         drive, position = drive[good], position[good]
