@@ -64,7 +64,7 @@ export class Scope {
   }
 
   get pixels() {
-    return Math.round(Math.min(Math.max(this.#lanes.pixels, 200), 4000));
+    return Math.round(Math.min(Math.max(this.#lanes.pixels || 1200, 200), 4000));
   }
 
   get canvases() {
