@@ -60,9 +60,7 @@ def elsewhere() -> Iterator[str]:
     server.server_close()
 
 
-def test_a_page_of_another_origin_cannot_move_the_drive(
-    page: Any, bench: Bench, address: str, elsewhere: str
-) -> None:
+def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench, address: str, elsewhere: str) -> None:
     started(page)
     page.fill("#setpoint", "12.5")
     page.keyboard.press("Enter")
