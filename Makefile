@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -22,6 +22,11 @@ test: $(READY)
 	$(BIN)/lint-imports
 	$(BIN)/python -m rtloop.commands.warm
 	$(BIN)/pytest -n 2 --dist loadfile
+
+# Foxglove's own client and decoders, with which `make test` reads what viewers get: needs node and npm.
+viewers:
+	npm install --prefix build/node --no-save --no-package-lock --no-audit --no-fund \
+		@foxglove/ws-protocol @foxglove/rosmsg @foxglove/rosmsg2-serialization ws
 
 # What the tests of the panel's page need: Debian's Chromium (as root), Playwright, and axe, which judges accessibility.
 browser: $(READY)
@@ -104,6 +109,10 @@ flagship: $(READY)
 # A service measures its own loop on rigs of known transfer function: about six minutes.
 soak-response: $(READY)
 	$(BIN)/python -m tests.soak.response
+
+# A service whose resonance has moved measures it, makes its taps anew, and steps and scans: four minutes.
+soak-retune: $(READY)
+	$(BIN)/python -m tests.soak.retune
 
 # One configuration on every backend that needs no hardware, side by side: two minutes.
 soak-backends: $(READY)

@@ -42,9 +42,10 @@ def beside(config: Path, wanted: bool, port: int) -> AbstractContextManager[None
 @click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="0 is any free one.")
 @click.option("--open", "opens", is_flag=True, help="Open it in the browser.")
 @click.option("--token-file", type=OUTPUT, help="Holds the token, and is made where it is not there.")
+@click.option("--foxglove", is_flag=True, help="Serve viewers of the Foxglove WebSocket protocol; they can only look.")
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @fails_clearly
-def panel(service: str | None, port: int, opens: bool, token_file: Path | None, tied: bool) -> int:
+def panel(service: str | None, port: int, opens: bool, token_file: Path | None, foxglove: bool, tied: bool) -> int:
     """Show a running loop in the browser: a scope, a spectrum, a desk.
 
     NAME is that of a service, SOCKET the path of its control socket; the only service that runs is taken without
@@ -56,7 +57,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
     if tied:
         _end_with_stdin()
     path = Path(service) if service is not None and "/" in service else socket_of(service)
-    return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens)
+    return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 
 def _end_with_stdin() -> None:

@@ -146,11 +146,16 @@ def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
     """Samples of delay in an axis's loop: what its model says, and no fewer than the simulated rig has."""
     options = configuration.driver_options
     of_rig = options.latency_ticks if configuration.driver_kind == "sim" and isinstance(options, RigOptions) else 0
+    return delay_with(of_rig, axis)
+
+
+def delay_with(of_rig: int, axis: AxisOptions) -> int:
+    """As `delay_ticks`, on a rig that delays by so many samples."""
     return max(of_rig, 0 if axis.model is None else axis.model.delay_ticks)
 
 
-def promised_loop(axis: AxisOptions, rate_hz: float, plant: Transfer | None = None) -> Loop | None:
-    """The loop of an axis with a controller of its own, on its model or another `plant`.
+def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:
+    """The loop of an axis with a controller of its own, on its model or another `plant`, with a `delay` in samples.
 
     None where there is none, or nothing linear is known of it.
     """
@@ -158,9 +163,7 @@ def promised_loop(axis: AxisOptions, rate_hz: float, plant: Transfer | None = No
     if axis.model is None or law is None or law.count > 1:
         return None
     try:
-        return discrete_loop(
-            linear_part(law), plant or axis.model.transfer(), axis.model.delay_ticks, axis.prefilter.path()
-        )
+        return discrete_loop(linear_part(law), plant or axis.model.transfer(), delay, axis.prefilter.path())
     except ValueError:
         return None
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtloop.analysis.learning import GROWN, Learning, learning, periods, rms, untaught
 from rtloop.analysis.perturbation import around
-from rtloop.configuration.checks import promised_loop
+from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
 from rtloop.service.desk import Refused
@@ -128,7 +128,7 @@ def _teacher(live: LiveLaw, number: int, asked: Asked) -> Learning:
     loops = []
     if options.model is not None and len(configuration.together(number)) == 1:
         for name, plant in around(options.model.transfer(), asked.resonance_percent):
-            loop = promised_loop(options, rate_hz, plant)
+            loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
             loops += [] if loop is None else [(name, loop)]
     if not loops:
         raise _unsuitable(f"axis {options.name!r}: no model of a loop of its own; what is learned follows from that")

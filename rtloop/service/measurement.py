@@ -21,7 +21,7 @@ from rtloop.analysis.measured.measurement import IN_STEP, Measurement, measureme
 from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
 from rtloop.analysis.measured.response import Signals
 from rtloop.analysis.perturbation import resonance_hz
-from rtloop.configuration.checks import promised_loop
+from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
 from rtloop.service.desk import Refused
@@ -94,7 +94,7 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
     if len(configuration.together(number)) > 1:
         raise ConfigError("request", [f"axis {axis!r}: shares its controller; a loop of one axis is measured"])
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
-    model = promised_loop(options, rate_hz)
+    model = promised_loop(options, rate_hz, delay_ticks(configuration, options))
     known = options.model and resonance_hz(options.model.transfer())
     near_hz, half_width_hz = known or (None, 0.0)
     near_hz = asked.near_hz or near_hz

@@ -205,7 +205,7 @@ def test_a_model_stands_for_hardware() -> None:
     """With the hysteresis that a compensation experiment found, and without."""
     card = replace(PAPER, driver_kind="card", driver_options=Options())
     stand = Stand(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
-    design = DesignOptions.model_validate({"simulation": {"steps_um": [5.0]}})
+    design = DesignOptions.model_validate({"simulation": {"steps_um": [20.0]}})
     found = [
         simulate(Bench(card, {"x": one}), card.axes[0], 0.031, design)
         for one in (stand, stand._replace(residual_percent=3.75))

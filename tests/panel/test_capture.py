@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -128,6 +130,18 @@ def test_what_is_refused(loop: Loop):
     with pytest.raises(RtloopError, match=r"no trigger within 0\.2 s"):
         connection.capture(0.1, rtloop.Tripped(), timeout_s=0.2)
     assert sorted((bench.folder / "recordings").glob("*capture*")) == before
+
+
+def test_where_another_recorder_took_over(loop: Loop):
+    """The stretch begins behind the place, and the last state of the law before it is in the dead one's file."""
+    bench, connection = loop
+    dead = bench.pid("recorder")
+    os.kill(dead, signal.SIGKILL)
+    wait_for(lambda: bench.pid("recorder") != dead, "another recorder")
+    for _ in range(3):
+        run = connection.capture(0.1, at=bench.ticks)
+        asked(run)
+    assert run.paths[0].parent == bench.folder / "recordings"
 
 
 def test_the_notebook(loop: Loop, monkeypatch: pytest.MonkeyPatch):

@@ -31,19 +31,23 @@ from rtloop.recording.replay.replay import replay
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import ROOT, RealLoop, scheduled
 
-TICKS, BURST, LAWS_AT = 16_000, 500, {4_000: "gain = 0.011", 11_500: "gain = 0.013"}
+TICKS, BURST = 16_000, 500
+TEXT = scheduled().replace("rate_hz = 10000\n", 'rate_hz = 10000\nlaws = ["pid"]\n', 1)
+PID = '[axis.controller]\nkind = "pid"\nki_per_s = 150.0\nkd_s = 1e-5\nfilter_s = 2e-4\n'
+CONTROLLER = TEXT[TEXT.index("[axis.controller]") : TEXT.index("# Eq (5)")]
+LAWS_AT = {4_000: ("gain = 0.016", "gain = 0.011"), 8_000: (CONTROLLER, PID), 14_500: ("gain = 0.016", "gain = 0.013")}
 SNAPSHOTS = 1_700
 
 
 def run(path: Path, **options: Any) -> list[Path]:
     """Modes, trips, references and laws that change while it runs; beside the file, what it was as it grew."""
-    loop = RealLoop(scheduled())
+    loop = RealLoop(TEXT)
     loop.take_snapshots_every(SNAPSHOTS)
     session = Session(loop.block, path, loop.header, Options(min_free_bytes=0, **options))
     while loop.tick < TICKS:
-        if gain := LAWS_AT.get(loop.tick):
-            coefficients = prepare(parse(scheduled().replace("gain = 0.016", gain), "test", ROOT / "deploy", "test"))
-            staged = coefficients.plan.coefficients.tobytes()
+        if change := LAWS_AT.get(loop.tick):
+            other = prepare(parse(TEXT.replace(*change), "test", ROOT / "deploy", "test"))
+            staged = other.plan.coefficients.tobytes()
             loop.block["staged"][: len(staged)] = np.frombuffer(staged, np.uint8)
             send(loop.block, message(Kind.LOAD_LAW, axis=0, values=[1.0]))
         loop.run(BURST)
@@ -61,7 +65,7 @@ def run(path: Path, **options: Any) -> list[Path]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = run(tmp_path_factory.mktemp("whole") / "run.mcap")[0]
     kinds = [event["kind"] for event in load(path).events]
-    assert kinds.count("load_law") == 2
+    assert kinds.count("load_law") == 3
     assert {"set_mode", "tripped", "reset_trip", "set_reference"} <= set(kinds)
     return path
 
@@ -190,8 +194,13 @@ def test_what_is_none(whole: Path, tmp_path: Path):
 def test_without_a_snapshot_before_it(whole: Path, parts: list[Path], tmp_path: Path):
     """The oldest parts were deleted, and one that a recorder began which took over in the middle is alone."""
     report = cut(parts[1:], 3_400, 5_000, tmp_path / "out.mcap")
-    assert report["problems"] == ["part 1 of the run is missing"]
+    assert (report["complete"], report["problems"]) == (True, [])
     assert identical(tmp_path / "out.mcap", 1_600)
+    missing, behind = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
+    report = cut([parts[0], parts[2]], missing[0] - 5, behind[0] + 5, tmp_path / "hole.mcap")
+    hole = len(missing)
+    assert report["gaps"] == [(missing[0], hole)]
+    assert report["problems"] == [f"{hole} of its ticks are not in the recording, and no gap says why"]
     rows = make_rows(3_000, first=500)
     path = write_recording(tmp_path / "late.mcap", rows, first_tick=500)
     with pytest.raises(RecordingError, match="ticks 500 to 3499 are"):

@@ -11,17 +11,18 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
+from tests.design.measured_loops import margins_of
 from tests.faults.bench import Bench
 from tests.service.http import answer
-from tests.service.test_response import CONFIGURATION, HELD_UM, LOOP, OMEGA
+from tests.service.test_response import CONFIGURATION, HELD_UM, LOOP, OMEGA, QUICK
 
 MODEL = f"""
 [axis.model]
 form = "factors"
 gain = {OMEGA**2!r}
 denominator = [[1.0, {2 * LOOP.damping * OMEGA!r}, {OMEGA**2!r}]]
-delay_ticks = {LOOP.delay_ticks}
 """
+"""It says nothing of a delay: what the rig's driver has is in the loop all the same."""
 TICKS = 100
 WANTED_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
 ASKED = {"axis": "x", "samples": WANTED_UM.tolist(), "cycles": 3}
@@ -74,3 +75,12 @@ def test_what_cannot_be_learned_is_refused_with_the_reason(running: Bench, chang
     assert code == 422
     assert said in json.dumps(told)
     assert running.client.get("/status")["axes"]["x"]["reference_um"] == pytest.approx(HELD_UM)
+
+
+def test_the_rigs_delay_is_in_the_loop_that_is_promised(running: Bench):
+    held(running)
+    found = running.client.post("/response", QUICK, 60.0)
+    true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
+    promised = found["model"]["margins"]
+    assert promised["gain_margin"] == pytest.approx(true["gain_margin"], rel=1e-3)
+    assert promised["phase_margin_deg"] == pytest.approx(true["phase_margin_deg"], abs=0.05)

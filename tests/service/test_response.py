@@ -236,3 +236,15 @@ def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:
     bench.client.post("/reset")
     bench.client.post("/start")
     bench.await_state("running")
+
+
+def test_a_service_that_ends_says_so_to_who_still_measures(bench: Bench) -> None:
+    """Last in this file."""
+    asking: list[tuple[int, Any]] = []
+    thread = threading.Thread(target=lambda: asking.append(answer(bench, "POST", "/response", QUICK)))
+    thread.start()
+    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    assert bench.stop() == 0
+    thread.join()
+    assert asking == [(503, {"error": "response: the service ends"})]
+    assert "Traceback" not in bench.log()

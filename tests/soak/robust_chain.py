@@ -4,11 +4,12 @@ Each rig is recorded under a slow sine and under steps; `design auto` designs fo
 promises its steps: as `design verify` does it, they are simulated with everything that is not linear, on a rig after
 the models that were identified, which knows nothing of the true one. The same steps then run on the true one, in
 virtual time, with noise of another seed. What counts is the worst of four steps, as a verification takes it. Noise
-makes that another each time, most of all a settling time where the overshoot comes near its band: so GROUPS of four
-are looked at on both sides. A row says the medians, promised and seen; or the refusal.
+makes that another each time, most of all a settling time where the overshoot comes near its band: so a verification
+promises a range there, and GROUPS of four are looked at on both sides. A row says the range promised, and the median
+and the range seen; or the refusal.
 
-Ends with 1 where an error other than a refusal came, a loop tripped, or the median promised was further than
-SETTLING_PART or OVERSHOOT_POINTS from all that was seen.
+Ends with 1 where an error other than a refusal came, a loop tripped, or the median seen was further than SETTLING_PART
+or OVERSHOOT_POINTS from the range promised.
 """
 
 from __future__ import annotations
@@ -67,18 +68,19 @@ class Steps(NamedTuple):
 
     def near(self, promised: Steps) -> bool:
         """Whether what was promised is what was seen; a tick is what a record can tell."""
-        settling, overshoot = np.median(promised.settling_ms), np.median(promised.overshoot_percent)
-        return _among(settling, self.settling_ms, max(SETTLING_PART * settling, 1e3 / RATE_HZ)) and _among(
-            overshoot, self.overshoot_percent, OVERSHOOT_POINTS
+        settling, overshoot = np.median(self.settling_ms), np.median(self.overshoot_percent)
+        return _among(settling, promised.settling_ms, max(SETTLING_PART * settling, 1e3 / RATE_HZ)) and _among(
+            overshoot, promised.overshoot_percent, OVERSHOOT_POINTS
         )
 
     def __str__(self) -> str:
-        return f"{np.median(self.settling_ms):.2f} ms {np.median(self.overshoot_percent):.2f} %"
+        found = zip((self.settling_ms, self.overshoot_percent), ("ms", "%"), strict=True)
+        return ", ".join(f"{np.median(one):.2f} ({one.min():.2f} … {one.max():.2f}) {unit}" for one, unit in found)
 
 
-def _among(promised: Any, seen: np.ndarray[Any, Any], allowed: float) -> bool:
-    """From the least to the most that was seen, or no more than `allowed` beside it."""
-    return bool(seen.min() - allowed <= promised <= seen.max() + allowed)
+def _among(seen: Any, promised: np.ndarray[Any, Any], allowed: float) -> bool:
+    """From the least to the most that was promised, or no more than `allowed` beside it."""
+    return bool(promised.min() - allowed <= seen <= promised.max() + allowed)
 
 
 def main() -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from rtloop.analysis.measured.measurement import IN_STEP, SIGNALS, Measurement, measurement
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import promised_loop
+from rtloop.configuration.checks import delay_with, promised_loop
 from rtloop.design.identification.measured import UnsuitableData, axis_of
 from rtloop.hil.modal import Real
 from rtloop.recording.load import load
@@ -30,11 +30,14 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
         names["feed_um"] = f"{axis}_feed_um"
     # all in one pass: a recording may still be growing
     signals: dict[str, Real] = dict(zip(names, recording.read(*names.values()), strict=True))
-    described = next(one for one in tomllib.loads(recording.configuration)["axis"] if one["name"] == axis)
+    configured = tomllib.loads(recording.configuration)
+    described = next(one for one in configured["axis"] if one["name"] == axis)
+    of_rig = configured["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == IN_STEP else 0
     model, known, taps = None, None, described.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
         options = AxisOptions.model_validate(described)
-        model, known = promised_loop(options, rate_hz), options.model and resonance_hz(options.model.transfer())
+        model = promised_loop(options, rate_hz, delay_with(of_rig, options))
+        known = options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (known[0] if known else None)
     try:
         return measurement(signals, rate_hz, near_hz, model, taps)

@@ -22,6 +22,8 @@ from rtloop.linear.transfer import Transfer
 PLACES, PROVED, ROUNDS = 7, 41, 6
 """Of each resonance in a programme, and in the proof of its answer; how often the worst of a proof may join it."""
 PROOF_POINTS = 10
+EXCESS = 1e-4
+"""Per unit step, by which v may miss its limits in a proof: 4 nm of 40 µm."""
 LONGEST = 0.9
 """Settling beyond this part of the taps' length is not looked for."""
 CURVE = (0.93, 1.15, 23)
@@ -50,10 +52,13 @@ class Subject:
 
 
 class Judged(NamedTuple):
-    """Of a step: settling to ±5 % in ms, overshoot, undershoot, least and largest v, per unit."""
+    """Of a step: settling to ±5 % in ms, overshoot, by how much v goes beyond what it may (negative where it does not),
+    undershoot, least and largest v, per unit.
+    """
 
     settling_ms: float
     overshoot: float
+    excess: float
     undershoot: float
     lowest_command: float
     highest_command: float
@@ -100,11 +105,11 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
                 f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help"
             )
         judged = {one: judged_of(subject, taps, one) for one in dict.fromkeys([*scenarios, *family.swept(PROVED)])}
-        worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(2)]
+        worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(3)]
         new = [one for one in dict.fromkeys(worst) if one not in scenarios]
         kept = _worst(judged.values())
         settled = kept.settling_ms <= (settling + 1 / options.points_per_tick) * tick_ms
-        if settled and kept.overshoot <= subject.overshoot:
+        if settled and kept.overshoot <= subject.overshoot and kept.excess <= EXCESS:
             break
         if rounds == ROUNDS:
             raise NoDesign(_unproved(subject, settling * tick_ms, kept, len(judged)))
@@ -163,19 +168,20 @@ def trade_off(programme: Programme, fastest: float, tick_ms: float) -> tuple[tup
 
 def _worst(found: Iterable[Judged]) -> Judged:
     """Of each quantity."""
-    settling, over, under, low, high = (np.array(values) for values in zip(*found, strict=True))
-    return Judged(
-        float(settling.max()), float(over.max()), float(under.max()), float(low.min()), float(high.max())
-    )  # fmt: skip
+    settling, over, excess, under, low, high = (np.array(values) for values in zip(*found, strict=True))
+    largest = (float(one.max()) for one in (settling, over, excess, under))
+    return Judged(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
 
 def judged_of(subject: Subject, taps: Taps, scenario: Scenario) -> Judged:
     """What a step does on one plant."""
     time, position, command = _steps(subject, taps, scenario)
+    low, high = subject.bounds.command(np.array(1 / subject.family().plant(scenario).dc_gain))
+    excess = float(max(command.max() - high, low - command.min()))
     outside = np.flatnonzero(np.abs(position - 1) > BAND)
     settled = float(time[min(outside[-1] + 1, time.size - 1)]) if outside.size else 0.0
     over, under = max(0.0, float(position.max()) - 1), max(0.0, -float(position.min()))
-    return Judged(1e3 * settled, over, under, float(command.min()), float(command.max()))
+    return Judged(1e3 * settled, over, excess, under, float(command.min()), float(command.max()))
 
 
 def _steps(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
@@ -218,9 +224,13 @@ def _unproved(subject: Subject, settling_ms: float, kept: Judged, plants: int) -
     """What the proof misses."""
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
-        f"{kept.settling_ms:.4g} ms and overshoot by {100 * kept.overshoot:.4g} % on {plants} plants between the "
-        "scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
+        f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_beyond(kept)} on {plants} "
+        "plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
     )
+
+
+def _beyond(kept: Judged) -> str:
+    return f"{100 * kept.excess:.2g} % of a step beyond its limits" if kept.excess > EXCESS else "within its limits"
 
 
 def _binding(subject: Subject) -> str:

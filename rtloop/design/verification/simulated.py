@@ -31,13 +31,17 @@ REST_S, SETTLES_S = 2.0, 0.5
 """How long the rest is looked at, and what passes before."""
 RESTS = (0.03, 0.12, 0.24, 0.48)
 """Where, as parts of the range."""
+GROUPS = 3
+"""How often four steps are made, each time with other noise."""
 JUDGED = ("settling_ms", "overshoot_percent", "static_error_percent")
 """Quantities of a step that a specification is about."""
 LIMITED = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
 
 
 class SimulatedStep(NamedTuple):
-    """The worst of steps of one height, up and down, to both sides; what limited, and what tripped it."""
+    """The worst of four steps of one height, up and down, to both sides: the median of GROUPS times four, and from the
+    least to the most (`ranges`, in the order of JUDGED); what limited, and what tripped it.
+    """
 
     height_um: float
     settling_ms: float
@@ -46,6 +50,7 @@ class SimulatedStep(NamedTuple):
     peak_drive_v: float
     limited: tuple[str, ...]
     trips: tuple[str, ...]
+    ranges: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -101,8 +106,9 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
     possible = sorted(height for height in set(heights_um) if height <= reach_um)
     found = []
     for height in possible:
-        levels = (0.0, height, 0.0, -height, 0.0) if downwards else (0.0, height, 0.0, height, 0.0)
-        found.append(_judged(bench.rig, bench.run(axis.name, levels, dwell_s), axis.name, height, bench.rate_hz))
+        levels = (height, 0.0, -height, 0.0) if downwards else (height, 0.0, height, 0.0)
+        run = bench.run(axis.name, (0.0, *GROUPS * levels), dwell_s)
+        found.append(_judged(bench.rig, run, axis.name, height, bench.rate_hz))
     truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
     left_out = tuple(sorted(set(heights_um) - set(possible)))
     noise_x_nm, noise_v_nm = _at_rest(bench, axis.name, reach_um)
@@ -131,18 +137,23 @@ def _reach(axis: AxisOptions) -> tuple[float, bool]:
 def _judged(rig: RigOptions, run: Mapping[str, Real], axis: str, height_um: float, rate_hz: float) -> SimulatedStep:
     flags = run["flags"].astype(np.int64)
     ever = int(np.bitwise_or.reduce(flags))
-    metrics = step_metrics(
-        np.repeat(run[f"{axis}_reference_um"], POINTS), between_ticks(rig, run, axis, rate_hz), POINTS * rate_hz
-    )
-    assert metrics is not None
+    reference = np.repeat(run[f"{axis}_reference_um"], POINTS)
+    position = between_ticks(rig, run, axis, rate_hz)
+    worst, count = [], 4 * reference.size // (4 * GROUPS + 1)
+    for start in range(reference.size - GROUPS * count, reference.size, count):
+        one = step_metrics(reference[start - 1 : start + count], position[start - 1 : start + count], POINTS * rate_hz)
+        assert one is not None
+        worst.append((one.settling_time_ms_worst, one.overshoot_percent_worst, one.static_error_percent_worst))
+    settling_ms, overshoot_percent, static_error_percent = np.median(worst, axis=0).tolist()
     return SimulatedStep(
         height_um,
-        metrics.settling_time_ms_worst,
-        metrics.overshoot_percent_worst,
-        metrics.static_error_percent_worst,
+        settling_ms,
+        overshoot_percent,
+        static_error_percent,
         float(np.abs(run[f"{axis}_drive_v"]).max()),
         tuple(name for flag, name in LIMITED.items() if ever & flag),
         tuple(trip_causes(ever)),
+        tuple(zip(np.min(worst, axis=0).tolist(), np.max(worst, axis=0).tolist(), strict=True)),
     )
 
 

@@ -16,6 +16,8 @@ from rtloop.design.verification.verify import Row, Verification
 ON_PAPER, RUNS = "continuous C(s)", "as it runs C(z)"
 LINEAR = "linear"
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
+SPREAD, SPREAD_PERCENT = 0.1, 0.5
+"""Part of a settling time, and points of a percentage, beyond which noise decides what it is: a range is shown."""
 NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
 
@@ -109,9 +111,9 @@ def simulated(found: Verification) -> list[tuple[str, ...]]:
     for step in found.simulated.steps:
         cells = [
             part
-            for name in JUDGED
+            for name, ends in zip(JUDGED, step.ranges, strict=True)
             for part in (
-                f"{getattr(step, name):.4g} {QUANTITIES[name][1]}",
+                _or_range(getattr(step, name), ends, QUANTITIES[name][1]),
                 verdict(found.simulated.met(step, name)),
             )
         ]
@@ -119,6 +121,12 @@ def simulated(found: Verification) -> list[tuple[str, ...]]:
         stopped += [f"limited: {', '.join(step.limited)}"] if step.limited else []
         rows.append((f"{step.height_um:g} µm", *cells, f"{step.peak_drive_v:.4g} V", "; ".join(stopped)))
     return rows
+
+
+def _or_range(value: float, ends: tuple[float, float], unit: str) -> str:
+    """The value; or from where to where it is, where noise decides that."""
+    decided = ends[1] - ends[0] <= (SPREAD_PERCENT if unit == "%" else SPREAD * value)
+    return f"{value:.4g} {unit}" if decided else f"{ends[0]:.3g} … {ends[1]:.3g} {unit}"
 
 
 def simulation_notes(found: Verification) -> list[str]:

@@ -18,16 +18,17 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
 from rtloop.errors import RtloopError
+from rtloop.panel.viewers.foxglove import Foxglove
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.link import Service
+from rtloop.panel.views.state import State
 from rtloop.panel.web import recordings
-from rtloop.panel.web.feed import Feed
-from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Live
 from rtloop.panel.web.loop import loop_for_pages
 from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy, decoded, limited_body
 from rtloop.panel.web.rates import Rate
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
-from rtloop.panel.web.state import State
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
 MOST_TOKEN_BYTES = 4096
@@ -43,8 +44,8 @@ class Pages(StaticFiles):
         return response
 
 
-def application(service: Service, sessions: Sessions) -> Starlette:
-    """The panel of a service."""
+def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
+    """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
     feed, state, tries = Feed(service), State(service.client), Rate(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
@@ -92,4 +93,8 @@ def application(service: Service, sessions: Sessions) -> Starlette:
         *recordings.routes(service, lambda: feed.run),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
-    return Starlette(routes=routes, middleware=[Middleware(Guard, sessions=sessions)], lifespan=lifespan)
+    guard = Middleware(Guard, sessions=sessions)
+    if viewers_token is not None:
+        foxglove = Foxglove(feed, viewers_token)
+        routes, guard = [*routes, foxglove.route], Middleware(Guard, sessions=sessions, also=foxglove.admits)
+    return Starlette(routes=routes, middleware=[guard], lifespan=lifespan)

@@ -11,9 +11,9 @@ from anyio import CancelScope, CapacityLimiter
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from rtloop.panel.web.feed import Feed
-from rtloop.panel.web.state import State
-from rtloop.panel.web.viewer import FRAME_S, Viewer
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.state import State
+from rtloop.panel.views.viewer import FRAME_S, Viewer
 
 MAX_STREAMS = 16
 TAKE_S = 10.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from rtloop.configuration.axis import InterlockOptions, LimitsOptions
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.past import longest_s
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import longest_s
 
 
 def loop_for_pages(loop: Description) -> dict[str, Any]:

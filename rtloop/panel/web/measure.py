@@ -8,7 +8,7 @@ import numpy as np
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from rtloop.panel.web.feed import Feed
+from rtloop.panel.views.feed import Feed
 
 MOST_SIGNALS = 8
 

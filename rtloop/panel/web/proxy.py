@@ -10,7 +10,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from rtloop.errors import HostRefused, UnavailableError
-from rtloop.panel.web.link import Service
+from rtloop.panel.views.link import Service
 from rtloop.panel.web.rates import Rate
 from rtloop.service.api.bodies import MAX_BODY_BYTES
 from rtloop.service.api.lanes import Busy, Lane, Lanes

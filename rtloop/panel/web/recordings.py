@@ -22,16 +22,16 @@ from starlette.routing import BaseRoute, Route
 from rtloop.configuration.file import describe
 from rtloop.errors import RtloopError, UnavailableError
 from rtloop.panel.capture import Run, present_run
-from rtloop.panel.web.aside import Aside, Crowded
-from rtloop.panel.web.link import Service
+from rtloop.panel.shelf.aside import Aside, Crowded
+from rtloop.panel.shelf.reference import Wanted, sweep
+from rtloop.panel.shelf.shelf import Shelf
+from rtloop.panel.views.link import Service
 from rtloop.panel.web.proxy import limited_body
-from rtloop.panel.web.reference import Wanted, sweep
-from rtloop.panel.web.shelf import Shelf
 from rtloop.recording.file.ticks import LARGEST
 
 READING_AT_A_TIME = 2
 MOST_BODY_BYTES = 4096
-LONGEST_S = 600.0
+LONGEST_S, AHEAD_S = 600.0, 60.0
 BLOCK_BYTES = 1 << 16
 
 Handler = Callable[[Any, Request], Awaitable[Response]]
@@ -172,8 +172,12 @@ class Recordings:
         if body.first is None or body.end is None:
             assert body.seconds is not None
             return max(run.tick + 1 - round(body.seconds * rate_hz), 0), run.tick + 1
-        if body.end > run.tick + 1 + LONGEST_S * rate_hz or body.end - body.first > LONGEST_S * rate_hz:
+        if body.end - body.first > LONGEST_S * rate_hz:
             raise ValueError(f"ticks {body.first} to {body.end}: at most {LONGEST_S:g} s are captured at once")
+        if body.end > run.tick + AHEAD_S * rate_hz:
+            raise ValueError(
+                f"end: {body.end}; at most {AHEAD_S:g} s behind the newest tick, {run.tick}, are waited for"
+            )
         return max(body.first, 0), body.end
 
     def _folder(self) -> Shelf:

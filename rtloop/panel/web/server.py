@@ -16,11 +16,12 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import OutputError, UnavailableError
+from rtloop.panel.viewers.foxglove import PATH, viewers_token
+from rtloop.panel.views.link import Service
+from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
 from rtloop.panel.web.application import application
-from rtloop.panel.web.link import Service
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions
-from rtloop.panel.web.wishes import MAX_MESSAGE_BYTES
 from rtloop.service.api.connections import Bounded
 
 HOST = "127.0.0.1"
@@ -38,8 +39,11 @@ class Few(Bounded):
     most = MAX_CONNECTIONS
 
 
-def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str], None], opens: bool) -> int:
+def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str], None], opens: bool,
+          foxglove: bool = False) -> int:  # fmt: skip
     """The panel of the service at `control` on 127.0.0.1:`port`; `say` is told its address with the token.
+
+    `foxglove` serves viewers as well; `say` is told theirs.
 
     Raises UnavailableError where the port is taken, OutputError where the token's file cannot be read or made.
     """
@@ -50,9 +54,12 @@ def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str]
         os.nice(NICE)
     address = f"http://{HOST}:{port}/#token={token}"
     say(address)
+    viewers = viewers_token(token) if foxglove else None
+    if viewers is not None:
+        say(f"ws://{HOST}:{port}{PATH}?token={viewers}")
     if opens:
         webbrowser.open(address)
-    server = uvicorn.Server(_settings(application(Service(control), Sessions(token, port))))
+    server = uvicorn.Server(_settings(application(Service(control), Sessions(token, port), viewers)))
     for number in (signal.SIGINT, signal.SIGTERM):  # the server takes them, and hands them on when it has ended
         signal.signal(number, lambda *_: None)
     try:

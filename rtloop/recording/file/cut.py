@@ -14,7 +14,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import CUT, GAP, recorder_event
-from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
+from rtloop.recording.file.parts import Files, Parts, find_files
 from rtloop.recording.file.reader import Rows
 from rtloop.recording.file.recover import Progress, grows
 from rtloop.recording.file.seek import Seeker
@@ -106,7 +106,7 @@ def cut(
             "cut": {"first": asked.first, "end": asked.end, "files": source.files(stretch)},
         }
         copy, ticks = _write(source, stretch, header, output, min_free_bytes, progress)
-        problems = [*absent_parts(readers), *source.problems]
+        problems = [*source.problems]
         if copy.unexplained:
             problems.append(f"{copy.unexplained} of its ticks are not in the recording, and no gap says why")
         return {

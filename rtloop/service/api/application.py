@@ -251,6 +251,8 @@ async def _answer(service: Service, lanes: Lanes, connection: HTTPConnection, pa
         wanted = None if body is None else body.model_validate_json(data)
         with asking(service, connection, path, wanted):
             return JSONResponse(await lanes.run(LANES.get(path, Lane.ORDINARY), action, service, wanted))
+    except asyncio.CancelledError:  # whoever still waits as the server comes to its end
+        return refused(503, f"{path.removeprefix('/')}: the service ends")
     except Exception as error:
         return refusal(error)
 

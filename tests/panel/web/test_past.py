@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.past import BLOCK, Past, longest_s, ticks_kept
+from rtloop.panel.views.past import BLOCK, Past, longest_s, ticks_kept
 
 COLUMNS = ("tick", "a", "b")
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.past import Past
-from rtloop.panel.web.scope import Scope
-from rtloop.panel.web.timing import Timing
-from rtloop.panel.web.wishes import read_wishes, wish_of
-from rtloop.panel.web.xy import extremes
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
+from rtloop.panel.views.scope import Scope
+from rtloop.panel.views.timing import Timing
+from rtloop.panel.views.wishes import read_wishes, wish_of
+from rtloop.panel.views.xy import extremes
 from rtloop.signals import Signal, columns
 from tests.panel.web.browser import unpacked
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,13 +15,10 @@ from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import RtloopError
 from rtloop.panel.reader import MOST_TICKS, Reader
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.events import Events
-from rtloop.panel.web.link import Description, Service
-from rtloop.panel.web.past import Past, ticks_kept
-from rtloop.panel.web.timing import Timing
-
-if TYPE_CHECKING:
-    from rtloop.panel.web.viewer import Viewer
+from rtloop.panel.views.events import Events
+from rtloop.panel.views.link import Description, Service
+from rtloop.panel.views.past import Past, ticks_kept
+from rtloop.panel.views.timing import Timing
 
 POLL_S = 1 / 60
 IDLE_S = 0.2
@@ -29,6 +27,22 @@ AGAIN_S = 0.5
 """Before a service that did not answer is asked again."""
 Messages = npt.NDArray[Any]
 log = logging.getLogger(__name__)
+
+
+class Follower(Protocol):
+    """Who is handed every tick, under the feed's lock."""
+
+    def begin(self, loop: Description) -> None:
+        """A run of a loop begins."""
+        ...
+
+    def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
+        """Ticks came; `commands` are those at which one took effect."""
+        ...
+
+    def end_run(self, past: Past) -> None:
+        """The run is over."""
+        ...
 
 
 class Feed:
@@ -45,7 +59,7 @@ class Feed:
         self.fault: str | None = "nothing is read yet"
         """Why nothing can be read; None while it can."""
         self._reader: Reader | None = None
-        self._viewers: list[Viewer] = []
+        self._viewers: list[Follower] = []
         self._caught_up = -1
         """The run of which nothing was left to read."""
         self._early: Messages = np.zeros(0, MESSAGE)
@@ -78,14 +92,14 @@ class Feed:
         """Since the newest tick came; None before one did."""
         return None if self._moved_s is None else time.monotonic() - self._moved_s
 
-    def join(self, viewer: Viewer) -> None:
+    def join(self, viewer: Follower) -> None:
         """Hand it every tick from now on."""
         with self.lock:
             self._viewers.append(viewer)
             if self.loop is not None:
                 viewer.begin(self.loop)
 
-    def leave(self, viewer: Viewer) -> None:
+    def leave(self, viewer: Follower) -> None:
         """It has gone."""
         with self.lock:
             self._viewers.remove(viewer)

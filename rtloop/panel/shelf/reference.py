@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rtloop.panel.envelope import envelope
 from rtloop.panel.stretch import index_of
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.wishes import MAX_PIXELS
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.wishes import MAX_PIXELS
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.seek import Seeker
 from rtloop.recording.file.ticks import LARGEST

@@ -6,9 +6,9 @@ import numpy as np
 
 from rtloop.panel.spectrum import Spectrum
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.wishes import SpectrumWish
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.wishes import SpectrumWish
 
 
 class Analyser:

@@ -11,10 +11,10 @@ from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import PlayModel
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.past import Past
-from rtloop.panel.web.wishes import XyWish
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
+from rtloop.panel.views.wishes import XyWish
 
 KIND = "prandtl_ishlinskii"
 BINS = 1000

@@ -8,8 +8,8 @@ import numpy as np
 
 from rtloop.hil.modal import Real
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.link import Description
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
 from rtloop.signals import COMMON, DEADLINE, EXEC, LATENESS, PERIODS_MISSED
 
 WINDOW_S = 60

@@ -11,10 +11,10 @@ import numpy as np
 from rtloop.panel.conditions import Commanded, Condition, Edge, Late, ModeChanged, Stepped, Tripped, Window
 from rtloop.panel.stretch import Stretch, index_of
 from rtloop.panel.trigger import Cause, Mode, Settings, Sweep, Trigger
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.past import Past, longest_s
-from rtloop.panel.web.wishes import TriggerWish, ViewWish
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past, longest_s
+from rtloop.panel.views.wishes import TriggerWish, ViewWish
 
 AUTO_S = 0.1
 """Without a trigger for so long, a sweep is taken all the same, where that is wished."""

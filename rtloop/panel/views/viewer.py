@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rtloop.panel.stretch import Stretch
-from rtloop.panel.web.feed import Feed
-from rtloop.panel.web.frames import pack
-from rtloop.panel.web.link import Description
-from rtloop.panel.web.past import Past
-from rtloop.panel.web.scope import Scope
-from rtloop.panel.web.spectra import Analyser
-from rtloop.panel.web.state import State
-from rtloop.panel.web.wishes import SpectrumWish, ViewWish, XyWish, read_wishes, wish_of
-from rtloop.panel.web.xy import Drawn
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.views.frames import pack
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
+from rtloop.panel.views.scope import Scope
+from rtloop.panel.views.spectra import Analyser
+from rtloop.panel.views.state import State
+from rtloop.panel.views.wishes import SpectrumWish, ViewWish, XyWish, read_wishes, wish_of
+from rtloop.panel.views.xy import Drawn
 
 FRAME_S = 1 / 30
 PERIODS_S = {"state": 1 / 20, "sweep": FRAME_S, "spectrum": 1 / 4, "xy": 1 / 10, "timing": 1 / 2, "events": FRAME_S}

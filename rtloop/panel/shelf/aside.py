@@ -1,4 +1,4 @@
-"""What takes long, or much memory, in processes beside the panel: few at a time, after everybody else, not for ever."""
+"""What takes long, or much memory, in processes beside the panel, as nice as it is: few at a time, and not for ever."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from rtloop.values import counted
 
 AT_A_TIME, MOST_WAITING = 2, 8
 TIMEOUT_S = 120.0
-BELOW = ("nice", "-n", "5", sys.executable, "-m")
 CALM = {"OPENBLAS_NUM_THREADS": "1"}
 
 
@@ -40,7 +39,7 @@ class Aside:
         self._there += 1
         try:
             async with self._turn:
-                return await _said([*BELOW, module, *map(str, arguments)])
+                return await _said([sys.executable, "-m", module, *map(str, arguments)])
         finally:
             self._there -= 1
 
@@ -62,7 +61,7 @@ async def _said(command: list[str]) -> dict[str, Any]:
     try:
         said = json.loads(out)
     except ValueError:
-        raise Failed(f"{command[len(BELOW) - 1]} ended with {process.returncode}") from None
+        raise Failed(f"{command[2]} ended with {process.returncode}") from None
     if "error" in said:
         raise Failed(said["error"])
     return said

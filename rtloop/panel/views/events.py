@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from typing import Any
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
-from rtloop.panel.web.link import Description, Service
+from rtloop.panel.views.link import Description, Service
 from rtloop.recording.file.events import Event, event_of
 
 KEPT = 200
@@ -20,18 +21,21 @@ class Events:
         self._service = service
         self._kept: deque[tuple[int, Event]] = deque(maxlen=KEPT)
         self._count = 0
+        self._lock = threading.Lock()
 
     def take(self, messages: Any, loop: Description, run: int) -> None:
         """Add records of MESSAGE, (n,), of the run that is read; who asked is asked of the service."""
         for message in messages[-KEPT:]:
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
             event = event_of(message, tuple(loop.axes), time_ns, name=self._name(message))
-            self._count += 1
-            self._kept.append((self._count, {**event, "run": run}))
+            with self._lock:
+                self._count += 1
+                self._kept.append((self._count, {**event, "run": run}))
 
     def after(self, number: int) -> tuple[int, list[Event]]:
         """The number of the newest, and those that are kept behind `number`."""
-        return self._count, [event for at, event in self._kept if at > number]
+        with self._lock:
+            return self._count, [event for at, event in self._kept if at > number]
 
     def _name(self, message: Any) -> str | None:
         """Of the operator; None where no name was given, or the service does not answer."""

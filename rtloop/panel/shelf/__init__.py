@@ -1,0 +1,1 @@
+"""The recordings of a service, as a page asks for them."""

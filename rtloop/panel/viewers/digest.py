@@ -1,0 +1,61 @@
+"""The extremes and the last value of every signal since they were taken, however many ticks that is about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.panel.stretch import Stretch
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
+from rtloop.signals import COMMON, TICK
+
+
+class Taken(NamedTuple):
+    """`extremes` (signals, 3): min, max, last; NaN where there was no number. `ticks` they are about, up to `tick`."""
+
+    tick: int
+    ticks: int
+    lost: int
+    extremes: Real
+
+
+class Digest:
+    """Fed with every tick by the feed, under its lock; `generation` goes up with other signals."""
+
+    def __init__(self) -> None:
+        self.names: tuple[str, ...] = ()
+        self.generation = 0
+        self._columns: list[int] = []
+        self._open: Taken | None = None
+
+    def begin(self, loop: Description) -> None:
+        """A run of a loop begins."""
+        names = tuple(name for name in loop.names if name != COMMON[TICK].name)
+        if names != self.names:
+            self.names, self._columns = names, [loop.names.index(name) for name in names]
+            self.generation += 1
+        self._open = None
+
+    def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
+        """Ticks came."""
+        rows = stretch.rows[:, self._columns]
+        if len(rows) == 0:
+            return
+        low, high, count, lost = np.fmin.reduce(rows), np.fmax.reduce(rows), len(rows), stretch.lost
+        if (before := self._open) is not None:
+            low, high = np.fmin(low, before.extremes[:, 0]), np.fmax(high, before.extremes[:, 1])
+            count, lost = count + before.ticks, lost + before.lost
+        self._open = Taken(stretch.end - 1, count, lost, np.column_stack([low, high, rows[-1]]))
+
+    def end_run(self, past: Past) -> None:
+        """The run is over: what was not taken is gone with it."""
+        self._open = None
+
+    def take(self) -> Taken | None:
+        """What came since the last time; None where nothing did."""
+        taken, self._open = self._open, None
+        return taken

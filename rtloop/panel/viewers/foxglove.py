@@ -1,0 +1,208 @@
+"""`/foxglove`: what the loop does, for viewers of the Foxglove WebSocket protocol. They look, and can do nothing else.
+
+Channels, both CDR with a schema of the kind ros2msg:
+
+    /live     RATE_HZ times a second: extremes and last value of each signal since the message before
+    /events   commands, changes of mode, trips, as they come
+
+https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md. A viewer sends no cookie and comes from a page of its
+own: it is let in by a token in its address, which is made from the panel's and is of no use for anything else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import hmac
+import json
+import struct
+import time
+from contextlib import suppress
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs
+
+import anyio.to_thread
+from starlette.routing import WebSocketRoute
+from starlette.types import Scope
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from rtloop.panel.viewers import cdr
+from rtloop.panel.viewers.digest import Digest, Taken
+from rtloop.panel.views.feed import Feed
+from rtloop.panel.web.live import TAKE_S
+
+PATH = "/foxglove"
+PROTOCOLS = ("foxglove.websocket.v1", "foxglove.sdk.v1")
+RATE_HZ, EVENTS_HZ = 50.0, 8.0
+"""Together less than the 60 messages a second above which viewers warn."""
+MAX_VIEWERS = 4
+REQUESTS_PER_S = 20.0
+MESSAGE_DATA = struct.Struct("<BIQ")
+WARNING = 1
+
+
+def viewers_token(token: str) -> str:
+    """What lets viewers in, made of the panel's token: who learns it from an address cannot drive."""
+    return hmac.new(token.encode(), b"viewers", hashlib.sha256).hexdigest()[:32]
+
+
+class Channel(NamedTuple):
+    """As it is advertised."""
+
+    id: int
+    topic: str
+    schemaName: str
+    schema: str
+    encoding: str = "cdr"
+    schemaEncoding: str = "ros2msg"
+
+
+EVENTS = Channel(1, "/events", cdr.EVENT, cdr.event_schema())
+
+
+class Foxglove:
+    """The endpoint, for viewers whose address has `token`, that of `viewers_token`."""
+
+    def __init__(self, feed: Feed, token: str, name: str = "rtloop") -> None:
+        self._feed, self._name, self._token = feed, name, token
+        self._viewers = 0
+
+    @property
+    def route(self) -> WebSocketRoute:
+        """Where it is served."""
+        return WebSocketRoute(PATH, self.serve)
+
+    def admits(self, scope: Scope) -> bool:
+        """Whether a request is that of a viewer with the token, from wherever its page is."""
+        if scope["type"] != "websocket" or scope["path"] != PATH:
+            return False
+        sent = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=8).get("token", [""])
+        return len(sent) == 1 and hmac.compare_digest(sent[0].encode(errors="replace"), self._token.encode())
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Serve one viewer; refuse it where there are MAX_VIEWERS, or where it speaks none of PROTOCOLS."""
+        spoken = next((one for one in socket.scope["subprotocols"] if one in PROTOCOLS), None)
+        if spoken is None or self._viewers >= MAX_VIEWERS:
+            await socket.close(1002 if spoken is None else 1013)
+            return
+        self._viewers += 1
+        viewer = _Viewer(socket, self._feed, self._name)
+        try:
+            await socket.accept(spoken)
+            await viewer.serve()
+        finally:
+            self._viewers -= 1
+            with suppress(RuntimeError, OSError, WebSocketDisconnect, TimeoutError):
+                await asyncio.wait_for(socket.close(1001), 1.0)
+
+
+class _Viewer:
+    """One viewer: what it subscribed to, and what it was told."""
+
+    def __init__(self, socket: WebSocket, feed: Feed, name: str) -> None:
+        self._socket, self._feed, self._name = socket, feed, name
+        self._digest = Digest()
+        self._live: Channel | None = None
+        self._subscribed: dict[int, int] = {}
+        """Channel by subscription."""
+        self._told, _ = feed.events.after(0)
+        self._event_due_s = 0.0
+        self._clock = asyncio.get_running_loop().time
+
+    async def serve(self) -> None:
+        """Until it goes, or takes nothing."""
+        info = {"op": "serverInfo", "name": self._name, "capabilities": [], "sessionId": str(time.time_ns())}
+        await self._say(info)
+        await self._advertise(EVENTS)
+        self._feed.join(self._digest)
+        try:
+            tasks = {asyncio.create_task(work()) for work in (self._listen, self._tell)}
+            _, pending = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in pending:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        finally:
+            self._feed.leave(self._digest)
+
+    async def _listen(self) -> None:
+        while True:
+            message = await self._socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            if fault := self._heard(message.get("text")):
+                await self._say({"op": "status", "level": WARNING, "message": fault})
+            await asyncio.sleep(1 / REQUESTS_PER_S)
+
+    def _heard(self, text: str | None) -> str | None:
+        """Do what a message asks for; what is wrong with it."""
+        try:
+            said = json.loads(text or "")
+            match said["op"]:
+                case "subscribe":
+                    return self._subscribe([(int(one["id"]), int(one["channelId"])) for one in said["subscriptions"]])
+                case "unsubscribe":
+                    for number in said["subscriptionIds"]:
+                        self._subscribed.pop(int(number), None)
+                    return None
+                case other:
+                    return f"op {str(other)[:40]!r}: viewers can subscribe and unsubscribe, and change nothing"
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return "a message that is none of the protocol's"
+
+    def _subscribe(self, asked: list[tuple[int, int]]) -> str | None:
+        known = {channel.id for channel in (EVENTS, self._live) if channel is not None}
+        for number, channel in asked:
+            if channel not in known:
+                return f"channel {channel}: {', '.join(map(str, sorted(known)))} are advertised"
+            if number in self._subscribed or channel in self._subscribed.values() or not 0 <= number < 1 << 32:
+                return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
+            self._subscribed[number] = channel
+        return None
+
+    async def _tell(self) -> None:
+        due_s = self._clock()
+        while True:
+            names, generation, taken = await anyio.to_thread.run_sync(self._taken)
+            if generation and (self._live is None or self._live.id != EVENTS.id + generation):
+                await self._other_signals(Channel(EVENTS.id + generation, "/live", cdr.LIVE, cdr.live_schema(names)))
+            now_ns = time.time_ns()
+            if taken is not None and self._live is not None:
+                await self._send(self._live, now_ns, cdr.live_message(now_ns, *taken))
+            await self._tell_event(now_ns)
+            due_s = max(due_s + 1 / RATE_HZ, self._clock())
+            await asyncio.sleep(due_s - self._clock())
+
+    def _taken(self) -> tuple[tuple[str, ...], int, Taken | None]:
+        with self._feed.lock:
+            return self._digest.names, self._digest.generation, self._digest.take()
+
+    async def _tell_event(self, now_ns: int) -> None:
+        """The next event, if it is time for one."""
+        if self._clock() < self._event_due_s:
+            return
+        newest, events = self._feed.events.after(self._told)
+        if not events:
+            return
+        event, self._told = events[0], newest - len(events) + 1
+        texts = event["kind"], event["who"], event["axis"] or "", json.dumps(event["what"])
+        await self._send(EVENTS, now_ns, cdr.event_message(now_ns, event["tick"], *texts))
+        self._event_due_s = self._clock() + 1 / EVENTS_HZ
+
+    async def _other_signals(self, live: Channel) -> None:
+        """The loop that runs has other signals than the one before."""
+        before, self._live = self._live, live
+        if before is not None:
+            self._subscribed = {number: at for number, at in self._subscribed.items() if at != before.id}
+            await self._say({"op": "unadvertise", "channelIds": [before.id]})
+        await self._advertise(live)
+
+    async def _advertise(self, channel: Channel) -> None:
+        await self._say({"op": "advertise", "channels": [channel._asdict()]})
+
+    async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
+        for number in [number for number, at in self._subscribed.items() if at == channel.id]:
+            data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
+            await asyncio.wait_for(self._socket.send_bytes(data), TAKE_S)
+
+    async def _say(self, said: dict[str, Any]) -> None:
+        await asyncio.wait_for(self._socket.send_text(json.dumps(said)), TAKE_S)

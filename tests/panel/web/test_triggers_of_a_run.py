@@ -1,0 +1,14 @@
+"""Steps of one tick's width in a loop that runs: each is found, at its tick, and nothing else is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.soak.panel_triggers import caught
+
+
+def test_every_pulse_of_one_tick_is_found_at_its_tick(tmp_path: Path):
+    found = caught(tmp_path, 600)
+    for name, one in found.items():
+        assert one.pulses == 600, name
+        assert (one.missed, one.made_up, one.furthest_ticks, one.lost_ticks) == (0, 0, 0, 0), name
