@@ -92,8 +92,9 @@ def said(page: Any, selector: str, text: str) -> None:
 def near(page: Any, selector: str, value: float, within: float = 0.1) -> None:
     """Wait until an element shows a number."""
     page.wait_for_function(
-        """([selector, value, within]) =>
-        Math.abs(parseFloat(document.querySelector(selector).textContent.replace("−", "-").replace("≈", "")) - value) < within""",
+        """([selector, value, within]) => {
+        const text = document.querySelector(selector).textContent.replace("−", "-").replace("≈", "");
+        return Math.abs(parseFloat(text) - value) < within}""",
         arg=[selector, value, within],
         timeout=1000 * START_S,
     )

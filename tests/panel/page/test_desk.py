@@ -55,7 +55,8 @@ def test_whoever_arms_starts_sets_tunes_undoes_captures_and_stops_sees_all_of_it
         page.click("#capture")
     picture = tmp_path / "screen.png"
     download.value.save_as(picture)
-    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 5_000
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 5_000
     said(page, "#said", "replay identical")
     captured = rtloop.load(next((bench.folder / "recordings").glob("*.capture-*.mcap")))
     assert abs(float(np.mean(captured["x_position_um"])) - 12.5) < 0.1
@@ -134,7 +135,8 @@ def test_a_hold_that_is_too_short_does_nothing_and_no_name_drives(page: Any, ben
     page.wait_for_timeout(400)
     page.mouse.up()
     page.wait_for_timeout(900)
-    assert bench.status()["state"] == "stopped" and not bench.status()["armed"]
+    assert bench.status()["state"] == "stopped"
+    assert not bench.status()["armed"]
     page.fill("#who", "")
     hold(page, "#go")
     said(page, "#lock-error", "Say who drives")
