@@ -129,7 +129,7 @@ def cut(
     It begins at the newest state of the law in front of the stretch, at most a second before. FILE may still grow
     (NAME.mcap.part); it stays as it is, and every tick is copied bit for bit.
     """
-    from rtloop.recording.file.cut import cut as cut_recording
+    from rtloop.recording.cutting.cut import cut as cut_recording
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_cut
 

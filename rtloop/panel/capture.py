@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.cut import cut, cut_path
 from rtloop.recording.file.parts import files_of_run
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load

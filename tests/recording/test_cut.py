@@ -23,8 +23,8 @@ from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
 from rtloop.errors import OutputError
 from rtloop.recording.capture.session import Options, Session
+from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.cut import cut
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay

@@ -13,8 +13,8 @@ from rtloop.panel.envelope import envelope
 from rtloop.panel.stretch import index_of
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.wishes import MAX_PIXELS
+from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.file.reader import Reader
-from rtloop.recording.file.seek import Seeker
 from rtloop.recording.file.ticks import LARGEST
 from rtloop.signals import TICK
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
+from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.file.reader import Reader
-from rtloop.recording.file.seek import Seeker
 
 ENDINGS = (".mcap", ".mcap.part")
 MOST_LISTED = 500

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.engine.memory import ring_ticks
+from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message, may_hold
 from rtloop.recording.file.events import FINAL
 from rtloop.recording.file.reader import Rows, tick_of
-from rtloop.recording.file.seek import Seeker
 from rtloop.signals import TICK
 
 OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "cut")

@@ -10,6 +10,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rtloop.recording.cutting.seek import Seeker
+from rtloop.recording.cutting.source import Source, Stretch
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message
@@ -17,8 +19,6 @@ from rtloop.recording.file.events import CUT, GAP, recorder_event
 from rtloop.recording.file.parts import Files, Parts, find_files
 from rtloop.recording.file.reader import Rows
 from rtloop.recording.file.recover import Progress, grows
-from rtloop.recording.file.seek import Seeker
-from rtloop.recording.file.source import Source, Stretch
 from rtloop.recording.file.ticks import missing
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE, TICK
