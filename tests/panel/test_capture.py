@@ -138,6 +138,7 @@ def test_where_another_recorder_took_over(loop: Loop):
     dead = bench.pid("recorder")
     os.kill(dead, signal.SIGKILL)
     wait_for(lambda: bench.pid("recorder") != dead, "another recorder")
+    wait_for(lambda: bench.status()["recording"]["state"] == "recording", "ticks that are taken")
     for _ in range(3):
         run = connection.capture(0.1, at=bench.ticks)
         asked(run)
