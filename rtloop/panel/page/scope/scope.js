@@ -79,6 +79,11 @@ export class Scope {
     this.#later();
   }
 
+  /** Draw what came last, as after it was out of sight. */
+  redraw() {
+    this.#later();
+  }
+
   toggleHold() {
     this.held = !this.held;
     $("hold").setAttribute("aria-pressed", String(this.held));
@@ -164,7 +169,7 @@ export class Scope {
   }
 
   #show() {
-    if (!this.sweep || !this.#lanes.lanes.length) return;
+    if (!this.sweep || !this.#lanes.lanes.length || $("scope").hidden) return;
     const older = this.#view.trigger.mode === "roll" || !this.#view.overlay ? [] : this.#older.slice(-this.#view.overlay);
     const sweeps = [
       ...(this.#reference ? [{ sweep: this.#reference, faded: 0.45 }] : []),
