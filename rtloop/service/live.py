@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import threading
 import tomllib
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -24,6 +23,7 @@ from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
 from rtloop.service.building import figures_limited, prepare_limited
+from rtloop.service.changes import Change, Changes
 from rtloop.service.desk import Desk, Refused, Taken
 from rtloop.service.preview import Figures
 from rtloop.signals import MODE, Mode
@@ -33,17 +33,6 @@ FIXED = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs
 OTHER_AXES = "controller.axes: which axes share a controller changed, which needs a restart"
 SECTIONS = ("controller", "limits", "interlocks", "prefilter", "model")
 """Of an axis, that may be tuned."""
-
-
-MOST_UNDONE = 100
-
-
-class Change(NamedTuple):
-    """Of axis `number`, as it was before, and what was changed."""
-
-    number: int
-    before: AxisOptions
-    what: str
 
 
 class LiveLaw:
@@ -63,7 +52,7 @@ class LiveLaw:
         self._places = [0] * len(prepared.plan.axes)
         self._unsettled_tick: int | None = None
         self._playing = [(int(one["kind"]), float(one["parameters"][0])) for one in prepared.plan.generators]
-        self._changes: deque[Change] = deque(maxlen=MOST_UNDONE)
+        self._changes = Changes()
         self._figures: dict[int, tuple[Configuration, Figures]] = {}
         """Of axes as a configuration had them."""
         self.references_set = [0] * len(prepared.plan.axes)
@@ -108,13 +97,12 @@ class LiveLaw:
         """
         with self._building:
             number, configuration = self.axis_number(axis), self.prepared.configuration
-            concerned = (number, configuration.owners[number])
-            change = next((one for one in reversed(self._changes) if one.number in concerned), None)
+            change = self._changes.last((number, configuration.owners[number]))
             if change is None:
                 raise Refused(f"undo: axis {axis} was not changed since the loop started, or since a reload")
             reference = configuration.axes[change.number].reference
             tick = self._swap(change.number, change.before.model_copy(update={"reference": reference}))
-            self._changes.remove(change)
+            self._changes.forget(change)
             return tick, change.what
 
     def _change(self, number: int, axis: AxisOptions, what: str) -> int:
@@ -123,9 +111,9 @@ class LiveLaw:
         try:
             tick = self._swap(number, axis)
         except Taken:
-            self._changes.append(change)
+            self._changes.note(change)
             raise
-        self._changes.append(change)
+        self._changes.note(change)
         return tick
 
     def _tuned(self, axis: str, section: str, changes: Mapping[str, Any]) -> tuple[int, AxisOptions]:
@@ -226,7 +214,7 @@ class LiveLaw:
                 raise Refused("; ".join([*faults, f"changed already: {', '.join(dict.fromkeys(changed))}"])) from None
             self.prepared = prepared
             if changed:
-                self._changes.clear()
+                self._changes.forget()
             return list(dict.fromkeys(changed))
 
     def _note(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.service.changes import Change, Changes
 from rtloop.service.preview import figures
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT
@@ -70,6 +71,23 @@ def test_back_step_by_step(running: Bench):
     assert axis_as_it_runs(running)["limits"] == before["limits"]
     assert running.status()["axes"]["x"]["reference_um"] == 12.5
     assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
+
+
+def test_changes_to_and_fro_are_taken_back_in_their_order():
+    axis = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml")).configuration.axes[0]
+    other = axis.model_copy(update={"name": "other"})
+    changes, made = Changes(), [Change(0, one, "to and fro") for one in (axis, other, axis, other, axis)]
+    for change in made:
+        changes.note(change)
+    changes.note(Change(1, axis, "of another axis"))
+    taken = []
+    while (change := changes.last((0,))) is not None:
+        taken.append(change.before.name)
+        changes.forget(change)
+    assert taken == ["x", "other", "x", "other", "x"]
+    assert changes.last((0, 1)) is not None
+    changes.forget()
+    assert changes.last((0, 1)) is None
 
 
 def test_a_refused_change_is_none_to_undo(running: Bench):

@@ -134,7 +134,7 @@ const decades = (_, ticks) =>
 /** Limits of round numbers that hold `low` … `high`; those in force stay while they suit. */
 export function roundLimits(low, high, now, least = 0.02) {
   if (!(low <= high)) return now ?? [-1, 1];
-  if (now && low >= now[0] && high <= now[1] && (high - low > 0.4 * (now[1] - now[0]) || now[1] - now[0] <= 2.1 * least)) return now;
+  if (now && low >= now[0] && high <= now[1] && (high - low > 0.55 * (now[1] - now[0]) || now[1] - now[0] <= 2.1 * least)) return now;
   const middle = (low + high) / 2;
   const half = Math.max((high - low) * 0.56, least);
   const step = 10 ** Math.floor(Math.log10(half / 2));

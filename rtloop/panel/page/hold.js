@@ -10,8 +10,12 @@ export class HoldButton {
   constructor(element, act) {
     this.#element = element;
     this.#act = act;
-    element.addEventListener("pointerdown", (event) => event.button === 0 && this.begin());
-    for (const end of ["pointerup", "pointerleave", "pointercancel", "blur"]) {
+    element.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
+      element.setPointerCapture(event.pointerId); // a page that moves beneath the finger lets nothing go
+      this.begin();
+    });
+    for (const end of ["pointerup", "pointercancel", "blur"]) {
       element.addEventListener(end, () => this.end());
     }
     element.addEventListener("keydown", (event) => event.key === "Enter" && !event.repeat && this.begin());

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections import deque
 from typing import Any
@@ -12,6 +13,8 @@ from rtloop.panel.views.link import Description, Service
 from rtloop.recording.file.events import Event, event_of
 
 KEPT = 200
+ASK_S = 0.2
+"""For a name; ticks come meanwhile, and the ring holds ten seconds."""
 
 
 class Events:
@@ -41,7 +44,9 @@ class Events:
         """Of the operator; None where no name was given, or the service does not answer."""
         if int(message["kind"]) >= Kind.REFUSED or int(message["origin"]) != Origin.OPERATOR:
             return None
+        resource = f"/asked_by?identity={int(message['identity'])}"
         try:
-            return self._service.client.get(f"/asked_by?identity={int(message['identity'])}")["name"]
-        except (RtloopError, KeyError, TypeError):
+            status, _, data = self._service.client.exchange("GET", resource, None, ASK_S)
+        except RtloopError:
             return None
+        return json.loads(data)["name"] if status == 200 else None

@@ -19,9 +19,11 @@ from rtloop.panel.views.wishes import XyWish
 KIND = "prandtl_ishlinskii"
 BINS = 1000
 """Stretches of time, of each of which the extremes of drive and position are shown: 4 points at most."""
-MODEL_BINS = 400
-WARM_BINS = 400
-"""The drive before, as coarse, is what the model remembers."""
+NEW_PART = 50
+"""One part in so many of what is shown."""
+MODEL_BINS, SHAPE_BINS = 150, 500
+WARM_BINS = 100
+"""The drive before, as coarse as that, is what the model remembers."""
 
 
 class Drawn:
@@ -34,10 +36,15 @@ class Drawn:
         self._ticks = max(round(wish.seconds * loop.rate_hz), 2)
         self._signals = [f"{wish.axis}_drive_v", f"{wish.axis}_position_um"]
         self._model = play_model(loop.axes[wish.axis])
+        self._shown = (-1, 0)
+        """Run and last tick of what was shown."""
 
-    def frame(self, past: Past) -> bytes:
-        """The last seconds."""
+    def frame(self, past: Past) -> bytes | None:
+        """The last seconds; None before a part of them is new."""
         first, end = past.end - self._ticks, past.end
+        if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
+            return None
+        self._shown = past.run, end
         drive, position = past.values(self._signals, first, end)
         good = np.isfinite(drive) & np.isfinite(position)
         drive, position = drive[good], position[good]
@@ -45,7 +52,7 @@ class Drawn:
         header: dict[str, Any] = {"axis": self._wish.axis, "run": past.run, "end": end, "loop_percent": None}
         arrays = {"drive_v": drive[shown], "position_um": position[shown]}
         if drive.size and np.ptp(drive) > 0:
-            percent = loop_shape(drive[shown], position[shown]).percent
+            percent = loop_shape(means(drive, SHAPE_BINS), means(position, SHAPE_BINS)).percent
             header["loop_percent"] = percent if np.isfinite(percent) else None
         if self._model is not None and drive.size:
             arrays |= self._modelled(past, first, drive, position, header)
@@ -55,7 +62,7 @@ class Drawn:
         """The model's loop, moved to where the measured one lies; `offset_um` says by how much."""
         assert self._model is not None
         turns = extremes([drive], MODEL_BINS)
-        before = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), max(first, 1), WARM_BINS // 2)
+        before = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), max(first, 1), WARM_BINS)
         warm = np.stack([before.low[0], before.high[0]], axis=-1).ravel()
         warm = warm[np.isfinite(warm)]
         whole = model_output(self._model, np.concatenate([warm, drive[turns]]))[warm.size :]
@@ -73,6 +80,14 @@ def play_model(axis: dict[str, Any]) -> PlayModel | None:
         return PrandtlIshlinskiiOptions.model_validate(feedforward).actuator()
     except ValueError:
         return None
+
+
+def means(signal: Real, bins: int) -> Real:
+    """Of a signal (n,) in each of `bins` stretches; of few samples, themselves."""
+    if signal.size <= bins:
+        return signal
+    first = -(-np.arange(bins) * signal.size // bins)
+    return np.add.reduceat(signal, first) / np.diff(first, append=signal.size)
 
 
 def extremes(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:

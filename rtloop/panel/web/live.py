@@ -35,12 +35,11 @@ class Stream(WebSocketsSansIOProtocol):
         await super().run_asgi()
         self.loop.call_later(CLOSE_S, self.transport.abort)
 
-    def handle_parser_exception(self) -> None:
-        """End what is no WebSocket, at once where it never was one."""
-        if self.conn.close_sent is None:
+    def data_received(self, data: bytes) -> None:
+        """End what is no handshake: nothing else would, before its client does."""
+        super().data_received(data)
+        if self.conn.handshake_exc is not None and not self.transport.is_closing():
             self.transport.abort()
-        else:
-            super().handle_parser_exception()
 
 
 class Live:

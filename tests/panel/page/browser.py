@@ -28,7 +28,8 @@ FLAGS = (
 AXE = Path(sys.prefix) / "lib" / "node_modules" / "axe-core" / "axe.min.js"
 """Where `make browser` puts it."""
 WIDTH, HEIGHT = 1400, 900
-START_S = 30.0
+PATIENCE_S = 120.0
+"""For whatever is waited for: it says nothing of how long it takes."""
 
 
 def chromium() -> str:
@@ -64,19 +65,20 @@ def panel_of(bench: Bench) -> tuple[str, subprocess.Popen[str]]:
         found[:] = re.findall(r"http://127\.0\.0\.1:\d+/#token=\S+", bench.log()[said:])
         return bool(found)
 
-    wait_for(told, "the panel's address", START_S)
+    wait_for(told, "the panel's address", PATIENCE_S)
     return found[0], process
 
 
 def opened(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT, scheme: str = "dark") -> Any:
     """The panel in a window of its own, showing what is now; what goes wrong in the page is noted in `page.faults`."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    context.set_default_timeout(1000 * PATIENCE_S)
     page = context.new_page()
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(f"{error}: {error.stack}"))
     page.on("console", lambda said: page.faults.append(said.text) if "Content Security" in said.text else None)
     page.goto(address)
-    page.wait_for_selector("body:not(.stale)", timeout=1000 * START_S)
+    page.wait_for_selector("body:not(.stale)", timeout=1000 * PATIENCE_S)
     return page
 
 
@@ -85,17 +87,18 @@ def said(page: Any, selector: str, text: str) -> None:
     page.wait_for_function(
         "([selector, text]) => new RegExp(text).test(document.querySelector(selector)?.textContent)",
         arg=[selector, text],
-        timeout=1000 * START_S,
+        timeout=1000 * PATIENCE_S,
     )
 
 
 def near(page: Any, selector: str, value: float, within: float = 0.1) -> None:
     """Wait until an element shows a number."""
     page.wait_for_function(
-        """([selector, value, within]) =>
-        Math.abs(parseFloat(document.querySelector(selector).textContent.replace("−", "-").replace("≈", "")) - value) < within""",
+        """([selector, value, within]) => {
+        const text = document.querySelector(selector).textContent.replace("−", "-").replace("≈", "");
+        return Math.abs(parseFloat(text) - value) < within}""",
         arg=[selector, value, within],
-        timeout=1000 * START_S,
+        timeout=1000 * PATIENCE_S,
     )
 
 
@@ -108,8 +111,14 @@ def hold(page: Any, selector: str) -> None:
     """Press a button for longer than a second."""
     page.hover(selector)
     page.mouse.down()
-    page.wait_for_timeout(1200)
+    held(page, selector)
     page.mouse.up()
+
+
+def held(page: Any, selector: str) -> None:
+    """Wait until a button that is pressed has had its second."""
+    page.wait_for_timeout(1000)
+    page.wait_for_selector(f"{selector}:not(.holding)")
 
 
 def started(page: Any, name: str = "ada") -> None:

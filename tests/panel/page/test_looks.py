@@ -46,9 +46,11 @@ def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(
         for scrolled in ("0", "document.body.scrollHeight"):
             page.evaluate(f"scrollTo(0, {scrolled})")
             seen = page.evaluate(
-                """() => {const {left, top, right, bottom} = document.querySelector("#stop").getBoundingClientRect();
+                """() => {
+                const {left, top, right, bottom} = document.querySelector("#stop").getBoundingClientRect();
                 const there = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
-                return left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight && !!there.closest("#stop")}"""
+                const within = left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight;
+                return within && !!there.closest("#stop")}"""
             )
             assert seen, (view, scrolled)
     page.click("#theme")

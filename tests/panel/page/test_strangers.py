@@ -28,7 +28,8 @@ ATTACKS = """async (panel) => {
     socket.onopen = () => resolve("open");
     socket.onerror = () => resolve("failed");
   });
-  const form = Object.assign(document.createElement("form"), {method: "post", action: panel + "/api/stop", target: "in"});
+  const form = document.createElement("form");
+  Object.assign(form, {method: "post", action: panel + "/api/stop", target: "in"});
   const frame = Object.assign(document.createElement("iframe"), {name: "in"});
   document.body.append(frame, form);
   form.submit();
@@ -71,7 +72,8 @@ def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench,
     tried = stranger.evaluate(ATTACKS, f"{parts.scheme}://{parts.netloc}")
     assert tried["json"] == tried["read"] == tried["socket"] == "failed"
     status = bench.status()
-    assert status["state"] == "running" and status["mode"] == "closed_loop"
+    assert status["state"] == "running"
+    assert status["mode"] == "closed_loop"
     assert status["axes"]["x"]["reference_um"] == 12.5
     stranger.close()
     page.keyboard.press("Escape")
@@ -82,7 +84,8 @@ def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench,
 
 def test_the_token_leaves_the_address_and_without_it_there_is_a_form(browser: Any, address: str) -> None:
     page = opened(browser, address)
-    assert "token" not in page.url and "#" not in page.url
+    assert "token" not in page.url
+    assert "#" not in page.url
     page.reload()
     page.wait_for_selector("body:not(.stale)")
     bare, token = address.split("#token=")

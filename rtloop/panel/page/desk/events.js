@@ -23,6 +23,6 @@ function about({ mode, reason, causes, periods, values, text }) {
   if (text) return text;
   if (mode) return String(mode).replaceAll("_", " ");
   if (reason || causes) return reason ?? causes.join(", ");
-  if (periods != null) return `${periods} periods`;
+  if (periods != null) return String(periods);
   return (values ?? []).filter((value) => value).slice(0, 3).map((value) => significant(value, 4)).join(", ");
 }

@@ -2,7 +2,7 @@
 
 import { get } from "../api.js";
 import { $, calmly, complain, make, say } from "../dom.js";
-import { duration, fromField, significant } from "../numbers.js";
+import { counted, duration, fromField, significant } from "../numbers.js";
 import { DASHES, palette } from "../palette.js";
 import { Picker } from "../picker.js";
 import { Lanes } from "./lanes.js";
@@ -64,7 +64,7 @@ export class Scope {
   }
 
   get pixels() {
-    return Math.round(Math.min(Math.max(this.#lanes.pixels, 200), 4000));
+    return Math.round(Math.min(Math.max(this.#lanes.pixels || 1200, 200), 4000));
   }
 
   get canvases() {
@@ -76,6 +76,11 @@ export class Scope {
     this.#reference = sweep;
     $("comparing").hidden = !sweep;
     say($("comparing").firstElementChild, says);
+    this.#later();
+  }
+
+  /** Draw what came last, as after it was out of sight. */
+  redraw() {
     this.#later();
   }
 
@@ -164,7 +169,7 @@ export class Scope {
   }
 
   #show() {
-    if (!this.sweep || !this.#lanes.lanes.length) return;
+    if (!this.sweep || !this.#lanes.lanes.length || $("scope").hidden) return;
     const older = this.#view.trigger.mode === "roll" || !this.#view.overlay ? [] : this.#older.slice(-this.#view.overlay);
     const sweeps = [
       ...(this.#reference ? [{ sweep: this.#reference, faded: 0.45 }] : []),
@@ -179,8 +184,8 @@ export class Scope {
   #number = calmly(200, () => {
     const window = this.#window();
     this.#table.show(this.sweep, window, this.#exact?.of === this.#stretch() ? this.#exact.figures : null);
-    const { trigger, uncertain_ticks, rate_hz } = this.sweep;
-    say($("sweep-says"), `at tick ${trigger}${uncertain_ticks ? `, or up to ${uncertain_ticks} before` : ""}; ${duration(this.#perPoint() / rate_hz, 3)} a point`);
+    const { trigger, uncertain_ticks, rate_hz, number } = this.sweep;
+    say($("sweep-says"), `${number ? `sweep ${counted(number)} ` : ""}at tick ${counted(trigger)}${uncertain_ticks ? `, or up to ${uncertain_ticks} before` : ""}; ${duration(this.#perPoint() / rate_hz, 3)} a point`);
     this.#measureSoon();
   });
 

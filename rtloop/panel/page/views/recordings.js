@@ -32,7 +32,8 @@ export class Recordings {
 
   arrange() {}
 
-  #row({ file, complete, duration_s, bytes: size, created_unix_s, trips, captured }) {
+  #row(recording) {
+    const { file, complete, duration_s, bytes: size, created_unix_s, trips, captured } = recording;
     const made = created_unix_s ? new Date(created_unix_s * 1000).toLocaleString("sv") : "—";
     const act = (text, action) => make("button", { type: "button", "aria-label": `${text} of ${file}`, click: () => this.#try(action) }, text);
     return make("tr", { "aria-current": this.#shown === file && "true" },
@@ -43,7 +44,7 @@ export class Recordings {
       make("td", {}, make("span", { class: "bar" },
         act("Info", () => this.#info(file)),
         act("Plot", () => this.#plot(file)),
-        act("Compare", () => this.#offer(file)),
+        act("Compare", () => this.#offer(recording)),
         make("a", { href: address(file), download: file.replace(/\.part$/, ""), "aria-label": `Download ${file}` }, "Download"))));
   }
 
@@ -75,29 +76,30 @@ export class Recordings {
   }
 
   /** Where in the recording the sweep begins is asked for; from there as long as the scope's screen. */
-  async #offer(file) {
+  async #offer(recording) {
     const from = make("input", { value: "0", size: 8, id: "compare-from" });
     const error = make("output", { class: "error", role: "alert" });
     const form = make("form", { class: "bar", autocomplete: "off" }, make("label", { class: "field", "data-name": "From" }, "from ", from, " s on, as long as the scope's screen"), make("button", { type: "submit", class: "prime" }, "Compare"), error);
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       try {
-        await this.#compare(file, fromField(from));
+        await this.#compare(recording, fromField(from));
         complain(error, null);
       } catch (failure) {
         complain(error, failure);
       }
     });
-    this.#show(file, form);
+    this.#show(recording.file, form);
     from.focus();
   }
 
-  async #compare(file, from_s) {
+  async #compare({ file, ticks: held, cut }, from_s) {
     const { signals, seconds, trigger } = this.#scope.view;
     const asked = `/sweep?signals=${signals}&pixels=${this.#scope.pixels}`;
-    const { first: begin, rate_hz } = await getArrays(address(file, asked));
+    const { first: begin, rate_hz } = await getArrays(address(file, `${asked}&ticks=1`));
     const first = begin + Math.round(from_s * rate_hz);
-    const ticks = Math.max(1, Math.round(seconds * rate_hz));
+    const end = cut?.end ?? (held == null ? Infinity : begin + held);
+    const ticks = Math.max(1, Math.min(Math.round(seconds * rate_hz), end - first));
     const sweep = await getArrays(address(file, `${asked}&first=${first}&ticks=${ticks}`));
     const before = trigger.mode === "roll" ? ticks : (ticks * trigger.pre_percent) / 100;
     const begins = sweep.arrays.offset[0] ?? 0;

@@ -8,6 +8,8 @@ import { Picker } from "../picker.js";
 import { Line } from "../scope/cursors.js";
 import { showFigures } from "./figures.js";
 
+const perRoot = (unit) => `${unit}/√Hz`;
+
 export class Spectrum {
   #live;
   #chart;
@@ -75,7 +77,7 @@ export class Spectrum {
     this.#chart?.destroy();
     this.#chart = new Chart($("spectrum-plot"), {
       x: { unit: "Hz", log: true },
-      scales: [{ key: "density", unit: this.#density ? `${this.#density.unit}` : "", log: true }],
+      scales: [{ key: "density", unit: this.#density ? perRoot(this.#density.unit) : "", log: true }],
       draw: (chart, ctx) => this.#paint(chart, ctx),
     });
     this.#chart.setRange("x", 0.1, 5000);
@@ -115,12 +117,11 @@ export class Spectrum {
     this.#chart.show();
     for (const [place, line] of this.#lines.entries()) line.place(this.#band_hz[place], frequency(this.#band_hz[place]));
     const averages = averages_least === averages_most ? `${averages_least ?? "—"}` : `${averages_least} … ${averages_most}`;
-    const plain = (unit ?? "").replace("/√Hz", "");
     showFigures($("spectrum-figures"), {
-      [`rms, ${frequency(low_hz, 3)} … ${frequency(high_hz, 3)}`]: `${significant(rms, 4)} ${plain}`,
+      [`rms, ${frequency(low_hz, 3)} … ${frequency(high_hz, 3)}`]: `${significant(rms, 4)} ${unit === "1" ? "" : unit}`,
       averages,
-      "at “from”": `${significant(this.#at(0), 3)} ${unit}`,
-      "at “to”": `${significant(this.#at(1), 3)} ${unit}`,
+      "at “from”": `${significant(this.#at(0), 3)} ${perRoot(unit)}`,
+      "at “to”": `${significant(this.#at(1), 3)} ${perRoot(unit)}`,
       ...(bridged ? { "ticks bridged": String(bridged) } : {}),
     });
   }

@@ -46,8 +46,8 @@ export class Timing {
     if (!this.#chart || !this.#seen) return;
     const { edges_us, counts } = this.#seen.arrays;
     const first = edges_us.find((edge) => edge > 0) ?? 0.1;
-    const last = edges_us.findLast((edge) => Number.isFinite(edge)) ?? 1e4;
-    this.#chart.setRange("x", first, Math.max(last, first * 10));
+    const last = edges_us[counts.findLastIndex((count) => count > 0) + 1] ?? 1e3;
+    this.#chart.setRange("x", first, Math.max(10 ** Math.ceil(Math.log10(last) + 0.05), 1e3));
     this.#chart.setRange("ticks", 0.5, Math.max(10, 10 ** Math.ceil(Math.log10(Math.max(...counts, 1)) + 0.05)));
     this.#chart.show();
     const { worst_us, p50_us, p99_us, periods_missed, exec_p50_us, exec_p99_us, window_s, advice } = this.#seen;

@@ -50,6 +50,7 @@ export class Views {
       else button.removeAttribute("aria-current");
     }
     $("scope").hidden = !large.matches && name !== "scope";
+    this.#scope.redraw();
     for (const [part, view] of Object.entries(this.#parts)) {
       const hidden = part !== other;
       const was = $(part).hidden;
