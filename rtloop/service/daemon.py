@@ -17,12 +17,12 @@ import uvicorn
 
 from rtloop.errors import UnavailableError
 from rtloop.hil.trusted import Untrusted, open_folder
-from rtloop.service.adaptation import adapting
 from rtloop.service.api.application import application
 from rtloop.service.api.connections import BACKLOG, settings
-from rtloop.service.building import builder_ended
 from rtloop.service.can_bus import supervised_by_can
+from rtloop.service.changing.building import builder_ended
 from rtloop.service.journal import Journal
+from rtloop.service.measuring.adaptation import adapting
 from rtloop.service.service import Service
 from rtloop.supervision.paths import FOLDER_MODE, refusal, socket_path
 

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from rtloop import signals
 from rtloop.configuration.service import DepolariseOptions, ServiceOptions
 from rtloop.engine.messages import Kind
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk, Refused
-from rtloop.service.live import LiveLaw
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 

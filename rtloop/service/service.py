@@ -29,11 +29,11 @@ from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.recording.file.recover import leftovers, recover
-from rtloop.service.building import expect_changes, prepare_limited
+from rtloop.service.changing.building import expect_changes, prepare_limited
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk, Refused
-from rtloop.service.live import LiveLaw
 from rtloop.service.lock import Lock
-from rtloop.service.measurement import Results
+from rtloop.service.measuring.measurement import Results
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode

@@ -19,9 +19,9 @@ import rtloop
 from rtloop.engine.messages import Kind
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.session import Session
-from rtloop.service.building import builder_ended
+from rtloop.service.changing.building import builder_ended
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
-from rtloop.service.live import LiveLaw
 from rtloop.signals import Flag, Mode
 from tests.recording.real_loop import PAPER, ROOT, Options, RealLoop
 

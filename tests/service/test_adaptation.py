@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtloop.configuration.axis import AdaptOptions
-from rtloop.service.adaptation import Schedule
+from rtloop.service.measuring.adaptation import Schedule
 from rtloop.service.service import State
 
 TUNED = {"resonance": {"hz": 643.125}, "percent_from_model": 8.0, "tick": 523005}

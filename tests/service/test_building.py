@@ -10,7 +10,7 @@ import pytest
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, UnavailableError
-from rtloop.service.building import Builder
+from rtloop.service.changing.building import Builder
 from tests.paper_configuration import PAPER, TEXT, UNSTABLE
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.service.changes import Change, Changes
-from rtloop.service.preview import figures
+from rtloop.service.changing.changes import Change, Changes
+from rtloop.service.changing.preview import figures
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT
 from tests.service.http import answer

@@ -11,8 +11,8 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
-from rtloop.service.live import LiveLaw
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 TEXT = (DEPLOY / "two-axis.toml").read_text(encoding="utf-8")

@@ -25,8 +25,8 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.recording.capture.names import Names
 from rtloop.recording.replay.replay import replay
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
-from rtloop.service.live import LiveLaw
 from rtloop.signals import Mode
 from rtloop.supervision.child import Child
 from rtloop.supervision.supervisor import Processes, Supervisor

@@ -43,10 +43,10 @@ from rtloop.service.api.bodies import (
 from rtloop.service.api.lanes import Lane, Lanes
 from rtloop.service.api.metrics import metrics_text
 from rtloop.service.api.refusals import refusal, refused
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
-from rtloop.service.learning import learn
-from rtloop.service.live import LiveLaw
-from rtloop.service.measurement import Asked, Results, measure
+from rtloop.service.measuring.learning import learn
+from rtloop.service.measuring.measurement import Asked, Results, measure
 from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, running_configuration, status
 from rtloop.supervision.supervisor import Supervisor

@@ -12,8 +12,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, mod
 from rtloop.configuration.file import ModeName
 from rtloop.configuration.references import MAX_HOLD_TICKS
 from rtloop.hil.options import LARGEST_INTEGER
-from rtloop.service.learning import Asked as Taught
-from rtloop.service.measurement import Asked
+from rtloop.service.measuring.learning import Asked as Taught
+from rtloop.service.measuring.measurement import Asked
 
 MAX_BODY_BYTES = 4 << 20
 MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096

@@ -13,8 +13,8 @@ import numpy as np
 from rtloop import signals
 from rtloop.engine.ring import drain
 from rtloop.hil.modal import Real
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
-from rtloop.service.live import LiveLaw
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 

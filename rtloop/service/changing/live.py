@@ -22,10 +22,10 @@ from rtloop.engine.ring import drain
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
-from rtloop.service.building import figures_limited, prepare_limited
-from rtloop.service.changes import Change, Changes
+from rtloop.service.changing.building import figures_limited, prepare_limited
+from rtloop.service.changing.changes import Change, Changes
+from rtloop.service.changing.preview import Figures
 from rtloop.service.desk import Desk, Refused, Taken
-from rtloop.service.preview import Figures
 from rtloop.signals import MODE, Mode
 
 FIXED = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs")

@@ -22,7 +22,7 @@ from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
-from rtloop.service.preview import Figures, figures
+from rtloop.service.changing.preview import Figures, figures
 
 BUILD_S = 10.0
 """A law that is not built and verified within this is refused."""
@@ -56,7 +56,7 @@ class Builder:
         self.end()
         self._ready = False
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rtloop.service.building"],
+            [sys.executable, "-m", "rtloop.service.changing.building"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             process_group=0,

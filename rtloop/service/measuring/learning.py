@@ -13,9 +13,9 @@ from rtloop.analysis.perturbation import around
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
-from rtloop.service.live import LiveLaw
-from rtloop.service.playing import Player
+from rtloop.service.measuring.playing import Player
 from rtloop.signals import FEED, POSITION, REFERENCE
 from rtloop.supervision.supervisor import Supervisor
 

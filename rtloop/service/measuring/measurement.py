@@ -24,9 +24,9 @@ from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
+from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
-from rtloop.service.live import LiveLaw
-from rtloop.service.playing import REST_S, Player
+from rtloop.service.measuring.playing import REST_S, Player
 from rtloop.supervision.supervisor import Supervisor
 
 FADE_S = 0.05
