@@ -10,6 +10,7 @@ from typing import Any
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
 from rtloop.panel.views.link import Description, Service
+from rtloop.panel.views.words import words
 from rtloop.recording.file.events import Event, event_of
 
 KEPT = 200
@@ -31,6 +32,7 @@ class Events:
         for message in messages[-KEPT:]:
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
             event = event_of(message, tuple(loop.axes), time_ns, name=self._name(message))
+            event["what"]["text"] = words(event)
             with self._lock:
                 self._count += 1
                 self._kept.append((self._count, {**event, "run": run}))

@@ -13,7 +13,7 @@ from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.link import Description
-from rtloop.panel.views.past import Past
+from rtloop.panel.views.past import BLOCK, Past
 from rtloop.panel.views.wishes import XyWish
 
 KIND = "prandtl_ishlinskii"
@@ -62,13 +62,30 @@ class Drawn:
         """The model's loop, moved to where the measured one lies; `offset_um` says by how much."""
         assert self._model is not None
         turns = extremes([drive], MODEL_BINS)
-        before = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), max(first, 1), WARM_BINS)
-        warm = np.stack([before.low[0], before.high[0]], axis=-1).ravel()
-        warm = warm[np.isfinite(warm)]
+        warm = self._remembered(past, first)
         whole = model_output(self._model, np.concatenate([warm, drive[turns]]))[warm.size :]
         offset_um = float(np.mean(position[turns]) - np.mean(whole))
         header["offset_um"] = offset_um
         return {"model_drive_v": drive[turns], "model_position_um": whole + offset_um}
+
+    def _remembered(self, past: Past, first: int) -> Real:
+        """The drive before tick `first`: coarsely, and every tick from where points, which are whole blocks, end."""
+        if first <= 0:
+            return np.zeros(0)
+        whole = first // BLOCK * BLOCK
+        before = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), whole, WARM_BINS)
+        (latest,) = past.values(self._signals[:1], whole, first)
+        return np.concatenate([in_turn(before.low[0], before.high[0]), latest[np.isfinite(latest)]])
+
+
+def in_turn(low: Real, high: Real) -> Real:
+    """Extremes (points,) of a signal in the order in which it went through them, (2 points,), without what is NaN."""
+    there = np.isfinite(low) & np.isfinite(high)
+    low, high = low[there], high[there]
+    if low.size < 2:
+        return np.concatenate([low, high])
+    rises = np.gradient(low + high) >= 0
+    return np.where(rises, [low, high], [high, low]).T.ravel()
 
 
 def play_model(axis: dict[str, Any]) -> PlayModel | None:

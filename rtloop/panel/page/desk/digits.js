@@ -9,12 +9,12 @@ const EVERY_MS = 150;
 export function showDigits(live, panel) {
   const shown = panel.axes.map((axis) => {
     const part = (name, unit) => {
-      const value = make("span", {}, "—");
-      return [value, make("div", {}, make("dt", {}, name), make("dd", {}, value, ` ${unit}`))];
+      const [value, of] = [make("span", {}, "—"), make("span", {}, unit)];
+      return [value, make("div", {}, make("dt", {}, name), make("dd", {}, value, " ", of)), of];
     };
     const large = make("span", { id: `position-${axis}` }, "—");
     const fill = make("i");
-    const [reference, first] = part("reference", "µm");
+    const [reference, first, unit] = part("reference", "µm");
     const [error, second] = part("error", "µm");
     const [drive, third] = part("drive", "V");
     const box = make("div", { role: "group", "aria-label": `Axis ${axis}` },
@@ -22,7 +22,7 @@ export function showDigits(live, panel) {
       make("p", { class: "large" }, large, make("small", {}, " µm")),
       make("dl", { class: "lesser" }, first, second, third),
       make("div", { class: "meter", "aria-hidden": "true" }, fill));
-    return { axis, box, large, reference, error, drive, fill };
+    return { axis, box, large, reference, unit, error, drive, fill };
   });
   $("digits").replaceChildren(...shown.map(({ box }) => box));
   let last_ms = 0;
@@ -30,11 +30,13 @@ export function showDigits(live, panel) {
     const now_ms = performance.now();
     if (!detail.axes || now_ms - last_ms < EVERY_MS * (reducedMotion.matches ? 4 : 1)) return;
     last_ms = now_ms;
-    for (const { axis, large, reference, error, drive, fill } of shown) {
+    const raw = detail.mode === "raw"; // the reference is the drive then, and there is nothing to be off from
+    for (const { axis, large, reference, unit, error, drive, fill } of shown) {
       const values = detail.axes[axis] ?? {};
+      say(unit, raw ? "V" : "µm");
       say(large, fixed(values.position_um, 3));
       say(reference, fixed(values.reference_um, 3));
-      say(error, fixed(values.error_um, 3));
+      say(error, raw ? "—" : fixed(values.error_um, 3));
       say(drive, fixed(values.drive_v, 3));
       const { lowest_v = -10, drive_v = 10 } = panel.limits?.[axis] ?? {};
       const place = (volts) => Math.min(Math.max(((volts - lowest_v) / (drive_v - lowest_v)) * 100, 0), 100);

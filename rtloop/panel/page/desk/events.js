@@ -1,7 +1,7 @@
 // What happened, newest first: commands, changes of mode, trips, each with its tick and who asked for it.
 
 import { $, make } from "../dom.js";
-import { counted, significant } from "../numbers.js";
+import { counted } from "../numbers.js";
 
 const MOST = 200;
 
@@ -12,17 +12,9 @@ export function showEvents(live) {
       if ([...list.children].some((item) => item.title === JSON.stringify(event))) continue; // said again after a break
       const { tick, kind, who, axis, what } = event;
       const tripped = kind === "tripped";
-      const text = [axis, String(kind).replaceAll("_", " "), about(what ?? event)].filter(Boolean).join(" · ");
+      const text = [axis, String(kind).replaceAll("_", " "), what?.text].filter(Boolean).join(" · ");
       list.prepend(make("li", { class: tripped && "trip", title: JSON.stringify(event) }, make("span", {}, counted(tick)), make("span", {}, who ?? ""), text));
     }
     while (list.children.length > MOST) list.lastElementChild.remove();
   });
-}
-
-function about({ mode, reason, causes, periods, values, text }) {
-  if (text) return text;
-  if (mode) return String(mode).replaceAll("_", " ");
-  if (reason || causes) return reason ?? causes.join(", ");
-  if (periods != null) return String(periods);
-  return (values ?? []).filter((value) => value).slice(0, 3).map((value) => significant(value, 4)).join(", ");
 }

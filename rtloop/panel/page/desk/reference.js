@@ -5,12 +5,12 @@ import { fixed, fromField, parseNumber } from "../numbers.js";
 import { Picker } from "../picker.js";
 
 const KINDS = {
-  sine: { amplitude: ["amplitude, µm", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, µm", "0"], phase_deg: ["phase, °", "0"] },
-  triangle: { amplitude: ["amplitude, µm", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, µm", "0"], phase_deg: ["phase, °", "0"] },
-  steps: { levels: ["levels, µm (blanks or ; between)", "10; 0; -10; 0"], dwell_s: ["each held, s", "0.2"] },
-  chirp: { amplitude: ["amplitude, µm", "1"], start_hz: ["from, Hz", "1"], end_hz: ["to, Hz", "100"], duration_s: ["within, s", "10"], offset: ["offset, µm", "0"] },
+  sine: { amplitude: ["amplitude, UNIT", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, UNIT", "0"], phase_deg: ["phase, °", "0"] },
+  triangle: { amplitude: ["amplitude, UNIT", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, UNIT", "0"], phase_deg: ["phase, °", "0"] },
+  steps: { levels: ["levels, UNIT (blanks or ; between)", "10; 0; -10; 0"], dwell_s: ["each held, s", "0.2"] },
+  chirp: { amplitude: ["amplitude, UNIT", "1"], start_hz: ["from, Hz", "1"], end_hz: ["to, Hz", "100"], duration_s: ["within, s", "10"], offset: ["offset, UNIT", "0"] },
 };
-const JOGS_UM = [0.01, 0.1, 1, 5, 10];
+const JOGS = [0.01, 0.1, 1, 5, 10];
 
 /** Numbers with blanks, semicolons or lines between them. */
 const numbers = (text, what) => text.split(/[\s;]+/).filter(Boolean).map((part) => parseNumber(part.replace(/,$/, ""), what));
@@ -35,6 +35,8 @@ export class Reference {
   #kind;
   #jog;
   #fields = {};
+  #typed = {};
+  #unit = "µm";
   #now = {};
   #mode = null;
 
@@ -48,11 +50,12 @@ export class Reference {
     this.#axis.options = panel.axes.map((value) => ({ value, text: `axis ${value}` }));
     $("desk-axis").hidden = panel.axes.length < 2;
     this.#jog = new Picker($("jog-step"));
-    this.#jog.options = JOGS_UM.map((value) => ({ value, text: `${value} µm` }));
     this.#jog.value = 1;
-    this.#kind = new Picker($("generator-kind"), () => this.#arrange());
+    this.#kind = new Picker($("generator-kind"), () => {
+      this.#typed = {};
+      this.#arrange();
+    });
     this.#kind.options = Object.keys(KINDS).map((value) => ({ value, text: value }));
-    this.#arrange();
     this.#limit();
     $("setpoint-slider").addEventListener("input", () => ($("setpoint").value = $("setpoint-slider").value));
     $("setpoint-slider").addEventListener("change", () => this.set(Number($("setpoint-slider").value)));
@@ -106,14 +109,18 @@ export class Reference {
     $("setpoint-slider").min = String(raw ? lowest_v : -most);
     $("setpoint-slider").max = String(most);
     $("setpoint-slider").step = raw ? "0.001" : "0.01";
-    $("setpoint-form").querySelector(".unit").textContent = raw ? "V" : "µm";
+    this.#unit = raw ? "V" : "µm";
+    $("setpoint-form").querySelector(".unit").textContent = this.#unit;
+    this.#jog.options = JOGS.map((value) => ({ value, text: `${value} ${this.#unit}` }));
+    this.#arrange();
   }
 
   #arrange() {
     this.#fields = {};
     const shown = Object.entries(KINDS[this.#kind.value]).map(([key, [label, value]]) => {
-      this.#fields[key] = make("input", { value });
-      return make("label", { class: "field", "data-name": label }, label, this.#fields[key]);
+      const name = label.replace("UNIT", this.#unit);
+      this.#fields[key] = make("input", { value: this.#typed[key] ?? value, input: ({ target }) => (this.#typed[key] = target.value) });
+      return make("label", { class: "field", "data-name": name }, name, this.#fields[key]);
     });
     $("generator-fields").replaceChildren(...shown);
   }

@@ -1,0 +1,57 @@
+"""The loop of the model beside what was measured; plays are written here once more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.panel.stretch import Stretch
+from rtloop.panel.views.link import Description
+from rtloop.panel.views.past import Past
+from rtloop.panel.views.wishes import wish_of
+from rtloop.panel.views.xy import MODEL_BINS, Drawn, extremes, in_turn
+from rtloop.signals import Signal
+from tests.panel.web.browser import unpacked
+
+RATE_HZ, THRESHOLDS_V, WEIGHTS = 4000, (0.0, 1.0, 3.0, 5.0), (2.0, 1.0, 0.6, 0.4)
+NAMES = ("tick", "deadline_ns", "x_drive_v", "x_position_um")
+AXIS = {"name": "x", "feedforward": {"thresholds_v": THRESHOLDS_V, "weights_um_per_v": WEIGHTS}}
+LOOP = Description(
+    "lab", RATE_HZ, tuple(Signal(name, "", "") for name in NAMES), Path("b"), Path("r"), {"axis": [AXIS]}
+)
+
+
+def plays(drive: np.ndarray) -> np.ndarray:
+    """Σ w·y, y = max(u − r, min(u + r, y)), from rest (Visintin 1994)."""
+    total = np.zeros(drive.size)
+    for r, w in zip(THRESHOLDS_V, WEIGHTS, strict=True):
+        y = 0.0
+        for k, u in enumerate(drive):
+            y = max(u - r, min(u + r, y))
+            total[k] += w * y
+    return total
+
+
+@pytest.mark.parametrize("begins", [0.03, 0.2, 0.35, 0.5, 0.72, 0.9])
+def test_the_models_loop_knows_what_came_before_the_screen(begins: float) -> None:
+    """Wherever in a period of a fast drive the screen begins: what is shown of the model has no jump in it."""
+    ticks = round(6.0 * RATE_HZ + begins * RATE_HZ)
+    drive = 9.0 * np.sin(2 * np.pi * np.arange(ticks) / RATE_HZ)
+    truth = plays(drive) + 0.7
+    past = Past(NAMES, 8 * RATE_HZ)
+    past.take(Stretch(NAMES, 0, np.column_stack([np.arange(ticks), np.arange(ticks) * 1e6, drive, truth])))
+    frame = Drawn(wish_of("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(past)
+    assert frame is not None
+    header, arrays = unpacked(frame)
+    assert header["offset_um"] == pytest.approx(0.7, abs=0.05)
+    shown = extremes([drive[-RATE_HZ:]], MODEL_BINS)
+    np.testing.assert_array_equal(arrays["model_drive_v"], np.float32(drive[-RATE_HZ:][shown]))
+    np.testing.assert_allclose(arrays["model_position_um"], truth[-RATE_HZ:][shown], atol=0.1)
+
+
+def test_extremes_in_the_order_of_the_drive() -> None:
+    low, high = np.array([0.0, 1.0, np.nan, 2.0, 1.0, 0.0]), np.array([1.0, 2.0, np.nan, 3.0, 2.5, 1.0])
+    assert in_turn(low, high).tolist() == [0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 2.5, 1.0, 1.0, 0.0]
+    assert in_turn(np.array([1.0]), np.array([2.0])).tolist() == [1.0, 2.0]
