@@ -2,6 +2,8 @@
 
 Of one service on the simulated rig, in pairs that alternate: SECONDS with nobody looking, SECONDS with four clients at
 the fastest time base. Lateness is read from the recording, the panel's CPU time from the kernel, bytes from the socket.
+The clients are on this machine as well, and cost as much as the panel; --cpu N gives a processor to the loop alone,
+and what is left to panel and clients.
 """
 
 from __future__ import annotations
@@ -64,11 +66,14 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measured(folder: Path, pairs: int, seconds: float) -> dict[str, Any]:
+def measured(folder: Path, pairs: int, seconds: float, cpu: int | None) -> dict[str, Any]:
     """Lateness with and without, in µs, and what the panel used."""
     spans: list[tuple[bool, int, int]] = []
     used_s = {False: 0.0, True: 0.0}
     text = TEXT.replace('folder = "recordings"', f'folder = "{folder}/recordings"')
+    if cpu is not None:
+        text = text.replace("[loop]\n", f"[loop]\ncpu = {cpu}\n", 1)
+        os.sched_setaffinity(0, os.sched_getaffinity(0) - {cpu})  # and of all that is started, but for the loop
     with Bench(folder, board=False, text=text) as bench:
         browser = Browser(bench)
         browser.log_in()
@@ -105,9 +110,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=PAIRS)
     parser.add_argument("--seconds", type=float, default=SECONDS)
+    parser.add_argument("--cpu", type=int, help="Of the loop alone.")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = measured(Path(folder), options.pairs, options.seconds)
+        found = measured(Path(folder), options.pairs, options.seconds, options.cpu)
     print(json.dumps(found, indent=2))
     return 0 if found["p99_ratio"] <= ALLOWED and not found["ticks_lost"] else 1
 
