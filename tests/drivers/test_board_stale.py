@@ -18,7 +18,7 @@ import pytest
 
 import rtloop
 from rtloop.configuration.file import parse
-from rtloop.errors import ConfigError
+from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil import board
 from rtloop.recording.replay.replay import replay
 from tests.faults.account import account
@@ -44,7 +44,7 @@ def drive_again(bench: Bench) -> None:
     for attempt in range(3):
         try:
             return bench.recover()
-        except AssertionError:
+        except (AssertionError, RtloopError):
             if attempt == 2:
                 raise
     return None

@@ -27,7 +27,7 @@ from rtloop.recording.capture.session import Session
 from rtloop.recording.file.events import event_of
 from rtloop.recording.replay.laws import Trust
 from rtloop.recording.replay.replay import replay
-from rtloop.service import live
+from rtloop.service.changing import live
 from tests.engine.harness import LoopBench
 from tests.law.harness import PERIOD_S
 from tests.laws.changing import PAIR

@@ -16,6 +16,8 @@ import stat
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,8 @@ from typing import Any
 from rtloop.configuration.file import load
 from rtloop.hil.board import LSB_V, BoardMemory
 
-UNIT, BOARD = "rtloop@board.service", "rtloop-board@board.service"
+UNIT, BOARD, PANEL = "rtloop@board.service", "rtloop-board@board.service", "rtloop-panel@board.service"
+PAGE = "http://127.0.0.1:8321"
 RTLOOP = "/opt/rtloop/bin/rtloop"
 CONFIG = Path("/etc/rtloop/board.toml")
 RECORDINGS = Path("/var/lib/rtloop/recordings")
@@ -259,6 +262,41 @@ def reload_bad() -> str:
     return " | ".join(text.removeprefix("reload refused, the old configuration stays: ") for text in said)
 
 
+def panel() -> str:
+    """In the browser's words: no token, no data; with it, the service's state; a foreign page moves nothing."""
+    run("systemctl", "start", PANEL)
+    token = Path("/run/rtloop/board.panel-token")
+    until(token.exists, 30.0, "the panel's token", 0.2)
+    require(stat.S_IMODE(token.stat().st_mode) == 0o640, f"{token} is {stat.S_IMODE(token.stat().st_mode):o}")
+    until(lambda: _asked("GET", "/")[0] == 200, 30.0, "the panel", 0.2)
+    require(_asked("GET", "/api/status")[0] == 401, "data without a session")
+    said, cookie = _asked("POST", "/session", json.dumps({"token": token.read_text().strip()}))
+    require(said == 204 and cookie, f"{said} for the token")
+    code, answer = _asked("GET", "/api/status", cookie=cookie)
+    require(code == 200 and json.loads(answer)["state"] == "running", answer)
+    require(_asked("POST", "/api/stop", "{}", cookie, "http://elsewhere.example")[0] == 403, "a foreign page is heard")
+    level = _exposure(PANEL)
+    require(level <= EXPOSURE_LIMIT, f"exposure {level}")
+    run("systemctl", "stop", PANEL)
+    require(ctl("status")["state"] == "running", "the service ended with its panel")
+    return f"session by token, nothing without; exposure {level}; its end changes nothing"
+
+
+def _asked(method: str, path: str, body: str = "", cookie: str = "", origin: str = PAGE) -> tuple[int, str]:
+    """Status, and the cookie of a session or the text of an answer."""
+    request = urllib.request.Request(PAGE + path, body.encode() or None, method=method)
+    for name, value in (("Origin", origin), ("Cookie", cookie), ("Content-Type", "application/json")):
+        request.add_header(name, value)
+    try:
+        with urllib.request.urlopen(request, timeout=10.0) as answer:
+            cookie = answer.headers.get("Set-Cookie", "").partition(";")[0]
+            return answer.status, cookie or answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+    except OSError as error:
+        return 0, str(error)
+
+
 def stop_loop() -> str:
     stall_s, _, ramp_s = timing()
     return _loop_fault(signal.SIGSTOP, stall_s + ramp_s)
@@ -357,10 +395,14 @@ def outputs_seen() -> str:
 
 
 def exposure() -> str:
-    text = run("systemd-analyze", "security", "--no-pager", UNIT)
-    level = float(re.search(r"Overall exposure level for \S+: ([\d.]+)", text)[1])  # type: ignore[index]
+    level = _exposure(UNIT)
     require(level <= EXPOSURE_LIMIT, f"{level}")
     return f"{level} (limit {EXPOSURE_LIMIT})"
+
+
+def _exposure(unit: str) -> float:
+    text = run("systemd-analyze", "security", "--no-pager", unit)
+    return float(re.search(r"Overall exposure level for \S+: ([\d.]+)", text)[1])  # type: ignore[index]
 
 
 def uninstall() -> str:
@@ -394,6 +436,7 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
     ("control socket 0660", socket_permissions),
     ("reload, good file", reload_good),
     ("reload, bad files: the old stays", reload_bad),
+    ("panel", panel),
     ("SIGSTOP loop", stop_loop),
     ("SIGSTOP service", stop_service),
     ("SIGKILL loop", kill_loop),
