@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import warnings
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,6 +85,7 @@ class Mortal:
 
     def __init__(self, run: Run, instant: int) -> None:
         self._instant = instant
+        self._status: int | None = None
         (orders, self._orders), (self._answers, answers) = os.pipe(), os.pipe()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -100,16 +102,21 @@ class Mortal:
 
     def step(self) -> bool:
         """Have it take and write what is there; whether it lives."""
-        os.write(self._orders, b".")
-        return os.read(self._answers, 1) != b""
+        with suppress(BrokenPipeError):  # killed before it took any
+            os.write(self._orders, b".")
+        if os.read(self._answers, 1):
+            return True
+        self._status = os.waitpid(self._pid, 0)[1]  # nobody takes its place before it is gone, with its locks
+        return False
 
     def end(self) -> bool:
         """Have it finish its file; whether it came to that."""
         os.close(self._orders)
         os.close(self._answers)
-        status = os.waitpid(self._pid, 0)[1]
-        assert status in (0, signal.SIGKILL)
-        return status == 0
+        if self._status is None:
+            self._status = os.waitpid(self._pid, 0)[1]
+        assert self._status in (0, signal.SIGKILL)
+        return self._status == 0
 
     def _record(self, session: Session, orders: int, answers: int) -> None:
         store, pwrite, rename = SharedBlock.store, os.pwrite, os.rename
