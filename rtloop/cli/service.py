@@ -221,9 +221,7 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
 
     For example 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'.
     """
-    body = {"axis": axis, "section": section, "values": _inline_table(values)}
-    click.echo(json.dumps(client_of(context).post("/tune", body)))
-    return 0
+    return _change(context, "/tune", axis, section, values)
 
 
 @ctl.command()
@@ -234,8 +232,13 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
 @fails_clearly
 def preview(context: click.Context, axis: str, section: str, values: str) -> int:
     """What `tune` would make of AXIS: margins, step, tolerated shift; changes nothing."""
+    return _change(context, "/preview", axis, section, values)
+
+
+def _change(context: click.Context, resource: str, axis: str, section: str, values: str) -> int:
+    """Ask for a change of keys of [axis.SECTION], or what it would do."""
     body = {"axis": axis, "section": section, "values": _inline_table(values)}
-    click.echo(json.dumps(client_of(context).post("/preview", body)))
+    click.echo(json.dumps(client_of(context).post(resource, body)))
     return 0
 
 
