@@ -1,0 +1,1 @@
+"""Other programs' files: measurements that come in, recordings that go out."""

@@ -1,0 +1,32 @@
+"""What is read of another program's file, before anybody says what its columns mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rtloop.errors import RtloopError
+from rtloop.hil.modal import Real
+
+ROWS_AT_MOST = 1 << 28
+"""Rows of one table; beyond them a file is cut with the program that wrote it, rather than read into all the memory."""
+
+
+class UnreadableData(RtloopError):
+    """A file of another program that cannot be taken: the message names the file, what is wrong, and what is possible."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Table:
+    """Named columns of a file, each float64 of shape (rows,), that were sampled together.
+
+    `units` as the file writes them, by column, where it does; `time` is the column that the file itself calls its time.
+    `about` is what else the file says of itself, for people.
+    """
+
+    columns: Mapping[str, Real]
+    units: Mapping[str, str] = field(default_factory=dict)
+    time: str | None = None
+    about: Mapping[str, str] = field(default_factory=dict)
