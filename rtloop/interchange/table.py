@@ -13,7 +13,7 @@ ROWS_AT_MOST = 1 << 28
 
 
 class UnreadableData(RtloopError):
-    """A file of another program that cannot be taken: the message names the file, what is wrong, and what is possible."""
+    """A file of another program that cannot be taken; the message names it, what is wrong, what is possible."""
 
     exit_code = 1
 
