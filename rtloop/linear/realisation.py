@@ -7,6 +7,7 @@ sections is built instead. It is upper quasi-triangular, and its sections never 
 
 from __future__ import annotations
 
+from itertools import accumulate, repeat
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -16,6 +17,9 @@ from rtloop.hil.modal import Complex, Modal, Real, RepeatedPoles, modal_sum
 
 MOST_CANCELLATION = 1e4
 """A sum of modes whose terms exceed their sum by more than this, somewhere, loses four of sixteen digits: cascade."""
+
+TOGETHER = 64
+"""Samples whose states are found at once."""
 
 Form = Literal["modal", "cascade"]
 
@@ -38,6 +42,23 @@ class System(NamedTuple):
         pencil = points[:, None, None] * np.eye(self.b.size) - self.a
         inputs = np.broadcast_to(self.b[:, None].astype(complex), (points.size, self.b.size, 1))
         return np.asarray(np.linalg.solve(pencil, inputs)[..., 0], dtype=complex)
+
+    def driven(self, inputs: Real) -> Real:
+        """States x_k of x⁺ = A x + b u from rest, (samples, n), by inputs (samples,); many samples at a time:
+
+        x_k+m = A^m x_k + Σ_j A^(m−1−j) b u_k+j.
+        """
+        order = self.b.size
+        powers = np.array(list(accumulate(repeat(self.a, TOGETHER), np.matmul, initial=np.eye(order))))
+        ages = np.subtract.outer(np.arange(TOGETHER), np.arange(TOGETHER))
+        answers = np.where(ages[..., None] >= 0, (powers[:-1] @ self.b)[ages], 0.0)
+        stretches = np.append(inputs, np.zeros(-inputs.size % TOGETHER)).reshape(-1, TOGETHER)
+        behind = np.einsum("sj,mjn->smn", stretches, answers, optimize=True)
+        before = np.zeros(order)
+        for stretch in behind:
+            stretch += powers[1:] @ before
+            before = stretch[-1]
+        return np.vstack([np.zeros(order), behind.reshape(stretches.size, order)])[: inputs.size]
 
 
 def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:

@@ -14,7 +14,7 @@ from rtloop.analysis.step_response import step_response
 from rtloop.configuration.axis import LimitsOptions
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
-from rtloop.design.synthesis.specification import DesignOptions, SensorOptions
+from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SimulationOptions
 from rtloop.design.verification.bench import Bench, Stand
 from rtloop.design.verification.judgement import described
 from rtloop.design.verification.simulated import between_ticks, simulate
@@ -244,3 +244,20 @@ def plays(values: np.ndarray, model: PlayModel) -> np.ndarray:
         held = np.maximum(value - model.thresholds, np.minimum(value + model.thresholds, held))
         found.append(model.weights @ held)
     return np.array(found)
+
+
+def test_as_many_steps_keep_what_is_said_of_them() -> None:
+    """Counted on steps under other noise than that of the simulation, which decides what the paper's loop does."""
+    height_um, cycles = 5.0, 12
+    asked = DesignOptions().model_copy(update={"simulation": SimulationOptions(steps_um=(height_um,))})
+    bench = Bench(PAPER, {})
+    (said,) = simulate(bench, PAPER.axes[0], 0.03, asked).steps
+    assert said.typical[0] < 0.9 * said.overshoot_percent
+    overshoots = []
+    for draw in range(100, 108):
+        levels = (0.0, *cycles * (height_um, 0.0, -height_um, 0.0))
+        position = bench.run("x", levels, 0.36, draw)["x_true_position_um"].reshape(len(levels), -1)[1:]
+        upwards = position * np.tile([1, -1, -1, 1], cycles)[:, None] / height_um
+        overshoots.append(100 * (upwards.max(axis=1) - upwards[:, -720:].mean(axis=1)))
+    assert 0.92 < np.mean(np.array(overshoots) <= said.overshoot_percent) < 0.98
+    assert 0.4 < np.mean(np.array(overshoots) <= said.typical[0]) < 0.6

@@ -66,8 +66,11 @@ class Bench:
         assert isinstance(on_rig.driver_options, RigOptions)
         self.rig, self.rate_hz = on_rig.driver_options, plan.pacing.rate_hz
 
-    def run(self, axis: str, levels_um: Sequence[float], dwell_s: float) -> dict[str, Real]:
-        """Every column of a record, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`."""
+    def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, draw: int = 0) -> dict[str, Real]:
+        """Every column of a record, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`.
+
+        Noise is that of the rig's seed in `draw` 0, and another in any other.
+        """
         table, generators = TableOfSamples(), self._plan.generators.copy()
         steps = StepsOptions(kind="steps", levels=tuple(levels_um), dwell_s=dwell_s, repeat=False)
         values = generator_values(steps, self.rate_hz, (), Path(), table)
@@ -75,7 +78,13 @@ class Bench:
         generators["kind"][number] = values[0]
         generators["parameters"][number, : len(values) - 1] = values[1:]
         ticks = round(dwell_s * self.rate_hz) * len(levels_um)
-        plan = replace(self._plan, generators=generators, table=table.samples, ticks=ticks)
+        plan = replace(
+            self._plan,
+            generators=generators,
+            table=table.samples,
+            ticks=ticks,
+            driver_options={**self._plan.driver_options, "seed": self.rig.seed + draw},
+        )
         return dict(zip(plan.columns, _records(plan, ticks).T, strict=True))
 
 

@@ -10,14 +10,12 @@ from rtloop.analysis.coupled_loop import TogetherMargins
 from rtloop.analysis.perturbation import Range
 from rtloop.design.synthesis.specification import QUANTITIES
 from rtloop.design.verification.judgement import Limit
-from rtloop.design.verification.simulated import JUDGED
+from rtloop.design.verification.simulated import JUDGED, KEPT, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
 ON_PAPER, RUNS = "continuous C(s)", "as it runs C(z)"
 LINEAR = "linear"
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
-SPREAD, SPREAD_PERCENT = 0.1, 0.5
-"""Part of a settling time, and points of a percentage, beyond which noise decides what it is: a range is shown."""
 NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
 
@@ -97,36 +95,29 @@ def scenarios(found: Verification) -> list[tuple[str, ...]]:
 
 
 def simulated(found: Verification) -> list[tuple[str, ...]]:
-    """Headings, then a row for each height of a step, the worst up and down; nothing where nothing was simulated."""
+    """Headings, then a row for each height of a step; nothing where nothing was simulated."""
     if found.simulated is None:
         return []
     rows = [
         (
-            "simulated steps, worst of 4",
+            f"{100 * KEPT:g} of 100 simulated steps",
             *(part for name in JUDGED for part in (QUANTITIES[name][0], "")),
             "peak |u|",
             "",
         )
     ]
     for step in found.simulated.steps:
-        cells = [
-            part
-            for name, ends in zip(JUDGED, step.ranges, strict=True)
-            for part in (
-                _or_range(getattr(step, name), ends, QUANTITIES[name][1]),
-                verdict(found.simulated.met(step, name)),
-            )
-        ]
+        cells = [part for name in JUDGED for part in (_kept(step, name), verdict(found.simulated.met(step, name)))]
         stopped = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
         stopped += [f"limited: {', '.join(step.limited)}"] if step.limited else []
         rows.append((f"{step.height_um:g} µm", *cells, f"{step.peak_drive_v:.4g} V", "; ".join(stopped)))
     return rows
 
 
-def _or_range(value: float, ends: tuple[float, float], unit: str) -> str:
-    """The value; or from where to where it is, where noise decides that."""
-    decided = ends[1] - ends[0] <= (SPREAD_PERCENT if unit == "%" else SPREAD * value)
-    return f"{value:.4g} {unit}" if decided else f"{ends[0]:.3g} … {ends[1]:.3g} {unit}"
+def _kept(step: SimulatedStep, name: str) -> str:
+    """What is kept; and what half of the steps do, where noise makes that another figure."""
+    kept, half, unit = getattr(step, name), step.typical[JUDGED.index(name)], QUANTITIES[name][1]
+    return f"{kept:.4g} {unit}" if step.alike(name) else f"{kept:.3g} (half: {half:.3g}) {unit}"
 
 
 def simulation_notes(found: Verification) -> list[str]:

@@ -33,7 +33,18 @@ class StepMetrics:
 def step_metrics(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> StepMetrics | None:
-    """Metrics of a piecewise constant reference (n,) and its position (n,); None where there are no such steps.
+    """Metrics of a piecewise constant reference (n,) and its position (n,); None where there are no such steps."""
+    table = every_step(reference_um, position_um, rate_hz)
+    if table is None:
+        return None
+    middle, worst = np.median(table, axis=0), np.max(table, axis=0)
+    return StepMetrics(len(table), *(float(value) for pair in zip(middle, worst, strict=True) for value in pair))
+
+
+def every_step(
+    reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
+) -> npt.NDArray[np.float64] | None:
+    """Overshoot %, settling time ms, static error % of each step, (steps, 3); None where there are no such steps.
 
     Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth.
     """
@@ -46,11 +57,7 @@ def step_metrics(
         if end - start >= SMALLEST_DWELL_TICKS:
             height = reference_um[start] - reference_um[start - 1]
             rows.append(_one_step(position_um[start:end], reference_um[start], height, rate_hz))
-    if not rows:
-        return None
-    table = np.array(rows)
-    middle, worst = np.median(table, axis=0), np.max(table, axis=0)
-    return StepMetrics(len(rows), *(float(value) for pair in zip(middle, worst, strict=True) for value in pair))
+    return np.array(rows) if rows else None
 
 
 def _one_step(
