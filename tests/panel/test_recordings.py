@@ -6,16 +6,12 @@ import asyncio
 import http.client
 import json
 import os
-import socket
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import uvicorn
-from starlette.applications import Starlette
 
 import rtloop
 from rtloop.panel.shelf.aside import Aside, Crowded, Failed
@@ -23,7 +19,7 @@ from rtloop.panel.views.link import Service
 from rtloop.panel.web.recordings import routes
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
+from tests.panel.served import Served
 
 RUN = 3
 
@@ -43,20 +39,11 @@ class Panel:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.folder = bench, bench.folder / "recordings"
-        listening = socket.create_server(("127.0.0.1", 0))
-        self._port = listening.getsockname()[1]
-        application = Starlette(routes=routes(Service(bench.client.path), lambda: RUN))
-        self._server = uvicorn.Server(uvicorn.Config(application, log_level="critical", lifespan="off"))
-        self._thread = threading.Thread(target=self._server.run, args=([listening],), daemon=True)
-        self._thread.start()
-        wait_for(lambda: self._server.started, "a server")
-
-    def close(self) -> None:
-        self._server.should_exit = True
-        self._thread.join(30)
+        self._served = Served(routes(Service(bench.client.path), lambda: RUN))
+        self.close = self._served.close
 
     def ask(self, path: str, method: str = "GET", body: Any = None, **headers: str) -> Answer:
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self._served.port, timeout=60)
         data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
         connection.putrequest(method, path, skip_accept_encoding=True)
         for name, value in {**headers, **({"Content-Length": str(len(data))} if data is not None else {})}.items():

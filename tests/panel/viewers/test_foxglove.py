@@ -7,7 +7,6 @@ import json
 import math
 import os
 import shutil
-import socket
 import struct
 import subprocess
 import threading
@@ -20,8 +19,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import uvicorn
-from starlette.applications import Starlette
 from starlette.websockets import WebSocket
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -32,6 +29,7 @@ from rtloop.panel.viewers import cdr
 from rtloop.panel.viewers.digest import Digest
 from rtloop.panel.viewers.foxglove import MAX_VIEWERS, PATH, PROTOCOLS, Foxglove, viewers_token
 from tests.faults.evidence import wait_for
+from tests.panel.served import Served
 
 NAMES = ("tick", "x_position_um", "x_drive_v", "y_position_um")
 LOOP: Any = SimpleNamespace(names=NAMES, rate_hz=1e4)
@@ -159,17 +157,11 @@ class Server:
     def __init__(self) -> None:
         self.feed = Feed()
         foxglove = Foxglove(self.feed, viewers_token(TOKEN), "lab")  # type: ignore[arg-type]
-        listening = socket.create_server(("127.0.0.1", 0))
-        self.address = f"ws://127.0.0.1:{listening.getsockname()[1]}{PATH}?token={viewers_token(TOKEN)}"
-        config = uvicorn.Config(Starlette(routes=[foxglove.route]), log_level="critical", lifespan="off")
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, args=([listening],), daemon=True)
-        self._thread.start()
-        wait_for(lambda: self._server.started, "a server")
+        self._served = Served([foxglove.route])
+        self.address = f"ws://127.0.0.1:{self._served.port}{PATH}?token={viewers_token(TOKEN)}"
 
     def close(self) -> None:
-        self._server.should_exit = True
-        self._thread.join(30)
+        self._served.close()
         self.feed.end()
 
     def viewer(self, *protocols: str) -> ClientConnection:
