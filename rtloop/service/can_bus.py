@@ -130,7 +130,7 @@ class CanSupervision:
         if axis >= len(axes):
             raise Refused(f"axis {axis:g}: 0 to {len(axes) - 1} are allowed")
         with self._service.lock.driving(OPERATOR, Origin.CAN):
-            live.set_reference(axes[int(axis)], {"kind": "hold", "value": value})
+            live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _mode(self, number: float) -> None:
         if number not in list(Mode):

@@ -26,7 +26,7 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
     if options.depolarise is not None:
         sweep = decaying_sine(options.depolarise, live.prepared.plan.pacing.rate_hz)
         for axis in axes:
-            live.play_raw(axis, sweep)
+            live.references.play_raw(axis, sweep)
         desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
         _await_ticks(supervisor, sweep.size, live.prepared.plan.pacing.rate_hz)
         desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])

@@ -315,7 +315,7 @@ class Service:
         try:
             prepare_actuator(self.configuration.service, supervisor, live, desk)
             for number in range(len(live.prepared.plan.axes)):
-                live.restore_reference(number)
+                live.references.restore(number)
             self.start()
         except RtloopError as error:
             self.faults.append(str(error))

@@ -59,7 +59,7 @@ def positions_um(live: LiveLaw) -> list[float]:
 
 
 def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live):
-    desk = live._desk
+    desk = live._staging.desk
     desk.refuses.add((Kind.LOAD_LAW, 1))
     with pytest.raises(Refused, match=f"tripped or stopping; changed already: axis.{FIRST}"):
         live.replace_all(prepared(TIGHTER))
@@ -72,7 +72,7 @@ def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live)
 
 
 def test_a_refusal_of_the_first_changes_nothing(live):
-    live._desk.refuses.add((Kind.LOAD_LAW, 0))
+    live._staging.desk.refuses.add((Kind.LOAD_LAW, 0))
     with pytest.raises(Refused, match=r"tripped or stopping$"):
         live.replace_all(prepared(TIGHTER))
     assert positions_um(live) == [60.0, 60.0]
@@ -81,9 +81,9 @@ def test_a_refusal_of_the_first_changes_nothing(live):
 def test_a_reference_that_was_refused_is_played_by_the_next_reload(live):
     text = TEXT.replace("levels = [10.0, 0.0]", "levels = [5.0, 0.0]").replace("amplitude = 20.0", "amplitude = 9.0")
     other = prepare(parse(text, "lab", DEPLOY, "lab.toml"), paced=False)
-    live._desk.refuses.add((Kind.SET_REFERENCE, 1))
+    live._staging.desk.refuses.add((Kind.SET_REFERENCE, 1))
     with pytest.raises(Refused, match=f"changed already: axis.{FIRST}"):
         live.replace_all(other)
-    live._desk.refuses.clear()
+    live._staging.desk.refuses.clear()
     assert live.replace_all(other) == [f"axis.{SECOND}"]
-    assert live._desk.taken == [(Kind.SET_REFERENCE, 0), (Kind.SET_REFERENCE, 1)]
+    assert live._staging.desk.taken == [(Kind.SET_REFERENCE, 0), (Kind.SET_REFERENCE, 1)]

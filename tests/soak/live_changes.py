@@ -111,13 +111,15 @@ class EveryChange(Changes):
         if self._chance.random() < 0.4:
             levels = [self._chance.uniform(-9.0, 9.0) for _ in range(self._chance.randrange(1, 50))]
             reference = {"kind": "steps", "levels": levels, "dwell_s": 0.01}
-        self._live.set_reference(self._axis, reference)
+        self._live.references.set(self._axis, reference)
 
     def _waveform(self) -> None:
         count = self._chance.choice((1, 2, 1000, SPARE_SAMPLES // 4))
         columns = [self._chance.uniform(-9.0, 9.0) for _ in range(self._chance.choice((1, 2)))]
         samples = np.tile(columns, (count, 1))
-        self._live.set_waveform(self._axis, samples, self._chance.randrange(1, 5), self._chance.random() < 0.5)
+        self._live.references.set_waveform(
+            self._axis, samples, self._chance.randrange(1, 5), self._chance.random() < 0.5
+        )
 
     def _tare(self) -> None:
         self._live.tare(self._chance.randrange(2), self._chance.uniform(-0.05, 0.05))

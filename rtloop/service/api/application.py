@@ -85,8 +85,8 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
     "/setpoint": (SetpointBody, "Hold the reference of an axis at a value.",
                   lambda service, body: _tick(_setpoint(service, body))),
     "/waveform": (WaveformBody, "Play samples on an axis.",
-                  lambda service, body: _tick(_live(service).set_waveform(body.axis, body.columns, body.hold_ticks,
-                                                                          body.repeat))),
+                  lambda service, body: _tick(_live(service).references.set_waveform(
+                      body.axis, body.columns, body.hold_ticks, body.repeat))),
     "/response": (ResponseBody, "Measure the response of the closed loop about the reference that is held.",
                   lambda service, body: _response(service, body)),
     "/learn": (LearnBody, "Play a period and learn it; it goes on playing.",
@@ -109,7 +109,7 @@ def _reference(service: Service, body: ReferenceBody) -> int:
     """Another generator; a table is read here, for whoever asks may not read what the service may."""
     live = _live(service)
     if body.reference.get("kind") != "table":
-        return live.set_reference(body.axis, body.reference)
+        return live.references.set(body.axis, body.reference)
     try:
         table = TableOptions.model_validate(body.reference)
         samples = read_samples(Path(table.file), below=service.configuration.folder)
@@ -117,7 +117,7 @@ def _reference(service: Service, body: ReferenceBody) -> int:
         raise ConfigError("reference", describe(error, "reference", body.reference)) from None
     except ValueError as error:
         raise ConfigError("reference", [f"reference.{error}"]) from None
-    return live.set_waveform(body.axis, samples, table.hold_ticks, table.repeat)
+    return live.references.set_waveform(body.axis, samples, table.hold_ticks, table.repeat)
 
 
 def _response(service: Service, body: ResponseBody) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def _running(service: Service, doing: str) -> tuple[Supervisor, LiveLaw]:
 
 
 def _setpoint(service: Service, body: SetpointBody) -> int:
-    return _live(service).set_reference(body.axis, {"kind": "hold", "value": body.value})
+    return _live(service).references.set(body.axis, {"kind": "hold", "value": body.value})
 
 
 def application(service: Service) -> Starlette:

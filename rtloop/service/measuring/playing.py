@@ -31,8 +31,8 @@ class Player:
         self._supervisor, self._live, self._number, self._doing = supervisor, live, number, doing
         self.axis = live.prepared.plan.axes[number]
         self.rate_hz = live.prepared.configuration.loop.rate_hz
-        self.hold_um = live.held(number)
-        self._set = live.references_set[number]
+        self.hold_um = live.references.held(number)
+        self._set = live.references.times_set[number]
 
     @property
     def tick(self) -> int:
@@ -42,17 +42,17 @@ class Player:
     @property
     def ours(self) -> bool:
         """Whether nobody else has set a reference since."""
-        return self._live.references_set[self._number] == self._set
+        return self._live.references.times_set[self._number] == self._set
 
     def play(self, samples: Real, *, repeat: bool = False) -> int:
         """Samples (n, 1 or 2), a tick each; the tick of the first one. Raises ConfigError, Refused."""
-        tick = self._live.set_waveform(self.axis, samples, 1, repeat)
+        tick = self._live.references.set_waveform(self.axis, samples, 1, repeat)
         self._set += 1
         return tick
 
     def hold(self, value_um: float) -> None:
         """A constant, and a while to come to rest. Raises Refused."""
-        self._live.set_reference(self.axis, {"kind": "hold", "value": value_um})
+        self._live.references.set(self.axis, {"kind": "hold", "value": value_um})
         self._set += 1
         time.sleep(REST_S)
 
