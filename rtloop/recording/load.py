@@ -55,7 +55,8 @@ class Recording:
     @property
     def units(self) -> dict[str, str]:
         """Unit of each signal."""
-        return {name: unit_of(name) for name in self.columns}
+        imported = self.header.get("imported", {}).get("units", {})
+        return {name: imported.get(name) or unit_of(name) for name in self.columns}
 
     @property
     def time_s(self) -> Signal:
