@@ -50,7 +50,7 @@ def require_law(recording: Recording) -> None:
     if "imported" in recording.header:
         raise RecordingError(
             f"{recording.paths[0]}: holds signals that were imported from {recording.header['imported']['file']}, "
-            "and nothing of a law, so that there is nothing to replay; info, plot, export, cut and identify work with it"
+            "and nothing of a law, so there is nothing to replay; info, plot, export, cut and identify work with it"
         )
 
 
