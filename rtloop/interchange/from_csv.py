@@ -119,7 +119,7 @@ def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
     text = values.astype(str).str.strip()
     if dialect.decimal == ",":
         text = text.str.replace(",", ".")
-    numbers = pandas.to_numeric(text, errors="coerce").to_numpy(np.float64)
+    numbers = np.asarray(pandas.to_numeric(text, errors="coerce"), np.float64)
     wrong = np.flatnonzero(np.isnan(numbers) & ~text.str.lower().isin(NO_NUMBER).to_numpy())
     if wrong.size:
         row = int(values.index[wrong[0]])

@@ -29,6 +29,7 @@ from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import FINISHED, recorder_event
 from rtloop.recording.file.ticks import WHOLE, whole_fault
 from rtloop.recording.file.writer import Writer
+from rtloop.recording.load import unit_of
 
 UNFINISHED = ".importing"
 LONGEST_WORDS = 200
@@ -114,8 +115,9 @@ def _signals(table: Table, path: Path, wanted: Wanted, found: Sampling) -> Signa
         columns[name] = column.values(table)
         if name in WHOLE and (fault := whole_fault(name, columns[name])):
             raise UnreadableData(f"{path}: {fault}; --map says another name for it")
-        if missing := int(np.count_nonzero(~np.isfinite(columns[name]))):
-            notes.append(f"{name}: {missing} of its values are no numbers")
+    missing = {name: np.count_nonzero(~np.isfinite(values)) for name, values in columns.items()}
+    if any(missing.values()):
+        notes.append("no numbers: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count))
     return Signals(
         columns,
         {name: _words(column.said) for name, column in made.items()},
@@ -138,7 +140,7 @@ def _columns(table: Table, path: Path, wanted: Wanted) -> dict[str, Column]:
     for column in kept:
         name = column if came_from_a_recording(table) and NAME.fullmatch(column) else own_name(column)
         free = next(one for one in (name, *(f"{name}_{k}" for k in range(2, len(made) + 3))) if one not in made)
-        unit = unit_in(table, column) or ""
+        unit = unit_of(column) if came_from_a_recording(table) and not table.units else unit_in(table, column) or ""
         made[free] = Column(column, Fraction(1), 0.0, unit, f"{bare(column)} [{unit}]" if unit else column, None)
     if not made:
         raise UnreadableData(f"{path}: holds no column beside its time")

@@ -25,7 +25,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
     except OSError as error:
         raise UnreadableData(f"{path}: {error.strerror}") from None
     if head.startswith(MCAP_MAGIC):
-        from rtloop.interchange.from_mcap import read_mcap
+        from rtloop.interchange.from_mcap import read_mcap  # pyright: ignore[reportMissingImports]
 
         return read_mcap(path, group)
     if head.startswith(b"MATLAB") or path.suffix.lower() == ".mat":

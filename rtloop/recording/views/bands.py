@@ -5,7 +5,7 @@ No peak is lost that way, whatever the size of the picture.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,7 +103,7 @@ def panels(recording: Recording) -> list[Panel]:
     return [panel for panel in found if panel.names]
 
 
-def _panel(recording: Recording, axis: str, names: tuple[str, ...]) -> Panel:
+def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
     there = [name for signal in names if (name := f"{axis}_{signal}") in recording]
     label = axis if len(names) > 1 else f"{axis} {kind_of(names[0])}"
     return Panel(label, unit_of(names[0]), there)

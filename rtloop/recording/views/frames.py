@@ -52,8 +52,4 @@ def _signals(recording: Recording, selection: Selection) -> dict[str, Any]:
 
 
 def _about(recording: Recording) -> dict[str, Any]:
-    return {
-        "name": recording.header["name"],
-        "rate_hz": recording.header["rate_hz"],
-        "recording": str(recording.paths[0]),
-    }
+    return {"recording": str(recording.paths[0]), **{key: recording.header[key] for key in ("name", "rate_hz")}}

@@ -26,7 +26,7 @@ class Selection:
     every: int = 1
 
     def names(self, recording: Recording) -> tuple[str, ...]:
-        """The signals that are meant, in the recording's order, with ALWAYS. Raises RecordingError for an unknown one."""
+        """The signals that are meant, in the recording's order, with ALWAYS. Raises RecordingError for one unknown."""
         if not self.signals:
             return recording.columns
         for pattern in self.signals:
