@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rtloop.interchange.aside import read_table
 from rtloop.interchange.importing import import_data, listing
-from rtloop.interchange.reading import read_table
 from rtloop.interchange.sampling import came_from_a_recording
 from rtloop.interchange.wanted import Wanted, mapping_beside, read_mapping
 

@@ -14,8 +14,10 @@ from rtloop.interchange.table import Table, UnreadableData
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
-def read_table(path: Path, group: str | None = None) -> Table:
+def read_here(path: Path, group: str | None = None) -> Table:
     """The columns of a file; `group` says which ones, where it has several rasters, groups or topics.
+
+    A library may let anything through of a damaged file, or crash: `aside.read_table` does not.
 
     Raises UnreadableData, MissingExtra.
     """
