@@ -20,8 +20,9 @@ from rtloop.interchange.units import is_unit
 SAMPLE_BYTES = 1 << 16
 SAMPLE_LINES = 1000
 LONGEST_LINE = 1 << 20
-NO_NUMBER = ("", "nan", "-nan", "inf", "-inf", "+inf", "na", "n/a", "null", "none", "#n/a")
-"""What may stand where a number is missing, or is none."""
+NO_NUMBER = ("", "nan", "-nan", "na", "n/a", "null", "none", "#n/a")
+"""What may stand where a number is missing."""
+INFINITE = ("inf", "-inf", "+inf", "infinity", "-infinity")
 _POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?")
@@ -87,7 +88,7 @@ def split(line: str, delimiter: str | None) -> list[str]:
 
 def is_number(field: str, decimal: str) -> bool:
     """Whether a field is a number, or says that there is none."""
-    return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in NO_NUMBER
+    return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
 
 
 def _sample(path: Path) -> tuple[str, list[str], list[str]]:
