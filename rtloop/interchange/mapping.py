@@ -20,7 +20,7 @@ from rtloop.hil.modal import Real
 from rtloop.interchange.table import Table, UnreadableData
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scaled
 from rtloop.recording.load import unit_of
-from rtloop.signals import COMMON, PER_AXIS
+from rtloop.signals import COMMON, DRIVE, PER_AXIS
 
 FIRST_AXIS = "x"
 ALIKE = 3
@@ -139,9 +139,11 @@ def own_name(column: str) -> str:
 
 
 def axes_of(signals: list[str]) -> list[str]:
-    """The axes that the names of signals speak of, in their order."""
+    """The axes that the names of signals speak of, in their order; `x_true_position_um` is of x where there is an x."""
     found = [name.removesuffix(f"_{one.name}") for name in signals for one in PER_AXIS if name.endswith(f"_{one.name}")]
-    return list(dict.fromkeys(found))
+    axes = list(dict.fromkeys(found))
+    driven = {axis for axis in axes if f"{axis}_{PER_AXIS[DRIVE].name}" in signals}
+    return [axis for axis in axes if axis in driven or not any(axis.startswith(f"{other}_") for other in axes)]
 
 
 def _split(name: str) -> tuple[str, str | None]:

@@ -99,7 +99,7 @@ def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[st
     if not np.all(np.isfinite(times)):
         raise UnreadableData(f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} holds no number")
     try:
-        factor = factor_between(unit, "ns")
+        factor = factor_between(unit, "s") * 10**9
     except UnknownUnit as fault:
         raise UnreadableData(f"{path}: time {name!r}: {fault}") from None
     notes = []

@@ -108,6 +108,7 @@ def test_names():
         "Grosse", "column_1", "file_tick", "Model_Root_A"
     ]  # fmt: skip
     assert axes_of(["x_drive_v", "long_name_position_um", "temperature"]) == ["x", "long_name"]
+    assert axes_of(["x_drive_v", "x_true_position_um", "x_2_drive_v"]) == ["x", "x_2"]
 
 
 def test_the_mapping_beside_the_data(tmp_path: Path):
