@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rtloop.interchange.table import UnreadableData
 from rtloop.interchange.units import is_unit
@@ -38,6 +38,8 @@ _MANNERS = (
     (None, ","),
 )
 """Delimiter (None: blanks) and decimal sign; of those that fit equally the first is taken."""
+_UNIT_BEHIND = re.compile(r"(?<=\d)\s+(s|sec|ms|min|hr|V|mV|nm|µm|um|mm)$")
+"""As MATLAB's timetables write durations: 0.001 sec."""
 _MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 _COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 
@@ -73,6 +75,8 @@ def dialect_of(path: Path) -> Dialect:
     if first is None:
         raise UnreadableData(f"{path}: no row of numbers in its first {SAMPLE_BYTES >> 10} KiB")
     names, units, has_header = _header(head[:first], delimiter, width)
+    behind = [_UNIT_BEHIND.search(field) for field in split(head[first], delimiter)]
+    units = tuple(found[1] if found else unit for found, unit in zip(behind, units, strict=True))
     return Dialect(encoding, delimiter, decimal, first, names, units, numbers, _dates(rows, width), has_header)
 
 
@@ -87,8 +91,14 @@ def split(line: str, delimiter: str | None) -> list[str]:
 
 
 def is_number(field: str, decimal: str) -> bool:
-    """Whether a field is a number, or says that there is none."""
+    """Whether a field is a number, alone or in front of a unit, or says that there is none."""
+    field = _UNIT_BEHIND.sub("", field)
     return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
+
+
+def number_alone(text: Any) -> Any:
+    """A column of fields (a pandas series of text) without the units behind their numbers."""
+    return text.str.replace(_UNIT_BEHIND, "", regex=True)
 
 
 def _sample(path: Path) -> tuple[str, list[str], list[str]]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.interchange.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of
+from rtloop.interchange.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
 from rtloop.interchange.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
 from rtloop.interchange.table import ROWS_AT_MOST, Table, UnreadableData
 
@@ -116,7 +116,7 @@ def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
 
     if values.dtype.kind in "fiub":
         return values.to_numpy(np.float64)
-    text = values.astype(str).str.strip()
+    text = number_alone(values.astype(str).str.strip())
     if dialect.decimal == ",":
         text = text.str.replace(",", ".")
     numbers = np.asarray(pandas.to_numeric(text, errors="coerce"), np.float64)

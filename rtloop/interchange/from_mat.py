@@ -26,8 +26,6 @@ DEEPEST = 32
 HDF5_AT = 512
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 VALUES = ("data", "values")
-LAYOUT = "layout"
-"""Of a table in ControlDesk's, whose time stands apart from its signals."""
 
 
 def read_mat(path: Path, group: str | None = None) -> Table:
@@ -105,7 +103,7 @@ def _is_controldesk(value: Any) -> bool:
 def _rasters(path: Path, value: dict[str, Any]) -> dict[str, Table]:
     """A table for each X, of the Y that belong to it: by XIndex, by the raster's name, or by length."""
     times, tables = _each(value["X"]), dict[str, Table]()
-    about = {LAYOUT: "ControlDesk", **_described(value)}
+    about = {"layout": "ControlDesk", **_described(value)}
     for number, x in enumerate(times, start=1):
         found = Found(path)
         name = unique(_text(x.get("Name")) or "Time", ())

@@ -19,7 +19,8 @@ BYTES_AT_MOST = 1 << 30
 COLUMNS_AT_MOST = 2000
 MATRIX_COLUMNS = 256
 """A matrix of more columns is an image, or a map, and no table of signals."""
-TIMES = ("time", "t", "zeit", "time_s", "timestamp", "tout", "deadline_ns", "sim_time", "elapsed", "elapsed time")
+TIMES = ("deadline_ns", "time", "t", "zeit", "time_s", "timestamp", "tout", "sim_time", "elapsed", "elapsed time")
+"""What a column of times is called, the likeliest first."""
 SHOWN = 8
 
 
@@ -69,6 +70,7 @@ class Found:
     def tables(self) -> dict[str, Table]:
         """What was sampled together: columns of one length, beside the time that stands nearest to them."""
         times = [name for name in self.columns if _last(name).casefold() in TIMES]
+        times.sort(key=lambda name: TIMES.index(_last(name).casefold()))
         members: dict[tuple[int, str | None], list[str]] = {}
         for name, values in self.columns.items():
             near = [time for time in times if self.columns[time].size == values.size]

@@ -18,7 +18,6 @@ import numpy as np
 from rtloop import __version__
 from rtloop.hil.modal import Real
 from rtloop.interchange.aside import read_table
-from rtloop.interchange.from_mat import LAYOUT
 from rtloop.interchange.groups import rows_of
 from rtloop.interchange.mapping import Column, axes_of, bare, column_of, find_column, own_name, signal_name, unit_in
 from rtloop.interchange.sampling import OWN, Sampling, came_from_a_recording, sampling, time_column
@@ -150,7 +149,7 @@ def _columns(table: Table, path: Path, wanted: Wanted) -> dict[str, Column]:
 def _times(table: Table, path: Path, wanted: Wanted) -> set[str | None]:
     """Columns that are times, and no signals."""
     if came_from_a_recording(table):
-        return {*OWN, table.time if LAYOUT in table.about else None}
+        return {*OWN, table.time}
     given = None if wanted.time is None else column_of(table, path, "", wanted.time).name
     return {time_column(table), given}
 

@@ -23,7 +23,7 @@ NAMED = {
     "metres": "m", "micrometer": "µm", "micrometers": "µm", "micrometre": "µm", "micron": "µm", "microns": "µm",
     "nanometer": "nm", "nanometers": "nm", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s",
     "sekunden": "s", "msec": "ms", "usec": "µs", "millisecond": "ms", "milliseconds": "ms", "microseconds": "µs",
-    "hertz": "Hz", "ampere": "A", "newton": "N", "angstrom": "Å", "count": "counts",
+    "hertz": "Hz", "hr": "h", "ampere": "A", "newton": "N", "angstrom": "Å", "count": "counts",
 }  # fmt: skip
 OTHERS = {
     "Å": (Fraction(1, 10**10), "m"), "min": (Fraction(60), "s"), "h": (Fraction(3600), "s"),

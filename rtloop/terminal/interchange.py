@@ -53,7 +53,10 @@ def print_listing(report: Mapping[str, Any]) -> None:
     out.print("\nNothing was written. Which column is what, in which unit? Such as:\n")
     time = "" if report["rate_hz"] else " --rate HZ"
     out.print(f"  rtloop import {escape(shlex.quote(report['file']))}{time} \\")
-    maps = [f'--map {name}="{escape(source)}"' for name, source in _likely(report["columns"], report["time_column"])]
+    maps = [
+        f"--map {escape(shlex.quote(f'{name}={source}'))}"
+        for name, source in _likely(report["columns"], report["time_column"])
+    ]
     out.print("    " + " \\\n    ".join(maps))
     out.print("\n--all takes every column as it is; rtloop import --help says more.")
 

@@ -34,6 +34,7 @@ WRITTEN = {
     "no names": (rows("  ").encode(), ["column_1", "column_2"], {}),
     "UTF-16": (f"t,u\n{rows(',')}".encode("utf-16"), ["t", "u"], {}),
     "quotes": (f'"t","u, filtered"\n{rows(",")}'.encode(), ["t", "u, filtered"], {}),
+    "a timetable of MATLAB": (f"Time,u\n{rows(' sec,')}".encode(), ["Time", "u"], {"Time": "sec"}),
     "a delimiter at the end": (f"t;u\n{rows(';')}".replace("\n", ";\n").encode(), ["t", "u"], {}),
 }
 

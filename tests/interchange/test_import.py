@@ -56,7 +56,7 @@ def test_without_a_mapping_it_shows_what_is_there_and_how_to_map_it(scan: Path):
     assert result.exit_code == 2
     assert "3,000 rows, 10000 Hz by t [s]" in result.stdout
     assert re.search(r"^drive_mV +mV +-1000 +1000$", result.stdout, re.MULTILINE)
-    assert '--map x_drive_v="drive_mV [mV]" \\\n    --map x_position_um="pos_nm [nm]"' in result.stdout
+    assert "--map 'x_drive_v=drive_mV [mV]' \\\n    --map 'x_position_um=pos_nm [nm]'" in result.stdout
     assert not scan.with_suffix(".mcap").exists()
     report = answer("import", scan, code=2)
     assert [column["name"] for column in report["columns"]] == ["t", "drive_mV", "pos_nm", "T"]
