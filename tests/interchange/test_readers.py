@@ -57,6 +57,14 @@ def test_rasters_are_told_and_chosen(tmp_path: Path):
         read_here(tmp_path / "scan.mat", "middle")
 
 
+def test_rasters_of_one_length_keep_apart(tmp_path: Path):
+    x = structures(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", 10 * TIME[None], "slow"))
+    y = structures(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None], 2.0))
+    savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})
+    assert same(read_here(tmp_path / "scan.mat", "fast"), Time=TIME, u=DRIVE)
+    assert same(read_here(tmp_path / "scan.mat", "slow"), Time=10 * TIME, T=PLACE)
+
+
 def test_simulink(tmp_path: Path):
     both = np.column_stack([PLACE, 2 * PLACE])
     signals = structures(("values", "label"), (DRIVE[:, None], "drive"), (both, "place"))

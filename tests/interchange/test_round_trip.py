@@ -18,6 +18,7 @@ from rtloop.interchange.reading import read_here
 from rtloop.interchange.wanted import Wanted
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import Selection
+from rtloop.recording.views.summary import summarise
 from tests.interchange.controldesk import read_v5, read_v73
 from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
 
@@ -118,6 +119,14 @@ def test_every_tenth_tick_comes_back_as_a_slower_recording(recording: Recording,
     assert np.array_equal(back["tick"], np.arange(COUNT // 10))
     assert np.array_equal(back["deadline_ns"], recording["deadline_ns"][::10])
     assert "they are counted anew" in back.header["imported"]["notes"][-1]
+
+
+def test_lost_ticks_stay_lost(tmp_path: Path):
+    rows = np.delete(make_rows(COUNT), np.arange(700, 720), axis=0)[500:]
+    path = write_recording(tmp_path / "run.mcap", rows, first_tick=500)
+    back = imported(exported(load(path), "npz", tmp_path))
+    assert np.array_equal(back["tick"], rows[:, 0])
+    assert summarise(back.paths).ticks_lost == 20
 
 
 def test_frames(recording: Recording, tmp_path: Path):

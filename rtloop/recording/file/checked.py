@@ -116,6 +116,15 @@ class _AnyHeader(_Checked):
     cut: _Cut | None = None
 
 
+class _Event(_Checked):
+    tick: Tick
+    time_ns: Annotated[int, Field(gt=-LARGEST_NS, lt=LARGEST_NS)]
+    kind: str
+    who: str
+    axis: str | None
+    what: Words
+
+
 class _Header(_AnyHeader):
     axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
     law: _Law
@@ -136,15 +145,6 @@ class _ImportedHeader(_AnyHeader):
     axes: Annotated[list[Name], Field(max_length=64)]
     law: None
     imported: _Imported
-
-
-class _Event(_Checked):
-    tick: Tick
-    time_ns: Annotated[int, Field(gt=-LARGEST_NS, lt=LARGEST_NS)]
-    kind: str
-    who: str
-    axis: str | None
-    what: Words
 
 
 class _Gap(_Checked):
