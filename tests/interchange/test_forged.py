@@ -39,8 +39,6 @@ def test_a_good_one(tmp_path: Path):
     ("changes", "message"),
     [
         ({"columns": ["deadline_ns", "tick", "u"]}, "tick and deadline_ns come first"),
-        ({"columns": ["tick"]}, "tick and deadline_ns come first"),
-        ({"columns": ["tick", "deadline_ns", "u", "u"]}, "a name may stand there once"),
         ({"imported": IMPORTED | {"units": {"v": "V"}}}, "imported.units: .*only columns have units"),
         ({"imported": IMPORTED | {"units": {"u": 3}}}, "imported.units.u: 3"),
         ({"imported": IMPORTED | {"notes": ["\x1b[2J"]}}, "imported.notes.0"),
