@@ -38,8 +38,11 @@ def write_mat(recording: Recording, part: Path, target: Path, selection: Selecti
     """The ticks written to `part`, which will be called `target`. Raises RecordingError, OSError, MissingExtra."""
     names = selection.names(recording)
     count = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
-    write = _write_v5 if 8 * count * (len(names) + 1) <= LARGEST_V5_BYTES else _write_v73
-    write(recording, part, variable_of(target), selection, progress)
+    if 8 * count * (len(names) + 1) <= LARGEST_V5_BYTES:
+        _write_v5(recording, part, variable_of(target), selection, count)
+        progress(count)
+    else:
+        _write_v73(recording, part, variable_of(target), selection, progress)
     return count
 
 
@@ -49,20 +52,20 @@ def variable_of(path: Path) -> str:
     return (name if name[:1].isalpha() else f"rec_{name}")[:LONGEST_NAME]
 
 
-def _write_v5(recording: Recording, part: Path, variable: str, selection: Selection, progress: Progress) -> None:
+def _write_v5(recording: Recording, part: Path, variable: str, selection: Selection, count: int) -> None:
     from scipy.io import savemat
 
-    names = selection.names(recording)
-    blocks = list(selection.blocks(recording, names)) or [np.empty((0, len(names)))]
-    data = [np.concatenate([rows[:, k] for rows in blocks])[None] for k in range(len(names))]
-    fields = [*_signal(recording, names[0])]
-    signals = np.zeros((1, len(names)), [("Data", "O"), *((field, "O") for field in fields)])
+    names, done = selection.names(recording), 0
+    data = np.empty((len(names), 1, count))
+    for rows in selection.blocks(recording, names):
+        data[:, 0, done : done + len(rows)] = rows.T
+        done += len(rows)
+    signals = np.zeros((1, len(names)), [("Data", "O"), *((field, "O") for field in _signal(recording, names[0]))])
     for k, name in enumerate(names):
         signals[0, k] = (data[k], *_signal(recording, name).values())
     time = {"Data": data[names.index("deadline_ns")] * 1e-9, **TIME}
     content = {"X": time, "Y": signals, **_about(recording)}
-    savemat(part, {variable: content}, appendmat=False, long_field_names=True, do_compression=True)
-    progress(data[0].size)
+    savemat(part, {variable: content}, appendmat=False, long_field_names=True)
 
 
 def _write_v73(recording: Recording, part: Path, variable: str, selection: Selection, progress: Progress) -> None:
