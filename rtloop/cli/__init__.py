@@ -7,7 +7,20 @@ import os
 import click
 
 from rtloop import __version__
-from rtloop.cli import adapt, design, doctor, experiment, identify, laws, loop, panel, recordings, response, service
+from rtloop.cli import (
+    adapt,
+    design,
+    doctor,
+    experiment,
+    identify,
+    interchange,
+    laws,
+    loop,
+    panel,
+    recordings,
+    response,
+    service,
+)
 
 # matrices here have tens of rows: a library's threads wait for each other longer than they compute, on the loop's cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -29,6 +42,19 @@ def main() -> None:
     """
 
 
-for module in (loop, laws, doctor, recordings, service, panel, identify, response, adapt, design, experiment):
+for module in (
+    loop,
+    laws,
+    doctor,
+    recordings,
+    interchange,
+    service,
+    panel,
+    identify,
+    response,
+    adapt,
+    design,
+    experiment,
+):
     for command in module.COMMANDS:
         main.add_command(command)

@@ -14,7 +14,7 @@ import click
 from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds, fails_clearly
 
 TICK = click.IntRange(min=0)
-TO = click.Choice(["csv", "parquet", "npz"])
+TO = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
 
 
 @click.command()
@@ -147,21 +147,41 @@ def cut(
 
 @click.command()
 @FILES
-@click.option("--to", type=TO, required=True, help="Format; parquet needs the extra of this name.")
+@click.option("--to", type=TO, required=True, help="Format; all but csv, npz and mat need the extra 'data'.")
 @click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
+@click.option("--from", "start_s", type=Seconds(zero=True), default=0.0, help="Seconds since the start of the run.")
+@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run.")
+@click.option("--every", type=click.IntRange(min=1), default=1, metavar="N", help="One tick of N, as it is: no mean.")
+@click.option(
+    "--signals", default="", metavar="A,B,…", help="Only these; x_* is a pattern. tick and deadline_ns come along."
+)
 @JSON
 @fails_clearly
-def export(files: tuple[Path, ...], to: str, out: Path | None, as_json: bool) -> int:
-    """Write a recording as CSV, Parquet or npz.
+def export(
+    files: tuple[Path, ...],
+    to: str,
+    out: Path | None,
+    start_s: float,
+    end_s: float | None,
+    every: int,
+    signals: str,
+    as_json: bool,
+) -> int:
+    """Write a recording as CSV, Parquet, npz, HDF5 or MAT.
 
-    Every number exactly, and never over an existing file.
+    Every number exactly, and never over an existing file. MAT files are laid out as dSPACE ControlDesk's: scripts that
+    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is that of the file. They are of version 5, and beyond
+    512 MiB of numbers of version 7.3.
     """
-    from rtloop.recording.views.export import export as export_recording
+    from rtloop.interchange.export import export as export_recording
+    from rtloop.recording.views.selection import Selection
     from rtloop.terminal.progress import Counter
     from rtloop.terminal.recordings import print_export
 
     with Counter("ticks exported", sys.stderr) as counter:
-        report = export_recording(files, to, out, counter.show)
+        wanted = tuple(filter(None, (name.strip() for name in signals.split(","))))
+        selection = Selection(wanted, start_s, math.inf if end_s is None else end_s, every)
+        report = export_recording(files, to, out, counter.show, selection)
     _show(report, as_json, print_export)
     return 0
 

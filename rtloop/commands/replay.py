@@ -20,7 +20,7 @@ from rtloop.errors import ConfigError
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
-from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
+from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws, require_law
 from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
 
 Progress = Callable[[int], None]
@@ -29,6 +29,7 @@ Progress = Callable[[int], None]
 def replay_with_other_law(files: Sequence[Path], other: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Differences between the recorded outputs and those of another configuration's law on the recorded inputs."""
     recording = load(files)
+    require_law(recording)
     law = _law(config.load(other), recording)
     return {**_about(recording, other), **other_law(recording, law, progress)}
 
@@ -38,6 +39,7 @@ def replay_on_the_rig(
 ) -> dict[str, Any]:
     """The recorded reference through a law on a simulated rig: those of `other`, or the recorded ones."""
     recording = load(files)
+    require_law(recording)
     if other is None:
         path = recording.paths[0]
         library = Library(path.parent, recorded_laws(recording, trust))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,10 @@ from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.signals import COMMON, DEADLINE, PER_AXIS
 from rtloop.signals import Signal as Column
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 Signal = np.ndarray[Any, Any]
 SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": "Hz"}
@@ -55,7 +60,8 @@ class Recording:
     @property
     def units(self) -> dict[str, str]:
         """Unit of each signal."""
-        return {name: unit_of(name) for name in self.columns}
+        imported = self.header.get("imported", {}).get("units", {})
+        return {name: imported.get(name) or unit_of(name) for name in self.columns}
 
     @property
     def time_s(self) -> Signal:
@@ -104,6 +110,25 @@ class Recording:
                         yield rows[:, 1:]
                     elif inside.any():
                         yield rows[inside, 1:]
+
+    def to_pandas(
+        self, signals: Sequence[str] = (), start_s: float = 0.0, end_s: float = math.inf, every: int = 1
+    ) -> pandas.DataFrame:
+        """Signals (names or patterns, all by default) between two times as a DataFrame over the time in s.
+
+        Its `attrs` hold `units` and `events`. Raises RecordingError, MissingExtra.
+        """
+        from rtloop.recording.views import frames, selection
+
+        return frames.to_pandas(self, selection.Selection(tuple(signals), start_s, end_s, every))
+
+    def to_xarray(
+        self, signals: Sequence[str] = (), start_s: float = 0.0, end_s: float = math.inf, every: int = 1
+    ) -> xarray.Dataset:
+        """The same as a Dataset, with the units in each variable's `attrs` and the events, as JSON, in its own."""
+        from rtloop.recording.views import frames, selection
+
+        return frames.to_xarray(self, selection.Selection(tuple(signals), start_s, end_s, every))
 
     def snapshots(self) -> Generator[Snapshot]:
         """The recorded states of the law, in order."""

@@ -85,7 +85,11 @@ def print_summary(summary: Summary) -> None:
     )
     shown.add_row("lost", str(summary.ticks_lost), "complete" if summary.complete else "[red]not complete[/]")
     shown.add_row("time", f"{summary.duration_s:.3f} s", f"at {summary.rate_hz:g} Hz")
-    if summary.paced:
+    if imported := summary.imported:
+        shown.add_row("imported", "", f"from {escape(imported['file'])}, time: {escape(imported['time'])}")
+        for note in imported["notes"]:
+            shown.add_row("", "", escape(note))
+    elif summary.paced:
         achieved = summary.achieved_rate_hz
         rate = "–" if achieved is None else f"{achieved:.1f} Hz"
         shown.add_row("achieved rate", rate, _scheduling(summary.realtime or {}))
@@ -112,11 +116,25 @@ def print_summary(summary: Summary) -> None:
     out.print(shown)
     if summary.lateness_us is not None:
         _print_timing(out, summary)
+    if summary.imported:
+        _print_imported(out, summary)
+        return
     axes = table("axis", "rms error µm", "largest drive V")
     for axis in summary.axes:
         error = "–" if axis.rms_error_um is None else f"{axis.rms_error_um:.4f}"
         axes.add_row(axis.name, error, f"{axis.max_abs_drive_v:.3f}")
     out.print(axes)
+
+
+def _print_imported(out: Console, summary: Summary) -> None:
+    """Signals, what they are in the other program's file, and what they range over."""
+    shown = table("signal", "unit", "least", "largest", "in the file")
+    shown.columns[4].justify = "left"
+    mapping = (summary.imported or {})["mapping"]
+    for one in summary.ranges:
+        ends = ["–" if end is None else f"{end:.6g}" for end in (one.least, one.largest)]
+        shown.add_row(one.name, escape(one.unit), *ends, escape(mapping.get(one.name, "")))
+    out.print(shown)
 
 
 def _by_whom(commands: dict[str, int]) -> str:

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from rtloop.errors import MissingExtra, OutputError
+from rtloop.interchange.export import export
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load, unit_of
 from rtloop.recording.views.bands import read_bands
-from rtloop.recording.views.export import export
 from rtloop.recording.views.histogram import Histogram
 from rtloop.recording.views.plot import plot
 from rtloop.recording.views.summary import AxisSummary, summarise
@@ -157,7 +157,7 @@ def test_export_is_exact(to: str, read, path: Path, rows: np.ndarray, tmp_path: 
 
 
 def test_export_says_what_it_cannot(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    with pytest.raises(RecordingError, match="possible are csv, parquet, npz"):
+    with pytest.raises(RecordingError, match="possible are csv, parquet, npz, mat, hdf5"):
         export(path, "xlsx", tmp_path / "run.xlsx")
     with pytest.raises(OutputError, match="No such file or directory"):
         export(path, "csv", tmp_path / "absent" / "run.csv")

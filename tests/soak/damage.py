@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import RtloopError
+from rtloop.interchange.export import export
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.format import TICKS
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
-from rtloop.recording.views.export import export
 from rtloop.recording.views.summary import summarise
 from tests.recording.real_loop import record, scheduled
 

@@ -67,7 +67,12 @@ class Source:
         return found
 
     def begin(self, tick: int) -> int:
-        """The newest snapshot at or before `tick` whose own tick is there. Raises RecordingError."""
+        """The newest snapshot at or before `tick` whose own tick is there; `tick` of what was imported, which has none.
+
+        Raises RecordingError.
+        """
+        if "imported" in self.header:
+            return tick
         for seeker in reversed(self._seekers):
             for place in reversed(range(min(seeker.reaching(tick) + 1, seeker.end))):
                 found = [tick_of(one) for one in self._slow(seeker, place) if one.channel == format.LAW]

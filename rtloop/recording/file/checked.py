@@ -97,18 +97,16 @@ class _Cut(_Checked):
     files: list[Text]
 
 
-class _Header(_Checked):
+class _AnyHeader(_Checked):
     format: Annotated[int, Field(ge=1)]
     name: Text
     created_unix_ns: Annotated[int, Field(ge=0, lt=LARGEST_NS)]
-    axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
     observed: list[Name]
     columns: Annotated[list[Name], Field(max_length=2000)]
     rate_hz: Annotated[float, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
     paced: bool
     ticks_expected: Tick | None = None
     configuration: str
-    law: _Law
     realtime: _Realtime
     versions: _Versions
     host: _Host
@@ -125,6 +123,28 @@ class _Event(_Checked):
     who: str
     axis: str | None
     what: Words
+
+
+class _Header(_AnyHeader):
+    axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
+    law: _Law
+
+
+class _Imported(_Checked):
+    file: Text
+    sha256: Text
+    time: Text
+    mapping: dict[Name, Text]
+    units: dict[Name, Text]
+    notes: list[Text]
+
+
+class _ImportedHeader(_AnyHeader):
+    """Of measured signals from another program's file: any columns behind the first two, and no law."""
+
+    axes: Annotated[list[Name], Field(max_length=64)]
+    law: None
+    imported: _Imported
 
 
 class _Gap(_Checked):
@@ -171,7 +191,7 @@ def header_from(payload: bytes) -> dict[str, Any]:
     number = header.get("format")
     if isinstance(number, int) and number > FORMAT:
         raise Malformed(f"recording format {_shown(number)} is newer than this version reads ({FORMAT})")
-    _require(_Header, header)
+    _require(_ImportedHeader if "imported" in header else _Header, header)
     for key in ("axes", "observed", "columns"):
         if len(set(header[key])) < len(header[key]):
             raise Malformed(f"{key}: {_shown(header[key])}; a name may stand there once")
@@ -180,6 +200,12 @@ def header_from(payload: bytes) -> dict[str, Any]:
 
 def require_columns(header: dict[str, Any]) -> None:
     """Raise Malformed where the columns are not those of the axes, the extras and the observed signals."""
+    if "imported" in header:
+        if header["columns"][:2] != ["tick", "deadline_ns"]:
+            raise Malformed(f"columns: {_shown(header['columns'])}; tick and deadline_ns come first")
+        if unknown := header["imported"]["units"].keys() - header["columns"]:
+            raise Malformed(f"imported.units: {_shown(sorted(unknown))}; only columns have units")
+        return
     axes, observed, extras = header["axes"], header["observed"], extras_of(header).columns
     expected = list(signals.columns(axes, observed, extras))
     feeds = {f"{axis}_{signals.PER_AXIS[signals.FEED].name}" for axis in axes}

@@ -79,12 +79,18 @@ def missing(ticks: np.ndarray[Any, Any], expected: int) -> list[tuple[int, int]]
 
 
 def _require_whole(records: np.ndarray[Any, Any]) -> None:
-    for name, (low, high) in WHOLE.items():
-        values = records[name]
-        good = (values >= low) & (values <= high) & (values == np.floor(values))
-        if not good.all():
-            wrong = float(values[np.argmin(good)])
-            raise DamagedChunk(f"{name}: {wrong:g}; a whole number from {low:g} to {high:g} is allowed")
+    for name in WHOLE.keys() & set(records.dtype.names or ()):  # measured signals that were imported have few of them
+        if fault := whole_fault(name, records[name]):
+            raise DamagedChunk(fault)
+
+
+def whole_fault(name: str, values: np.ndarray[Any, Any]) -> str | None:
+    """What is wrong with the values of a column of whole numbers; None where nothing is."""
+    low, high = WHOLE[name]
+    good = (values >= low) & (values <= high) & (values == np.floor(values))
+    if good.all():
+        return None
+    return f"{name}: {float(values[np.argmin(good)]):g}; a whole number from {low:g} to {high:g} is allowed"
 
 
 def _require_times(records: np.ndarray[Any, Any]) -> None:

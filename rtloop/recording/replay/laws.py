@@ -32,6 +32,7 @@ def recorded_laws(recording: Recording, trust: Trust = NOTHING) -> tuple[LawRefe
     """The laws that the recorded loop knew. Raises RecordingError for one that is not here, or not as it was recorded,
     and where this version lays out their records otherwise.
     """
+    require_law(recording)
     described = recording.header.get("law", {}).get("laws")
     entries = [entry for entry in described if isinstance(entry, dict)] if isinstance(described, list) else []
     laws = tuple(_law(entry, recording, trust) for entry in entries)
@@ -42,6 +43,15 @@ def recorded_laws(recording: Recording, trust: Trust = NOTHING) -> tuple[LawRefe
             "that version"
         )
     return laws
+
+
+def require_law(recording: Recording) -> None:
+    """Raise RecordingError where the signals were imported: nothing of a law is among them."""
+    if "imported" in recording.header:
+        raise RecordingError(
+            f"{recording.paths[0]}: holds signals that were imported from {recording.header['imported']['file']}, "
+            "and nothing of a law, so there is nothing to replay; info, plot, export, cut and identify work with it"
+        )
 
 
 def _law(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:

@@ -5,19 +5,25 @@ No peak is lost that way, whatever the size of the picture.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.events import FINAL
-from rtloop.recording.load import Recording
+from rtloop.recording.load import Recording, unit_of
+from rtloop.signals import DEADLINE
 
 Progress = Callable[[int], None]
 BEYOND_DRAWING = 1e30
 """What is larger is left out of a picture, as is what is no number; a single-precision page holds the rest."""
 BAD = ("tripped", "driver_failed", "gap")
+OF_AN_AXIS = (("reference_um", "position_um"), ("error_um",), ("drive_v",))
+"""What is drawn together of each axis."""
+TIMING = ("exec_us", "lateness_us")
+MOST_OTHERS = 8
+"""Signals under names of their own that are drawn of an imported recording."""
 
 
 class Band(NamedTuple):
@@ -39,6 +45,15 @@ class Mark(NamedTuple):
     time_s: float
     label: str
     bad: bool
+
+
+class Panel(NamedTuple):
+    """Signals that are drawn together; `empty` is said where all of them are NaN."""
+
+    label: str
+    unit: str
+    names: list[str]
+    empty: str = ""
 
 
 def read_bands(
@@ -75,10 +90,30 @@ def read_bands(
     return {name: Band(time_s, low[:, index], high[:, index]) for index, name in enumerate(names)}
 
 
-def drawn_signals(recording: Recording) -> list[str]:
-    """The signals that a picture shows."""
-    wanted = ("reference_um", "position_um", "error_um", "drive_v")
-    return [*(f"{axis}_{name}" for axis in recording.header["axes"] for name in wanted), "lateness_us", "exec_us"]
+def panels(recording: Recording) -> list[Panel]:
+    """What a picture shows, from the top. Raises RecordingError where there is nothing."""
+    found = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in OF_AN_AXIS]
+    found.append(Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured"))
+    if "imported" in recording.header:
+        drawn = {name for panel in found for name in panel.names}
+        others = [name for name in recording.columns[DEADLINE + 1 :] if name not in drawn]
+        found += [Panel(name, recording.units[name], [name]) for name in others[:MOST_OTHERS]]
+    if not any(panel.names for panel in found):
+        raise RecordingError(f"{recording.paths[0]}: holds no signal that could be drawn")
+    return [panel for panel in found if panel.names]
+
+
+def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
+    there = [name for signal in names if (name := f"{axis}_{signal}") in recording]
+    label = axis if len(names) > 1 else f"{axis} {kind_of(names[0])}"
+    return Panel(label, unit_of(names[0]), there)
+
+
+def kind_of(name: str) -> str:
+    """`position` of `x_position_um`, by which signals are drawn alike; the name itself where it is nothing known."""
+    kind = name.rpartition("_")[0].rpartition("_")[2]
+    known = [signal for names in (*OF_AN_AXIS, TIMING) for signal in names]
+    return kind if f"{kind}_{name.rpartition('_')[2]}" in known else name
 
 
 def marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
@@ -95,5 +130,5 @@ def marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
 def title(recording: Recording) -> str:
     """Name, rate and clock of a run."""
     header = recording.header
-    clock = "paced" if header["paced"] else "virtual time"
+    clock = "paced" if header["paced"] else "imported" if "imported" in header else "virtual time"
     return f"{header.get('name', recording.paths[0].name)}   ({header['rate_hz']:g} Hz, {clock})"

@@ -12,16 +12,14 @@ import numpy as np
 from rtloop.errors import OutputError
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
-from rtloop.recording.views.bands import Band, Progress, drawn_signals, marks, read_bands, title
+from rtloop.recording.views.bands import Band, Panel, Progress, kind_of, marks, panels, read_bands, title
 from rtloop.values import rendered
 
 POINTS = 100_000
 """About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
-SHAPES = (
-    ("µm", (("reference_um", "reference", 1.0), ("position_um", "position", 1.5))),
-    ("µm", (("error_um", "error", 1.0),)),
-    ("V", (("drive_v", "drive", 1.0),)),
-)
+COLOURED = ("reference", "position", "error", "drive", "exec", "lateness")
+WIDTHS = {"position": 1.5}
+"""In pixels, where it is not 1."""
 
 
 def write_page(
@@ -35,13 +33,14 @@ def write_page(
     """Write the page, by default beside the recording. Raises RecordingError, OutputError."""
     recording = files if isinstance(files, Recording) else load(files)
     target = recording.paths[0].with_suffix(".html") if output is None else Path(output)
-    bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
+    drawn = panels(recording)
+    bands = read_bands(recording, [name for panel in drawn for name in panel.names], start_s, end_s, POINTS, progress)
     time_s = next(iter(bands.values())).time_s
     data = {
         "about": _about(recording, bands),
         "problems": recording.problems,
         "time_s": _encoded(time_s, np.float64),
-        "panels": _panels(recording.header["axes"], bands),
+        "panels": [_panel(panel, bands) for panel in drawn],
         "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
     embedded = json.dumps(data).replace("<", "\\u003c")
@@ -60,21 +59,15 @@ def _about(recording: Recording, bands: dict[str, Band]) -> str:
     return " · ".join(filter(None, parts))
 
 
-def _panels(axes: list[str], bands: dict[str, Band]) -> list[dict[str, Any]]:
-    panels = [
-        {"unit": unit, "empty": "", "traces": [_trace(bands[f"{axis}_{name}"], f"{axis} {label}", label, width)
-                                               for name, label, width in traces]}
-        for axis in axes
-        for unit, traces in SHAPES
-    ]  # fmt: skip
-    timing = [
-        _trace(bands[f"{name}_us"], label, name, 1.0) for name, label in (("exec", "tick"), ("lateness", "lateness"))
-    ]
-    return [*panels, {"unit": "µs", "empty": "virtual time: nothing was measured", "traces": timing}]
+def _panel(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
+    traces = [_trace(bands[name], name) for name in panel.names]
+    return {"unit": panel.unit, "empty": panel.empty, "traces": traces}
 
 
-def _trace(band: Band, label: str, colour: str, width: float) -> dict[str, Any]:
-    high = None if band.thin else _encoded(band.high, np.float32)
+def _trace(band: Band, name: str) -> dict[str, Any]:
+    kind, high = kind_of(name), None if band.thin else _encoded(band.high, np.float32)
+    label = "tick" if kind == "exec" else kind if name.startswith(kind) else f"{name[: name.index(f'_{kind}_')]} {kind}"
+    colour, width = kind if kind in COLOURED else "other", WIDTHS.get(kind, 1.0)
     return {"label": label, "colour": colour, "width": width, "low": _encoded(band.low, np.float32), "high": high}
 
 

@@ -9,13 +9,19 @@ import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.file.parts import Files
-from rtloop.recording.load import Recording, load, unit_of
-from rtloop.recording.views.bands import Band, Mark, Progress, drawn_signals, marks, read_bands, title
+from rtloop.recording.load import Recording, load
+from rtloop.recording.views.bands import Band, Mark, Panel, Progress, kind_of, marks, panels, read_bands, title
 
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
 MAX_LABELS = 12
-REFERENCE, POSITION, ERROR, DRIVE, LATENESS = "0.15", "tab:blue", "tab:red", "tab:green", "tab:purple"
+COLOURS = {
+    "reference": "0.15", "position": "tab:blue", "error": "tab:red", "drive": "tab:green",
+    "exec": "0.6", "lateness": "tab:purple",
+}  # fmt: skip
+OTHER = "tab:brown"
+BENEATH = {"position": 2.0}
+"""Width in points, where it is not 0.8, of what other lines shall be seen on."""
 
 
 def plot(
@@ -41,12 +47,12 @@ def plot(
         raise OutputError(f"{target}: no picture ends in {target.suffix!r}; possible are {', '.join(FORMATS)}")
     recording = files if isinstance(files, Recording) else load(files)
     target = target or recording.paths[0].with_suffix(FORMATS[0])
-    axes = recording.header["axes"]
-    bands = read_bands(recording, drawn_signals(recording), start_s, end_s, POINTS, progress)
+    drawn = panels(recording)
+    bands = read_bands(recording, [name for panel in drawn for name in panel.names], start_s, end_s, POINTS, progress)
     time_s = next(iter(bands.values())).time_s
-    figure = Figure(figsize=(12, 2.0 + 2.1 * (3 * len(axes) + 1)), layout="constrained")
+    figure = Figure(figsize=(12, 2.0 + 2.1 * len(drawn)), layout="constrained")
     FigureCanvasAgg(figure)
-    _draw(figure, axes, bands, marks(recording, time_s[0], time_s[-1]))
+    _draw(figure, drawn, bands, marks(recording, time_s[0], time_s[-1]))
     figure.suptitle(title(recording), fontsize=11, parse_math=False)
     try:
         figure.savefig(target, format=target.suffix[1:], dpi=110)
@@ -55,43 +61,31 @@ def plot(
     return target
 
 
-def _draw(figure: Any, axes: list[str], bands: dict[str, Band], events: list[Mark]) -> None:
-    panels = list(np.ravel(figure.subplots(3 * len(axes) + 1, 1, sharex=True)))
-    for index, axis in enumerate(axes):
-        position, error, drive = panels[3 * index : 3 * index + 3]
-        _trace(position, bands, f"{axis}_position_um", "position", POSITION, linewidth=2.0)
-        _trace(position, bands, f"{axis}_reference_um", "reference", REFERENCE)
-        position.set_ylabel(f"{axis} / µm")
-        _trace(error, bands, f"{axis}_error_um", "error", ERROR)
-        _trace(drive, bands, f"{axis}_drive_v", "drive", DRIVE)
-    _timing(panels[-1], bands)
-    for panel in panels:
-        panel.grid(visible=True, alpha=0.3)
-        panel.margins(x=0)
-        panel.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
-    panels[-1].set_xlabel("time since the start of the run / s")
-    _mark_events(panels, events)
+def _draw(figure: Any, drawn: list[Panel], bands: dict[str, Band], events: list[Mark]) -> None:
+    places = list(np.ravel(figure.subplots(len(drawn), 1, sharex=True)))
+    for place, panel in zip(places, drawn, strict=True):
+        if panel.empty and all(np.isnan(bands[name].high).all() for name in panel.names):
+            place.text(0.5, 0.5, panel.empty, transform=place.transAxes, ha="center")
+            place.plot([], [], label=kind_of(panel.names[-1]))
+            place.set_yticks([])
+        else:
+            for name in panel.names:
+                _trace(place, bands[name], kind_of(name))
+            place.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
+        place.grid(visible=True, alpha=0.3)
+        place.margins(x=0)
+        place.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
+    places[-1].set_xlabel("time since the start of the run / s")
+    _mark_events(places, events)
 
 
-def _trace(panel: Any, bands: dict[str, Band], name: str, label: str, color: str, linewidth: float = 0.8) -> None:
-    band = bands[name]
-    panel.plot(band.time_s, band.low, color=color, linewidth=linewidth, label=label)
+def _trace(place: Any, band: Band, kind: str) -> None:
+    color = COLOURS.get(kind, OTHER)
+    line = {"color": color, "linewidth": BENEATH.get(kind, 0.8), "zorder": 1.9 if kind in BENEATH else 2.0}
+    place.plot(band.time_s, band.low, label=kind, **line)
     if not band.thin:
-        panel.plot(band.time_s, band.high, color=color, linewidth=linewidth)
-        panel.fill_between(band.time_s, band.low, band.high, color=color, alpha=0.5, linewidth=0)
-    panel.set_ylabel(f"{name.rpartition('_')[0].replace('_', ' ')} / {unit_of(name)}")
-
-
-def _timing(panel: Any, bands: dict[str, Band]) -> None:
-    """Lateness and execution time; in virtual time there is none."""
-    if np.isnan(bands["lateness_us"].high).all():
-        panel.text(0.5, 0.5, "virtual time: nothing was measured", transform=panel.transAxes, ha="center")
-        panel.plot([], [], label="lateness")
-        panel.set_yticks([])
-        return
-    for name, color in (("exec_us", "0.6"), ("lateness_us", LATENESS)):
-        _trace(panel, bands, name, name.removesuffix("_us"), color)
-    panel.set_ylabel("timing / µs")
+        place.plot(band.time_s, band.high, **line)
+        place.fill_between(band.time_s, band.low, band.high, color=color, alpha=0.5, linewidth=0)
 
 
 def _mark_events(panels: list[Any], events: list[Mark]) -> None:

@@ -31,7 +31,17 @@ class AxisSummary:
 
     name: str
     rms_error_um: float | None
-    max_abs_drive_v: float
+    max_abs_drive_v: float | None
+
+
+@dataclass(frozen=True)
+class Range:
+    """Least and largest value of a signal; None where it has no number."""
+
+    name: str
+    unit: str
+    least: float | None
+    largest: float | None
 
 
 @dataclass(frozen=True)
@@ -74,6 +84,10 @@ class Summary:
     realtime: dict[str, Any] | None
     host: dict[str, Any] | None
     axes: list[AxisSummary]
+    imported: dict[str, Any] | None
+    """Of which file, and how, where the signals are another program's."""
+    ranges: list[Range]
+    """Of each of those signals."""
     trips: list[Trip]
     commands: dict[str, int]
     """By whom, the most first."""
@@ -93,46 +107,73 @@ class AxisSums:
         self.name = name
         self._square_sum, self._count, self._drive = 0.0, 0, 0.0
 
-    def add(self, error_um: Any, drive_v: Any, closed: Any) -> None:
-        """Count a block; `closed` says which ticks ran in closed loop."""
-        errors = error_um[closed]
-        self._square_sum += float(errors @ errors)
-        self._count += len(errors)
-        self._drive = max(self._drive, float(np.abs(drive_v).max()))
+    def add(self, column: dict[str, np.ndarray[Any, Any]], closed: Any) -> None:
+        """Count a block; `closed` says which ticks ran in closed loop. Imported signals may lack either column."""
+        error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
+        if error_um is not None and closed is not None:
+            errors = error_um[closed]
+            self._square_sum += float(errors @ errors)
+            self._count += len(errors)
+        if drive_v is not None:
+            self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
-    def summary(self) -> AxisSummary:
-        """What came of it."""
+    def summary(self, columns: Sequence[str]) -> AxisSummary:
+        """What came of it, in a recording with these columns."""
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
-        return AxisSummary(self.name, rms_um, self._drive)
+        return AxisSummary(self.name, rms_um, self._drive if f"{self.name}_drive_v" in columns else None)
+
+
+class Extremes:
+    """The least and the largest number of each signal."""
+
+    def __init__(self, units: dict[str, str]) -> None:
+        self._units = units
+        self._found = {name: (math.inf, -math.inf) for name in units}
+
+    def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
+        """Count a block; NaN is no number."""
+        for name, (least, largest) in self._found.items():
+            low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
+            self._found[name] = float(np.fmin(least, low)), float(np.fmax(largest, high))
+
+    def summary(self) -> list[Range]:
+        """What came of it."""
+        return [
+            Range(name, self._units[name], *(found if found[0] <= found[1] else (None, None)))
+            for name, found in self._found.items()
+        ]
 
 
 class Totals:
     """What is summed up over the ticks of a recording."""
 
-    def __init__(self, axes: list[str]) -> None:
+    def __init__(self, axes: list[str], imported_units: dict[str, str]) -> None:
         self.ticks, self.overruns, self.periods_missed = 0, 0, 0
         self.limited = dict.fromkeys(LIMITED, 0)
         self.first: tuple[float, float] | None = None
         self.last = (0.0, 0.0)
         self.histograms = {name: Histogram() for name in MEASURED}
         self.axes = [AxisSums(name) for name in axes]
+        self.extremes = Extremes(imported_units)
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
         """A block of consecutive ticks, by column."""
         self.ticks += len(column["tick"])
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
         self.last = float(column["tick"][-1]), float(column["deadline_ns"][-1])
-        self.periods_missed += int(column["periods_missed"].sum())
-        flags = column["flags"].astype(np.int64)
+        if "periods_missed" in column:
+            self.periods_missed += int(column["periods_missed"].sum())
+        flags = column["flags"].astype(np.int64) if "flags" in column else np.zeros(0, np.int64)
         self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
         for name, flag in LIMITED.items():
             self.limited[name] += int(np.count_nonzero(flags & flag))
-        for name, histogram in self.histograms.items():
-            histogram.add(column[name])
-        closed = column["mode"] == Mode.CLOSED_LOOP
+        for name in self.histograms.keys() & column.keys():
+            self.histograms[name].add(column[name])
+        closed = column["mode"] == Mode.CLOSED_LOOP if "mode" in column else None
         with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a recording
             for axis in self.axes:
-                axis.add(column[f"{axis.name}_error_um"], column[f"{axis.name}_drive_v"], closed)
+                axis.add(column, closed)
+            self.extremes.add(column)
 
     @property
     def executed(self) -> int:
@@ -199,7 +240,9 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         problems=problems,
         realtime=header.get("realtime"),
         host=header.get("host"),
-        axes=[axis.summary() for axis in totals.axes],
+        axes=[axis.summary(readers[0].columns) for axis in totals.axes],
+        imported=header.get("imported"),
+        ranges=totals.extremes.summary(),
         trips=[
             Trip(event["tick"], event["what"]["causes"], event["what"].get("reason"))
             for event in events
@@ -213,9 +256,11 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
 
 
 def _sum_up(readers: Sequence[Reader], progress: Progress | None) -> Totals:
-    axes = readers[0].header["axes"]
-    totals = Totals(axes)
+    header, axes = readers[0].header, readers[0].header["axes"]
+    totals = Totals(axes, header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]
+    if "imported" in header:
+        names = [*readers[0].columns]
     batch, fill = np.empty((len(names), BATCH_ROWS)), 0
     for rows in (rows for reader in readers for rows in reader.blocks(names)):
         if fill + len(rows) > BATCH_ROWS:

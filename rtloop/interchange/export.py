@@ -1,11 +1,11 @@
-"""Hands a recording on as CSV, Parquet or npz: every float64 exactly, block by block, never over an existing file."""
+"""Hands a recording on as CSV, Parquet, npz, HDF5 or MAT: every float64 exactly, never over an existing file."""
 
 from __future__ import annotations
 
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,15 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError
+from rtloop.interchange.hdf5_signals import append, begin
+from rtloop.interchange.to_mat import write_mat
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.parts import Files, find_files
-from rtloop.recording.load import Recording, load
+from rtloop.recording.load import Recording, described, load
+from rtloop.recording.views.selection import ALL, Selection
 
-FORMATS = ("csv", "parquet", "npz")
+FORMATS = {"csv": ".csv", "parquet": ".parquet", "npz": ".npz", "mat": ".mat", "hdf5": ".h5"}
+"""And how their files end."""
 PASS_BYTES = 512 << 20
 """Memory for the columns of one pass of the npz export."""
 ROW_GROUP = 1 << 18
@@ -25,19 +29,28 @@ ROW_GROUP = 1 << 18
 Progress = Callable[[int], None]
 
 
-def export(files: Files, to: str, output: Path | str | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Write a recording as `to`, one of FORMATS; `progress` is told the ticks so far.
+def export(
+    files: Files,
+    to: str,
+    output: Path | str | None = None,
+    progress: Progress | None = None,
+    selection: Selection = ALL,
+) -> dict[str, Any]:
+    """Write what is selected of a recording as `to`, one of FORMATS; `progress` is told the ticks so far.
 
     Returns {recording, output, ticks, bytes, problems}. Raises RecordingError, OutputError, MissingExtra.
     """
-    writers = {"csv": _write_csv, "parquet": _write_parquet, "npz": _write_npz}
-    if to not in writers:
+    if to not in FORMATS:
         raise RecordingError(f"export to {to!r}: possible are {', '.join(FORMATS)}")
-    recording = load(files)
+    recording, tell = load(files), progress or (lambda _: None)
     path = find_files(files)[0]
-    target = path.with_suffix(f".{to}") if output is None else Path(output)
+    target = path.with_suffix(FORMATS[to]) if output is None else Path(output)
+    writers = {"csv": _write_csv, "parquet": _write_parquet, "npz": _write_npz, "hdf5": _write_hdf5}
     with _new_file(target) as part:
-        ticks = writers[to](recording, part, progress or (lambda _: None))
+        if to == "mat":
+            ticks = write_mat(recording, part, target, selection, tell)
+        else:
+            ticks = writers[to](recording, part, selection, tell)
     size = target.stat().st_size
     return {
         "recording": str(path),
@@ -63,35 +76,33 @@ def _new_file(target: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def _write_csv(recording: Recording, path: Path, progress: Progress) -> int:
+def _write_csv(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
     """One line of names, then one line a tick; `float()` of each field gives the recorded number."""
-    ticks = 0
+    ticks, names = 0, selection.names(recording)
     with path.open("w", encoding="ascii", newline="") as file:
-        file.write(",".join(recording.columns) + "\n")
-        for rows in recording.blocks():
+        file.write(",".join(names) + "\n")
+        for rows in selection.blocks(recording, names):
             file.writelines(",".join(map(repr, row)) + "\n" for row in rows.tolist())
             ticks += len(rows)
             progress(ticks)
     return ticks
 
 
-def _write_parquet(recording: Recording, path: Path, progress: Progress) -> int:
+def _write_parquet(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
     """A column of doubles a signal, its unit in the field's metadata, header and events in the file's."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise MissingExtra("export to Parquet needs pyarrow: pip install 'rtloop[parquet]'") from None
-    fields = [
-        pyarrow.field(name, pyarrow.float64(), nullable=False, metadata={"unit": unit})
-        for name, unit in recording.units.items()
-    ]
+    names, units = selection.names(recording), recording.units
+    fields = [pyarrow.field(name, pyarrow.float64(), nullable=False, metadata={"unit": units[name]}) for name in names]
     about = {"rtloop.header": json.dumps(recording.header), "rtloop.events": json.dumps(recording.events)}
     schema = pyarrow.schema(fields, metadata=about)
     ticks = 0
     try:
         with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-            for rows in _grouped(recording, recording.columns):
+            for rows in _grouped(selection.blocks(recording, names)):
                 columns = [np.ascontiguousarray(rows[:, index]) for index in range(rows.shape[1])]
                 writer.write_table(pyarrow.Table.from_arrays([pyarrow.array(c) for c in columns], schema=schema))
                 ticks += len(rows)
@@ -101,19 +112,41 @@ def _write_parquet(recording: Recording, path: Path, progress: Progress) -> int:
     return ticks
 
 
-def _write_npz(recording: Recording, path: Path, progress: Progress) -> int:
+def _write_npz(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
     """An array a signal, and `header_json` and `events_json`; several passes where memory asks for it."""
-    ticks = sum(len(rows) for rows in recording.blocks(["tick"]))
+    everything = selection.names(recording)
+    ticks = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
     at_once = max(PASS_BYTES // (8 * max(ticks, 1)), 1)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for name, value in (("header_json", recording.header), ("events_json", recording.events)):
             _add_array(archive, name, np.array(json.dumps(value)))
-        for start in range(0, len(recording.columns), at_once):
-            names = recording.columns[start : start + at_once]
-            blocks = list(recording.blocks(names)) or [np.empty((0, len(names)))]
+        for start in range(0, len(everything), at_once):
+            names = everything[start : start + at_once]
+            blocks = list(selection.blocks(recording, names)) or [np.empty((0, len(names)))]
             for index, name in enumerate(names):
                 _add_array(archive, name, np.concatenate([rows[:, index] for rows in blocks]))
-            progress(ticks * (start + len(names)) // len(recording.columns))
+            progress(ticks * (start + len(names)) // len(everything))
+    return ticks
+
+
+def _write_hdf5(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
+    """A dataset a signal, its `unit` and `meaning` as attributes; header and events as JSON in two more."""
+    try:
+        import h5py
+    except ImportError:
+        raise MissingExtra("export to HDF5 needs h5py: pip install 'rtloop[data]'") from None
+    names, ticks = selection.names(recording), 0
+    with h5py.File(path, "w", track_order=True) as file:
+        file.attrs["rate_hz"] = recording.header["rate_hz"]
+        for name, value in (("header_json", recording.header), ("events_json", recording.events)):
+            file[name] = json.dumps(value)
+        datasets = [begin(file, name) for name in names]
+        for name, dataset in zip(names, datasets, strict=True):
+            dataset.attrs.update({"unit": recording.units[name], "meaning": described(name).meaning})
+        for rows in selection.blocks(recording, names):
+            append(datasets, rows)
+            ticks += len(rows)
+            progress(ticks)
     return ticks
 
 
@@ -122,10 +155,10 @@ def _add_array(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any])
         np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _grouped(recording: Recording, names: Sequence[str]) -> Iterator[np.ndarray[Any, Any]]:
+def _grouped(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
     """The blocks, joined to about ROW_GROUP rows."""
     waiting: list[np.ndarray[Any, Any]] = []
-    for rows in recording.blocks(names):
+    for rows in blocks:
         waiting.append(rows)
         if sum(map(len, waiting)) >= ROW_GROUP:
             yield np.concatenate(waiting)

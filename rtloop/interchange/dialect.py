@@ -1,0 +1,194 @@
+"""How a text file writes its table: encoding, delimiter, decimal sign, header, units; found out from its lines.
+
+Nothing is assumed of the beginning of a file, where programs write what they like: the lines of numbers are looked
+for, and the names above them. Lines of the middle and of the end are looked at too, for at rest a German program
+writes 0 and not 0,0.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rtloop.interchange.table import UnreadableData
+from rtloop.interchange.units import is_unit
+
+SAMPLE_BYTES = 1 << 16
+SAMPLE_LINES = 1000
+LONGEST_LINE = 1 << 20
+NO_NUMBER = ("", "nan", "-nan", "na", "n/a", "null", "none", "#n/a")
+"""What may stand where a number is missing."""
+INFINITE = ("inf", "-inf", "+inf", "infinity", "-infinity")
+_POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?")
+_MANNERS = (
+    (";", "."),
+    ("\t", "."),
+    (",", "."),
+    ("|", "."),
+    (";", ","),
+    ("\t", ","),
+    ("|", ","),
+    (None, "."),
+    (None, ","),
+)
+"""Delimiter (None: blanks) and decimal sign; of those that fit equally the first is taken."""
+_UNIT_BEHIND = re.compile(r"(?<=\d)\s+(s|sec|ms|min|hr|V|mV|nm|µm|um|mm)$")
+"""As MATLAB's timetables write durations: 0.001 sec."""
+_MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
+_COMMENT = re.compile(r"\s*(#|%|//)+\s*")
+
+
+class Dialect(NamedTuple):
+    """`delimiter` is None for blanks; `first`, from 0, is the line of the first numbers, `numbers` their columns."""
+
+    encoding: str
+    delimiter: str | None
+    decimal: str
+    first: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    numbers: tuple[int, ...]
+    dates: tuple[int, ...]
+    has_header: bool
+
+
+def dialect_of(path: Path) -> Dialect:
+    """How the lines of a file are written. Raises UnreadableData where there are no rows of numbers."""
+    encoding, head, rest = _sample(path)
+    lines = [*head, *rest]
+    lines = lines[:: -(-len(lines) // SAMPLE_LINES)]
+    fits = [(_fit(lines, *manner), -place) for place, manner in enumerate(_MANNERS)]
+    (score, place) = max(fits)
+    delimiter, decimal = _MANNERS[-place]
+    rows = [split(line, delimiter) for line in lines]
+    width = _width(rows)
+    numbers = _number_columns([row for row in rows if len(row) == width], decimal)
+    if score == 0 or not numbers:
+        raise UnreadableData(f"{path}: holds no table: no rows of numbers, in columns divided by , ; tabs or blanks")
+    first = _first_row((split(line, delimiter) for line in head), width, numbers, decimal)
+    if first is None:
+        raise UnreadableData(f"{path}: no row of numbers in its first {SAMPLE_BYTES >> 10} KiB")
+    names, units, has_header = _header(head[:first], delimiter, width)
+    behind = [_UNIT_BEHIND.search(field) for field in split(head[first], delimiter)]
+    units = tuple(found[1] if found else unit for found, unit in zip(behind, units, strict=True))
+    return Dialect(encoding, delimiter, decimal, first, names, units, numbers, _dates(rows, width), has_header)
+
+
+def split(line: str, delimiter: str | None) -> list[str]:
+    """The fields of a line, without blanks and quotes around them."""
+    if delimiter is None:
+        return line.split()
+    try:
+        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
+    except csv.Error:
+        return []
+
+
+def is_number(field: str, decimal: str) -> bool:
+    """Whether a field is a number, alone or in front of a unit, or says that there is none."""
+    field = _UNIT_BEHIND.sub("", field)
+    return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
+
+
+def number_alone(text: Any) -> Any:
+    """A column of fields (a pandas series of text) without the units behind their numbers."""
+    return text.str.replace(_UNIT_BEHIND, "", regex=True)
+
+
+def _sample(path: Path) -> tuple[str, list[str], list[str]]:
+    """Encoding, the first lines, and some from the middle and the end. Raises UnreadableData."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        blocks = [file.read(SAMPLE_BYTES)]
+        for place in (size // 2, size - SAMPLE_BYTES):
+            if place > SAMPLE_BYTES:
+                file.seek(place // 4 * 4)
+                blocks.append(file.read(SAMPLE_BYTES))
+    encoding = next((name for mark, name in _MARKS if blocks[0].startswith(mark)), None) or _encoding(blocks[0])
+    plain = "utf-16-le" if blocks[0].startswith(b"\xff\xfe") else "utf-16-be" if encoding == "utf-16" else encoding
+    texts = [block.decode(encoding if k == 0 else plain, "replace") for k, block in enumerate(blocks)]
+    if any("\0" in text for text in texts):
+        raise UnreadableData(f"{path}: no text, and no other kind of file that is known")
+    whole = len(blocks[0]) == size
+    head = texts[0].splitlines()[: None if whole else -1]
+    if not head:
+        raise UnreadableData(
+            f"{path}: {'empty' if not size else f'its first line is longer than {SAMPLE_BYTES} bytes'}"
+        )
+    return encoding, head, [line for text in texts[1:] for line in text.splitlines()[1:-1]]
+
+
+def _encoding(block: bytes) -> str:
+    try:
+        block[: -4 if len(block) == SAMPLE_BYTES else None].decode()
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
+def _fit(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
+    """Numbers among the fields of the usual lines, times the part of all lines that such lines are."""
+    rows = [split(line, delimiter) for line in lines if line.strip()]
+    width = _width(rows)
+    usual = [row for row in rows if len(row) == width]
+    numbers = sum(bool(field) and is_number(field, decimal) for row in usual for field in row)
+    return numbers / max(width, 1) / max(len(rows), 1)
+
+
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """The usual number of fields."""
+    counts = Counter(len(row) for row in rows if row)
+    return counts.most_common(1)[0][0] if counts else 0
+
+
+def _number_columns(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
+    """Columns in which most fields are numbers."""
+    width = len(rows[0]) if rows else 0
+    return tuple(
+        column
+        for column in range(width)
+        if any(row[column] for row in rows)
+        and sum(bool(row[column]) and is_number(row[column], decimal) for row in rows) * 2
+        > sum(bool(row[column]) for row in rows)
+    )
+
+
+def _dates(rows: Sequence[Sequence[str]], width: int) -> tuple[int, ...]:
+    """Columns in which most fields are dates and times of the day, such as 2024-03-01 12:00:00.25."""
+    usual = [row for row in rows if len(row) == width]
+    return tuple(k for k in range(width) if sum(bool(_DATE.fullmatch(row[k])) for row in usual) * 2 > len(usual))
+
+
+def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int], decimal: str) -> int | None:
+    """The first of the rows that has numbers where numbers are."""
+    for number, row in enumerate(rows):
+        whole = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
+        if whole and any(row[column] for column in numbers):
+            return number
+    return None
+
+
+def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names and units by the lines above the numbers, and whether there are names."""
+    above = [split(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
+    named = [[*row, *[""] * (width - len(row))] for row in above if width - 1 <= len(row) <= width and any(row)]
+    units = [""] * width
+    if len(named) > 1 and _are_units(named[-1]):
+        units = [field.strip("[]() ") for field in named.pop()]
+    if not named:
+        return tuple(f"column_{number}" for number in range(1, width + 1)), tuple(units), False
+    names = [name or f"column_{number}" for number, name in enumerate(named[-1], start=1)]
+    return tuple(names), tuple(units), True
+
+
+def _are_units(fields: Sequence[str]) -> bool:
+    """Whether a row below the names is one of units: most of it is understood as such, or stands in brackets."""
+    said = [field for field in fields if field]
+    bracketed = sum(field[0] + field[-1] in ("[]", "()") for field in said)
+    return bool(said) and max(sum(is_unit(field.strip("[]()")) for field in said), bracketed) * 2 >= len(said)

@@ -1,0 +1,149 @@
+"""Tables in text: CSV and its kin, with whatever delimiter, decimal sign, header and units a program writes."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.errors import MissingExtra
+from rtloop.interchange.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
+from rtloop.interchange.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
+from rtloop.interchange.table import ROWS_AT_MOST, Table, UnreadableData
+
+ROWS_AT_ONCE = 1 << 16
+SIGNS = {None: "blanks", "\t": "tabs"}
+
+
+def read_csv(path: Path) -> Table:
+    """The columns of numbers; those of text alone are left out. Raises UnreadableData, MissingExtra."""
+    dialect = dialect_of(path)
+    if len(dialect.names) > COLUMNS_AT_MOST:
+        raise UnreadableData(f"{path}: more than {COLUMNS_AT_MOST} columns")
+    blocks = _numbers(path, dialect)
+    names: list[str] = []
+    wanted = (*dialect.dates, *dialect.numbers)
+    for column in wanted:
+        names.append(unique(dialect.names[column], names))
+    columns = {name: np.concatenate([block[k] for block in blocks]) for k, name in enumerate(names)}
+    units = {name: dialect.units[column] for name, column in zip(names, wanted, strict=True)}
+    for name in names[: len(dialect.dates)]:
+        columns[name], units[name] = (columns[name] - columns[name][:1]) * 1e-9, "s"
+    sign = SIGNS.get(dialect.delimiter, repr(dialect.delimiter))
+    about = {
+        "table": f"columns divided by {sign}, decimal {dialect.decimal!r}, "
+        f"{dialect.encoding.removesuffix('-sig')}, numbers from line {dialect.first + 1} on"
+        + ("" if dialect.has_header else ", no names")
+    }
+    text = [name for k, name in enumerate(dialect.names) if k not in wanted and not name.startswith("column_")]
+    if text:
+        about["left out"] = ", ".join(f"{name} (text)" for name in text)
+    return Table(
+        columns, {name: unit for name, unit in units.items() if unit}, names[0] if dialect.dates else None, about
+    )
+
+
+class _Lines(io.TextIOBase):
+    """A text from its first numbers on. Raises UnreadableData at what is no text."""
+
+    def __init__(self, path: Path, dialect: Dialect) -> None:
+        self._path, self._since = path, 0
+        self._file = path.open(encoding=dialect.encoding, errors="replace", newline=None)
+        for _ in range(dialect.first):
+            self._file.readline()
+
+    def readable(self) -> bool:
+        """For pandas."""
+        return True
+
+    def read(self, size: int | None = -1) -> str:
+        """As much as is asked for."""
+        text = self._file.read(size)
+        self._since = len(text) - text.rfind("\n") - 1 if "\n" in text else self._since + len(text)
+        if "\0" in text or self._since > LONGEST_LINE:
+            what = "zeros, which are no text" if "\0" in text else f"a line longer than {LONGEST_LINE >> 20} MiB"
+            raise UnreadableData(f"{self._path}: damaged: holds {what}")
+        return text
+
+    def __iter__(self) -> Any:
+        return iter(self._file)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
+    """Blocks of rows, each a list of columns. Raises UnreadableData, which says where something is no number."""
+    try:
+        import pandas
+    except ImportError:
+        raise MissingExtra("CSV needs pandas: pip install 'rtloop[data]'") from None
+    blocks: list[list[np.ndarray[Any, Any]]] = []
+    rows, most = 0, min(ROWS_AT_MOST, BYTES_AT_MOST // (8 * len(dialect.numbers)))
+    lines = _Lines(path, dialect)
+    try:
+        with pandas.read_csv(
+            lines,
+            sep=r"\s+" if dialect.delimiter is None else dialect.delimiter,
+            decimal=dialect.decimal,
+            header=None,
+            names=range(len(dialect.names)),
+            na_values=list(NO_NUMBER),
+            skipinitialspace=True,
+            low_memory=False,
+            chunksize=ROWS_AT_ONCE,
+        ) as reader:
+            for block in reader:
+                dates = [_dates_ns(path, dialect, block[column]) for column in dialect.dates]
+                blocks.append([*dates, *(_column(path, dialect, block[column]) for column in dialect.numbers)])
+                rows += len(block)
+                if rows > most:
+                    raise UnreadableData(f"{path}: more than {most} rows; cut it, or write fewer columns")
+    except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeError) as fault:
+        raise UnreadableData(f"{path}: {_where(str(fault), dialect)}") from None
+    finally:
+        lines.close()
+    return blocks
+
+
+def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
+    """A column's numbers. Raises UnreadableData at the first text."""
+    import pandas
+
+    if values.dtype.kind in "fiub":
+        return values.to_numpy(np.float64)
+    text = number_alone(values.astype(str).str.strip())
+    if dialect.decimal == ",":
+        text = text.str.replace(",", ".")
+    numbers = np.asarray(pandas.to_numeric(text, errors="coerce"), np.float64)
+    wrong = np.flatnonzero(np.isnan(numbers) & ~text.str.lower().isin(NO_NUMBER).to_numpy())
+    if wrong.size:
+        row = int(values.index[wrong[0]])
+        raise UnreadableData(
+            f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[wrong[0]])[:60]!r} is no number "
+            f"(row {row + 1} of the numbers, about line {dialect.first + row + 1})"
+        )
+    return numbers
+
+
+def _dates_ns(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
+    """Dates as ns since 1970, int64. Raises UnreadableData at the first that is none."""
+    import pandas
+
+    dates = pandas.to_datetime(values.str.replace(",", "."), format="ISO8601", utc=True, errors="coerce")
+    if dates.isna().any():
+        row = int(values.index[int(np.argmax(dates.isna()))])
+        raise UnreadableData(
+            f"{path}: column {dialect.names[values.name]!r}: line {dialect.first + row + 1} holds no date"
+        )
+    return dates.dt.tz_localize(None).to_numpy("datetime64[ns]").astype(np.int64)
+
+
+def _where(fault: str, dialect: Dialect) -> str:
+    """pandas counts lines from the first numbers on."""
+    words = fault.removeprefix("Error tokenizing data. C error: ").strip()
+    return "damaged: " + re.sub(r"line (\d+)", lambda found: f"line {int(found[1]) + dialect.first}", words)

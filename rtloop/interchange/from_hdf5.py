@@ -1,0 +1,16 @@
+"""HDF5: datasets in any depth of groups, matrices and records by column; units from attributes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rtloop.interchange.groups import Found, one_of
+from rtloop.interchange.hdf5 import collect
+from rtloop.interchange.table import Table
+
+
+def read_hdf5(path: Path, group: str | None = None) -> Table:
+    """What was sampled together: `group`, else the only or the longest. Raises UnreadableData, MissingExtra."""
+    found = Found(path)
+    collect(found)
+    return one_of(path, found.tables(), group)

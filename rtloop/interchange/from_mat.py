@@ -1,0 +1,195 @@
+"""MAT files: v5 and older by scipy, v7.3 by h5py; the layouts of ControlDesk and Simulink, structures and plain arrays.
+
+ControlDesk writes one structure: X, the times of each raster, and Y(k), a signal each, with Name, Data, Unit and the
+XIndex of its raster. Simulink's structure with time has time and signals(k) with values and label; its To File block
+writes a matrix whose first row is the time. Objects (timeseries, Dataset, table) are readable for MATLAB alone.
+"""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.interchange.groups import BYTES_AT_MOST, Found, one_of, unique
+from rtloop.interchange.hdf5 import matlab_variables
+from rtloop.interchange.table import Table, UnreadableData
+
+HEADER_BYTES = 128
+MATRIX, COMPRESSED = 14, 15
+"""Types of the elements of a file (MathWorks, MAT-File Format, table 1-1)."""
+BLOCK = 1 << 16
+DEEPEST = 32
+HDF5_AT = 512
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+VALUES = ("data", "values")
+
+
+def read_mat(path: Path, group: str | None = None) -> Table:
+    """The signals of one raster or structure: `group`, else the only or the longest one. Raises UnreadableData."""
+    with path.open("rb") as file:
+        head = file.read(HDF5_AT + len(HDF5_MAGIC))
+    found = Found(path)
+    variables = matlab_variables(found) if head[HDF5_AT:] == HDF5_MAGIC else _variables(path, head)
+    tables: dict[str, Table] = {}
+    for name, value in variables.items():
+        if _is_controldesk(value):
+            for raster, table in _rasters(path, value).items():
+                tables[unique(raster or name, tables)] = table
+        else:
+            _walk(found, name, value, 0)
+    return one_of(path, tables | found.tables(), group)
+
+
+def _variables(path: Path, head: bytes) -> dict[str, Any]:
+    """The variables of a file of version 5 or older, structures as dicts."""
+    from scipy.io import loadmat
+
+    if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
+        _require_bounded(path, "<" if head[126:128] == b"IM" else ">")
+    elif path.stat().st_size > BYTES_AT_MOST or not any(head[:20]):
+        raise UnreadableData(f"{path}: not a MAT file")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = loadmat(path, simplify_cells=True)
+    except Exception as fault:  # scipy lets through whatever a damaged element leads to
+        raise UnreadableData(f"{path}: not a MAT file, or damaged ({_first_line(fault)})") from None
+    return {name: value for name, value in found.items() if not name.startswith("__")}
+
+
+def _require_bounded(path: Path, order: str) -> None:
+    """Go through the elements. Raise UnreadableData where one is damaged, or all together hold more than is allowed."""
+    size, position, total = path.stat().st_size, HEADER_BYTES, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            kind, length = np.frombuffer(file.read(8).ljust(8, b"\0"), f"{order}u4").tolist()
+            if kind not in (MATRIX, COMPRESSED):
+                raise UnreadableData(f"{path}: damaged: no element of a MAT file stands at byte {position}")
+            if position + 8 + length > size:
+                raise UnreadableData(f"{path}: cut off: its element at byte {position} ends behind the file")
+            total += length if kind == MATRIX else _expanded(path, file, length, BYTES_AT_MOST - total)
+            if total > BYTES_AT_MOST:
+                raise UnreadableData(
+                    f"{path}: holds more than {BYTES_AT_MOST >> 30} GiB; cut it with the program that wrote it"
+                )
+            position += 8 + length
+
+
+def _expanded(path: Path, file: Any, length: int, limit: int) -> int:
+    """Bytes of a compressed element, as far as they are no more than `limit` and a block."""
+    stream, total, left = zlib.decompressobj(), 0, length
+    try:
+        while (left or stream.unconsumed_tail) and not stream.eof and total <= limit:
+            block = stream.unconsumed_tail or file.read(min(left, BLOCK))
+            left -= 0 if stream.unconsumed_tail else len(block)
+            total += len(stream.decompress(block, BLOCK * 16))
+    except zlib.error as fault:
+        raise UnreadableData(f"{path}: damaged: {fault}") from None
+    return total
+
+
+def _is_controldesk(value: Any) -> bool:
+    """Whether this is a structure with X.Data and Y(k).Data."""
+    if not isinstance(value, dict) or not {"X", "Y"} <= value.keys():
+        return False
+    return all(isinstance(one, dict) and "Data" in one for key in "XY" for one in _each(value[key]))
+
+
+def _rasters(path: Path, value: dict[str, Any]) -> dict[str, Table]:
+    """A table for each X, of the Y that belong to it: by XIndex, by the raster's name, or by length."""
+    times, tables = _each(value["X"]), dict[str, Table]()
+    about = {"layout": "ControlDesk", **_described(value)}
+    for number, x in enumerate(times, start=1):
+        found = Found(path)
+        name = unique(_text(x.get("Name")) or "Time", ())
+        found.add(name, x["Data"], _text(x.get("Unit")) or "s")
+        rows = np.size(x["Data"])
+        for y in _each(value["Y"]):
+            if _index(y) in (None, number) and np.size(y["Data"]) == rows and _of_raster(y, x):
+                label = _text(y.get("Name")) or "Y"
+                found.add(unique(label, found.columns), y["Data"], _text(y.get("Unit")))
+        raster = _text(x.get("Raster")) if len(times) > 1 else ""
+        if found.columns:
+            tables[unique(raster or (f"X({number})" if len(times) > 1 else ""), tables)] = Table(
+                found.columns, found.units, name, about
+            )
+    return tables
+
+
+def _of_raster(y: dict[str, Any], x: dict[str, Any]) -> bool:
+    mine, other = _text(y.get("Raster")), _text(x.get("Raster"))
+    return not mine or not other or mine == other
+
+
+def _index(y: dict[str, Any]) -> int | None:
+    found = y.get("XIndex", y.get("Xindex"))
+    return int(found) if found is not None and np.size(found) == 1 else None
+
+
+def _described(value: dict[str, Any]) -> dict[str, str]:
+    text = value.get("Description")
+    text = next((one for one in text.values() if isinstance(one, str)), "") if isinstance(text, dict) else text
+    return {"description": text[:200]} if isinstance(text, str) and text else {}
+
+
+def _walk(found: Found, path: str, value: Any, depth: int, unit: str | None = None) -> None:
+    """Every array of numbers below a value, by its path; names and units are taken from beside it."""
+    if depth > DEEPEST:
+        raise UnreadableData(f"{found.path}: {path}: nested more than {DEEPEST} deep")
+    if isinstance(value, dict):
+        said = {key.casefold(): one for key, one in {**_fields(value.get("DataInfo")), **value}.items()}
+        unit, name = _text(said.get("unit")) or _text(said.get("units")), _text(said.get("name"))
+        for key, one in value.items():
+            if key == "signals":
+                _signals(found, path, one, depth)
+            elif key.casefold() in VALUES:
+                _walk(found, f"{path}/{name or key}", one, depth + 1, unit)
+            else:
+                _walk(found, f"{path}/{key}", one, depth + 1)
+    elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype.kind == "O"):
+        for number, one in enumerate(_each(value), start=1):
+            name = _text(one.get("Name", one.get("name"))) if isinstance(one, dict) else ""
+            _walk(found, f"{path}/{name or number}", one, depth + 1)
+    elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
+        found.left_out.append(f"{path} (an object, which only MATLAB can read: save it as a structure or an array)")
+    elif isinstance(value, np.ndarray):
+        found.add(path, value, unit)
+
+
+def _signals(found: Found, path: str, signals: Any, depth: int) -> None:
+    """Simulink's signals(k): values under their label; values of several dimensions have the time as the last one."""
+    for number, one in enumerate(_each(signals), start=1):
+        if isinstance(one, dict) and "values" in one:
+            values = np.asarray(one["values"])
+            if values.ndim > 2:
+                values = values.reshape(-1, values.shape[-1])
+            label = (
+                _text(one.get("label")) or _text(one.get("title")) or _text(one.get("blockName")) or f"signal_{number}"
+            )
+            found.add(unique(f"{path}/{label.replace('/', '.')}", found.columns), values)
+        else:
+            _walk(found, f"{path}/signals/{number}", one, depth + 1)
+
+
+def _each(value: Any) -> list[Any]:
+    """A structure, or the elements of a list of them."""
+    if isinstance(value, dict):
+        return [value]
+    return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _text(value: Any) -> str:
+    return value.strip() if isinstance(value, str) else ""
+
+
+def _first_line(fault: Exception) -> str:
+    return (str(fault).strip().splitlines() or [type(fault).__name__])[0][:200]

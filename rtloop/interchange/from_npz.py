@@ -1,0 +1,43 @@
+"""numpy's npz: an array a signal, or matrices and records by column; nothing that is pickled."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.interchange.groups import Found, one_of
+from rtloop.interchange.table import Table, UnreadableData
+
+WORKBOOK = "xl/workbook.xml"
+
+
+def read_npz(path: Path, group: str | None = None) -> Table:
+    """The arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
+    found = Found(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        if any(member.filename == WORKBOOK for member in members):
+            raise UnreadableData(f"{path}: an Excel workbook; save its sheet as CSV")
+        for member in members:
+            found.room(member.filename, (-(-member.file_size // 8),))
+        with np.load(path, allow_pickle=False) as arrays:
+            for name in arrays:
+                _add(found, name, arrays)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError) as fault:
+        raise UnreadableData(f"{path}: not an npz file, or damaged ({fault})") from None
+    return one_of(path, found.tables(), group)
+
+
+def _add(found: Found, name: str, arrays: np.lib.npyio.NpzFile) -> None:
+    try:
+        array = arrays[name]
+    except ValueError:
+        found.left_out.append(f"{name} (pickled objects)")
+        return
+    for field in array.dtype.names or ():
+        found.add(f"{name}/{field}", array[field])
+    if not array.dtype.names:
+        found.add(name, array)

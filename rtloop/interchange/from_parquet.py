@@ -1,0 +1,49 @@
+"""Parquet: a column a signal; units from a field's metadata `unit`; a column of times counts from its first one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.errors import MissingExtra
+from rtloop.interchange.groups import Found, one_of
+from rtloop.interchange.table import Table, UnreadableData
+
+
+def read_parquet(path: Path) -> Table:
+    """All columns of numbers and times. Raises UnreadableData, MissingExtra."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise MissingExtra("Parquet needs pyarrow: pip install 'rtloop[data]'") from None
+    found = Found(path)
+    try:
+        with pyarrow.parquet.ParquetFile(path) as file:
+            schema = file.schema_arrow
+            for field in schema:
+                found.room(field.name, (file.metadata.num_rows,))
+                _add(found, field, file.read(columns=[field.name]).column(0))
+    except (pyarrow.ArrowException, OSError) as fault:
+        raise UnreadableData(f"{path}: not a Parquet file, or damaged ({str(fault).splitlines()[0]})") from None
+    table = one_of(path, found.tables(), None)
+    dated = next((field.name for field in schema if pyarrow.types.is_timestamp(field.type)), None)
+    return replace(table, time=table.time or dated)
+
+
+def _add(found: Found, field: Any, column: Any) -> None:
+    import pyarrow.types as types
+
+    unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+    if types.is_timestamp(field.type):
+        ns = column.cast("timestamp[ns]").cast("int64").to_numpy()
+        found.add(field.name, (ns - ns[:1]) * 1e-9, "s")
+    elif types.is_duration(field.type):
+        found.add(field.name, column.cast("duration[ns]").cast("int64").to_numpy() * 1e-9, "s")
+    elif types.is_floating(field.type) or types.is_integer(field.type) or types.is_boolean(field.type):
+        found.add(field.name, np.asarray(column.to_numpy(), np.float64), unit)
+    else:
+        found.left_out.append(f"{field.name} ({field.type})")

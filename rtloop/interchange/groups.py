@@ -1,0 +1,162 @@
+"""Columns that were sampled together: the rasters of a recorder, the groups of a file, arrays of one length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.interchange.table import ROWS_AT_MOST, Table, UnreadableData
+from rtloop.values import counted
+
+BYTES_AT_MOST = 1 << 30
+"""Of numbers in memory."""
+COLUMNS_AT_MOST = 2000
+MATRIX_COLUMNS = 256
+"""A matrix of more columns is an image, or a map, and no table of signals."""
+TIMES = ("deadline_ns", "time", "t", "zeit", "time_s", "timestamp", "tout", "sim_time", "elapsed", "elapsed time")
+"""What a column of times is called, the likeliest first."""
+SHOWN = 8
+
+
+@dataclass
+class Found:
+    """What is found in a file before it is known what belongs together: columns by path, their units, their time."""
+
+    path: Path
+    columns: dict[str, Real] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+    bytes: int = 0
+
+    def room(self, name: str, shape: tuple[int, ...]) -> None:
+        """Raise UnreadableData where so many more numbers are too many."""
+        rows, size = max(shape, default=1), 8 * int(np.prod(shape, dtype=object))
+        self.bytes += size
+        if rows > ROWS_AT_MOST or self.bytes > BYTES_AT_MOST:
+            raise UnreadableData(
+                f"{self.path}: {name}: the file's numbers take more than {BYTES_AT_MOST >> 30} GiB of memory; cut it "
+                "with the program that wrote it, or write fewer of its signals"
+            )
+
+    def add(self, name: str, values: Any, unit: str | None = None) -> None:
+        """One column, or each column of a matrix; what is neither is left out."""
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiub":
+            if array.size > 1 or array.dtype.kind != "U":
+                self.left_out.append(f"{name} ({_kind(array)})")
+            return
+        array = np.squeeze(array) if array.ndim > 1 else array
+        if array.ndim == 2 and min(array.shape) <= MATRIX_COLUMNS:
+            lying = array.shape[0] < array.shape[1]
+            for number, column in enumerate(array if lying else array.T, start=1):
+                self.add(f"{name}_{number}", column, unit)
+        elif array.ndim != 1 or array.size < 2:
+            if array.size > 1:
+                self.left_out.append(f"{name} ({'×'.join(map(str, array.shape))})")
+        elif len(self.columns) == COLUMNS_AT_MOST:
+            raise UnreadableData(f"{self.path}: more than {COLUMNS_AT_MOST} columns")
+        else:
+            name = unique(name, self.columns)
+            self.columns[name] = np.ascontiguousarray(array, np.float64)
+            if unit:
+                self.units[name] = unit
+
+    def tables(self) -> dict[str, Table]:
+        """What was sampled together: columns of one length, beside the time that stands nearest to them."""
+        times = [name for name in self.columns if _last(name).casefold() in TIMES]
+        times.sort(key=lambda name: TIMES.index(_last(name).casefold()))
+        members: dict[tuple[int, str | None], list[str]] = {}
+        for name, values in self.columns.items():
+            near = [time for time in times if self.columns[time].size == values.size]
+            best = max(near, key=lambda time: _common(time, name), default=None)
+            members.setdefault((values.size, best), []).append(name)
+        about = {"left out": ", ".join(self.left_out[:SHOWN])} if self.left_out else {}
+        tables: dict[str, Table] = {}
+        for (rows, time), names in members.items():
+            begin = len(_shared(names))
+            short = {name: name[begin:] for name in names}
+            group = _shared(names).strip("/") or _parent(time or "") or counted(rows, "row")
+            tables[unique(group, tables)] = Table(
+                {short[name]: self.columns[name] for name in names},
+                {short[name]: self.units[name] for name in names if name in self.units},
+                None if time is None else short[time],
+                about,
+            )
+        return tables
+
+
+def one_of(path: Path, tables: Mapping[str, Table], group: str | None) -> Table:
+    """The group that is asked for; else the only one, or the longest, and what else there is in its `about`.
+
+    Raises UnreadableData where there is none.
+    """
+    if not tables:
+        raise UnreadableData(f"{path}: holds no column of numbers")
+    if group is not None and group not in tables:
+        raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
+    name = (
+        group
+        if group is not None
+        else max(tables, key=lambda one: (len(tables[one].columns) > 1, rows_of(tables[one])))
+    )
+    others = [
+        f"{other!r} ({counted(rows_of(table), 'row')}, {counted(len(table.columns), 'column')})"
+        for other, table in tables.items()
+        if other != name
+    ]
+    if not others:
+        return tables[name]
+    said = {"group": name, "other groups": ", ".join(others[:SHOWN]) + ", …" * (len(others) > SHOWN)}
+    return replace(tables[name], about={**tables[name].about, **said})
+
+
+def rows_of(table: Table) -> int:
+    """How many samples each column has."""
+    return next((column.size for column in table.columns.values()), 0)
+
+
+def unique(name: str, taken: Iterable[str]) -> str:
+    """The name, or with a number behind it where it is taken."""
+    known = set(taken)
+    found, number = name, 1
+    while found in known:
+        number += 1
+        found = f"{name} ({number})"
+    return found
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+def _parent(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _shared(names: Sequence[str]) -> str:
+    """The folder that all of the paths begin with, with its slash; empty where there is none."""
+    folders = [name.split("/")[:-1] for name in names]
+    same = takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))
+    return "".join(f"{parts[0]}/" for parts in same)
+
+
+def _common(one: str, other: str) -> int:
+    """Parts of the path that two columns share."""
+    same = 0
+    for first, second in zip(one.split("/")[:-1], other.split("/")[:-1], strict=False):
+        if first != second:
+            break
+        same += 1
+    return same
+
+
+def _kind(array: np.ndarray[Any, Any]) -> str:
+    return {"U": "text", "S": "text", "O": "text or cells", "c": "complex", "M": "dates"}.get(
+        array.dtype.kind, "no numbers"
+    )

@@ -1,0 +1,25 @@
+"""Signals that are appended to an HDF5 file block by block, each a dataset of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+CHUNK_TICKS = 1 << 16
+COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+
+
+def begin(place: Any, name: str, *, column: bool = False) -> Any:
+    """An empty dataset of doubles in a group or file; of shape (ticks, 1) with `column`."""
+    shape, most, chunk = ((0, 1), (None, 1), (CHUNK_TICKS, 1)) if column else ((0,), (None,), (CHUNK_TICKS,))
+    return place.create_dataset(name, shape, "<f8", maxshape=most, chunks=chunk, **COMPRESSION)
+
+
+def append(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
+    """Rows (n, datasets) behind what is there."""
+    for dataset, values in zip(datasets, rows.T, strict=True):
+        there = dataset.shape[0]
+        dataset.resize(there + len(values), axis=0)
+        dataset[there:] = values.reshape(-1, *dataset.shape[1:])

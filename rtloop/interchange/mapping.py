@@ -1,0 +1,164 @@
+"""Which column of a file becomes which signal, and what it is multiplied by on the way.
+
+    x_drive_v = "Piezo Out [mV] * 20"                 column, its unit, an amplifier's gain
+    x_position_um = "Sensor [V] * 2.5 µm/V - 3 µm"    a sensor's sensitivity, and an offset of the signal
+
+A column is found by its name, with or without its unit, in any case, or by the end of its path. A unit in brackets
+goes before what the file says of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from fractions import Fraction
+from pathlib import Path
+from typing import NamedTuple
+from unicodedata import normalize
+
+from rtloop.hil.modal import Real
+from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scaled
+from rtloop.recording.load import unit_of
+from rtloop.signals import COMMON, DRIVE, PER_AXIS
+
+FIRST_AXIS = "x"
+ALIKE = 3
+"""Columns that are named where one is not found."""
+LONGEST_NAME = 90
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_SOURCE = re.compile(
+    r"(?P<column>.+?)(?:\s*\[(?P<unit>[^\[\]]*)\])?"
+    rf"(?:\s+\*\s*(?P<factor>{_NUMBER})(?:\s*(?P<by>[^\s\d]\S*))?)?"
+    rf"(?:\s+(?P<sign>[-+])\s*(?P<offset>{_NUMBER})(?:\s*(?P<of>[^\s\d]\S*))?)?\s*"
+)
+_BRACKETED = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\)|\s(?:/|in)\s+(\S+))")
+_SUFFIX = re.compile(r".*[^_]_([A-Za-zµ]+)")
+_PREFIX_OF_TAKEN = "file_"
+
+
+class Column(NamedTuple):
+    """A column of a file as a signal: times `factor`, plus `offset`, is in `unit`; `said` is the mapping in words."""
+
+    name: str
+    factor: Fraction
+    offset: float
+    unit: str
+    said: str
+    assumed: str | None
+    """What had to be assumed of its unit."""
+
+    def values(self, table: Table) -> Real:
+        """The signal, (rows,)."""
+        found = scaled(table.columns[self.name], self.factor)
+        return found + self.offset if self.offset else found
+
+
+def column_of(table: Table, path: Path, signal: str, source: str) -> Column:
+    """What `signal` is made of, by the words of a mapping. Raises UnreadableData."""
+    parts = {} if source in table.columns else _parts(source)
+    name = find_column(table, path, parts.get("column") or source)
+    by, target = parts.get("by") or "", unit_of(signal)
+    in_file = unit_in(table, name)
+    known = parts.get("unit") or in_file
+    unit = known or (by.partition("/")[2] if by else target)
+    try:
+        factor = factor_between(unit, target, by) if target else Fraction(1)
+        factor *= Fraction(parts.get("factor") or 1)
+        offset = float(parts.get("offset") or 0) * (-1 if parts.get("sign") == "-" else 1)
+        offset *= float(factor_between(parts.get("of") or target, target))
+    except UnknownUnit as fault:
+        raise UnreadableData(
+            f"{path}: {signal}: column {name!r}: {fault}; its unit stands in brackets, a factor behind a star: "
+            f'"{bare(name)} [V] * 2.5 µm/V"'
+        ) from None
+    assumed = None
+    if target and not known:
+        assumed = f"{signal}: no unit is known of {name!r}; it is taken for {unit}"
+    elif in_file and in_file != known:
+        assumed = f"{signal}: the file says that {name!r} is in {in_file}; it is taken for {unit}"
+    return Column(name, factor, offset, target or known or "", _said(name, unit, parts), assumed)
+
+
+def _parts(source: str) -> dict[str, str | None]:
+    found = _SOURCE.fullmatch(source)
+    return found.groupdict() if found else {}
+
+
+def _said(name: str, unit: str, parts: dict[str, str | None]) -> str:
+    said = f"{bare(name)} [{unit}]" if unit else name
+    if parts.get("factor"):
+        said += f" * {parts['factor']} {parts.get('by') or ''}".rstrip()
+    if parts.get("offset"):
+        said += f" {parts['sign']} {parts['offset']} {parts.get('of') or ''}".rstrip()
+    return said
+
+
+def find_column(table: Table, path: Path, asked: str) -> str:
+    """The column of the file that is meant. Raises UnreadableData where none is, or several."""
+    if asked in table.columns:
+        return asked
+    rules = (lambda name: _plain(name) == _plain(asked), lambda name: _slashed(name).endswith("/" + _slashed(asked)))
+    for rule in rules:
+        found = [name for name in table.columns if rule(name)]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise UnreadableData(f"{path}: column {asked!r}: several are called so: {_listed(found)}")
+    alike = difflib.get_close_matches(asked, list(table.columns), ALIKE, 0.4) or list(table.columns)[: 4 * ALIKE]
+    left_out = f" (left out: {table.about['left out']})" if "left out" in table.about else ""
+    raise UnreadableData(f"{path}: no column {asked!r}; there are {_listed(alike)}{left_out}")
+
+
+def unit_in(table: Table, name: str) -> str | None:
+    """The unit of a column as the file says it: beside its name, within it, or as the end of it."""
+    if table.units.get(name):
+        return table.units[name]
+    if unit := _split(name)[1]:
+        return unit
+    suffix = _SUFFIX.fullmatch(name)
+    return suffix[1] if suffix and is_unit(suffix[1]) else None
+
+
+def bare(name: str) -> str:
+    """A column's name without the unit in it."""
+    return _split(name)[0]
+
+
+def signal_name(text: str) -> str:
+    """A signal's whole name: that of the first axis, where an axis is not named."""
+    return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in PER_AXIS} else text
+
+
+def own_name(column: str) -> str:
+    """What a column is called in a recording where nobody says it otherwise."""
+    plain = normalize("NFKD", bare(column).replace("µ", "u").replace("ß", "ss")).encode("ascii", "ignore").decode()
+    words = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[-LONGEST_NAME:].strip("_")
+    name = words if words[:1].isalpha() else f"column_{words}"
+    return _PREFIX_OF_TAKEN + name if name in {signal.name for signal in COMMON} else name
+
+
+def axes_of(signals: list[str]) -> list[str]:
+    """The axes that the names of signals speak of, in their order; `x_true_position_um` is of x where there is an x."""
+    found = [name.removesuffix(f"_{one.name}") for name in signals for one in PER_AXIS if name.endswith(f"_{one.name}")]
+    axes = list(dict.fromkeys(found))
+    driven = {axis for axis in axes if f"{axis}_{PER_AXIS[DRIVE].name}" in signals}
+    return [axis for axis in axes if axis in driven or not any(axis.startswith(f"{other}_") for other in axes)]
+
+
+def _split(name: str) -> tuple[str, str | None]:
+    found = _BRACKETED.fullmatch(name.strip())
+    unit = next(filter(None, found.groups()[1:]), "") if found else ""
+    return (found[1], unit) if found and is_unit(unit) else (name, None)
+
+
+def _plain(name: str) -> str:
+    return bare(name).strip(" \"'").casefold()
+
+
+def _slashed(name: str) -> str:
+    return re.sub(r"[\\./]+", "/", _plain(name).replace('"', "").strip("/"))
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(map(repr, names))

@@ -1,0 +1,41 @@
+"""A file of another program, read by whatever it turns out to be: by its first bytes, not by its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rtloop.interchange.from_csv import read_csv
+from rtloop.interchange.from_hdf5 import read_hdf5
+from rtloop.interchange.from_mat import HDF5_AT, HDF5_MAGIC, read_mat
+from rtloop.interchange.from_npz import read_npz
+from rtloop.interchange.from_parquet import read_parquet
+from rtloop.interchange.table import Table, UnreadableData
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+
+
+def read_here(path: Path, group: str | None = None) -> Table:
+    """The columns of a file; `group` says which ones, where it has several rasters, groups or topics.
+
+    A library may let anything through of a damaged file, or crash: `aside.read_table` does not.
+
+    Raises UnreadableData, MissingExtra.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(HDF5_AT + len(HDF5_MAGIC))
+    except OSError as error:
+        raise UnreadableData(f"{path}: {error.strerror}") from None
+    if head.startswith(MCAP_MAGIC):
+        from rtloop.interchange.from_mcap import read_mcap  # pyright: ignore[reportMissingImports]
+
+        return read_mcap(path, group)
+    if head.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
+        return read_mat(path, group)
+    if head.startswith(HDF5_MAGIC):
+        return read_hdf5(path, group)
+    if head.startswith(b"PK\x03\x04"):
+        return read_npz(path, group)
+    if head.startswith(b"PAR1"):
+        return read_parquet(path)
+    return read_csv(path)

@@ -1,0 +1,148 @@
+"""When the samples of a table were taken: its column of times, in ns, the rate, and what is odd about them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.interchange.groups import TIMES, rows_of
+from rtloop.interchange.mapping import bare, column_of, unit_in
+from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.units import UnknownUnit, factor_between, scaled
+from rtloop.recording.file.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
+from rtloop.recording.file.ticks import LARGEST
+from rtloop.signals import COMMON, DEADLINE, TICK
+from rtloop.values import counted
+
+JITTER = 1e-3
+"""Part of a period by which samples may be early or late before it is told."""
+ROUNDED_NS = 1.5
+"""What rounding to whole ns makes of an even time."""
+MISSING = 1.5
+"""Periods between two samples from which on some are missing between them."""
+
+
+OWN = (COMMON[TICK].name, COMMON[DEADLINE].name)
+"""A file with both came from a recording, and its columns are taken as they are."""
+
+
+class Sampling(NamedTuple):
+    """Deadlines (rows,) in whole ns that grow, the rate, where they are from, and what is to be told of them."""
+
+    deadline_ns: Real
+    rate_hz: float
+    said: str
+    notes: list[str]
+
+
+def sampling(table: Table, path: Path, time: str | None, rate_hz: float | None) -> Sampling:
+    """The times by `rate_hz`, or else by the column `time` (words of a mapping), or the one that is called so.
+
+    Raises UnreadableData where there is no time, or one that does not grow.
+    """
+    if rate_hz is not None:
+        deadlines = np.rint(np.arange(rows_of(table)) * (1e9 / rate_hz))
+        return Sampling(deadlines, rate_hz, f"by the rate of {rate_hz:g} Hz that was given", [])
+    if time is None and (time := time_column(table)) is None:
+        raise UnreadableData(
+            f"{path}: no column is known to be its time; --time COLUMN says which one is, or --rate HZ what to count by"
+        )
+    column = column_of(table, path, "", time)
+    if table.columns[column.name].size < 2:
+        raise UnreadableData(f"{path}: fewer than two samples; --rate HZ says their rate")
+    unit, notes = unit_of_time(table, column.name, time, column.said), []
+    if unit is None:
+        unit, notes = "s", [f"no unit is known of the time {column.name!r}; it is taken for s"]
+    deadlines, more = _in_ns(path, column.name, table.columns[column.name], unit)
+    period_ns, odd = _regularity(deadlines)
+    found_hz = _rate_hz(deadlines, period_ns)
+    if not LOWEST_RATE_HZ <= found_hz <= HIGHEST_RATE_HZ:
+        raise UnreadableData(
+            f"{path}: {found_hz:g} Hz by the time {column.name!r} in {unit}; {LOWEST_RATE_HZ:g} to {HIGHEST_RATE_HZ:g} "
+            f"Hz are possible: --time '{bare(column.name)} [ms]' says another unit, --rate HZ the rate"
+        )
+    return Sampling(deadlines, found_hz, f"{bare(column.name)} [{unit}]", [*notes, *more, *odd])
+
+
+def came_from_a_recording(table: Table) -> bool:
+    """Whether a table has the ticks and deadlines of one: then no mapping is needed."""
+    return set(OWN) <= table.columns.keys()
+
+
+def time_column(table: Table) -> str | None:
+    """The deadlines of a recording; the column that the file calls its time, or that is called so in any file."""
+    if came_from_a_recording(table):
+        return OWN[1]
+    called = [name for name in table.columns if bare(name).rpartition("/")[2].strip(" \"'").casefold() in TIMES]
+    return table.time or next(iter(called), None) or _unnamed_time(table)
+
+
+def _unnamed_time(table: Table) -> str | None:
+    """The first of columns without names, or row of Simulink's To File, where it grows evenly."""
+    name, times = next(iter(table.columns.items()))
+    steps = np.diff(times)
+    even = steps.size > 1 and steps.min() > 0 and steps.max() < MISSING * steps.min()
+    return name if name.endswith("_1") and len(table.columns) > 1 and even else None
+
+
+def unit_of_time(table: Table, name: str, asked: str, said: str) -> str | None:
+    """What times are counted in, by the mapping, else by the file."""
+    given = said.rpartition("[")[2].rstrip("]") if asked != name and said.endswith("]") else None
+    return given or unit_in(table, name)
+
+
+def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
+    """Whole ns since the start that the file counts from, or since the first sample where that is long ago."""
+    if not np.all(np.isfinite(times)):
+        raise UnreadableData(f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} holds no number")
+    try:
+        factor = factor_between(unit, "s") * 10**9
+    except UnknownUnit as fault:
+        raise UnreadableData(f"{path}: time {name!r}: {fault}") from None
+    notes = []
+    if times.min() < 0 or times.max() * float(factor) > LARGEST:
+        notes = [f"the time begins at {times[0]:g} {unit} in the file; it is counted from there"]
+        times = times - times[0]
+    deadlines = np.rint(scaled(times, factor))
+    growing = np.diff(deadlines) > 0
+    if not growing.all():
+        row = int(np.argmin(growing))
+        raise UnreadableData(
+            f"{path}: time {name!r}: does not grow: {times[row + 1]:g} {unit} in row {row + 2} after {times[row]:g}; "
+            "--time COLUMN names another, --rate HZ counts instead"
+        )
+    if deadlines[-1] > LARGEST:
+        raise UnreadableData(
+            f"{path}: time {name!r}: spans {np.ptp(times):g} {unit}; at most {LARGEST * 1e-9:.2g} s are possible"
+        )
+    return deadlines, notes
+
+
+def _rate_hz(deadlines: Real, period_ns: float) -> float:
+    """By the mean period where it is even, else by the usual one."""
+    even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
+    period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if even else period_ns
+    return float(f"{1e9 / period_ns:.9g}")
+
+
+def _regularity(deadlines: Real) -> tuple[float, list[str]]:
+    """The usual period in ns, and in words what jitters and what is missing."""
+    intervals = np.diff(deadlines)
+    period, notes = float(np.median(intervals)), []
+    near = intervals[intervals < MISSING * period]
+    off = np.abs(near - period)
+    if off.size and off.max() > max(JITTER * period, ROUNDED_NS):
+        rms = float(np.sqrt(np.mean(off**2)))
+        notes.append(
+            f"sample times jitter: by {rms / 1e3:.3g} µs rms, {off.max() / 1e3:.3g} µs at most, about a period of "
+            f"{period / 1e3:.6g} µs; they are kept as they are"
+        )
+    wide = np.flatnonzero(intervals >= MISSING * period)
+    if wide.size:
+        samples = int(np.sum(np.rint(intervals[wide] / period) - 1))
+        where = f"first behind {deadlines[wide[0]] * 1e-9:.6g} s"
+        notes.append(f"about {counted(samples, 'sample')} missing, in {counted(wide.size, 'place')}, {where}")
+    return period, notes

@@ -1,0 +1,116 @@
+"""Units as files write them, and the exact factor from one to another.
+
+A unit is a product of powers: `V`, `mV`, `µm/V`, `V·µm/V`, `1/s`, `m/s²`. Its scale is a fraction, so that a conversion
+by a power of ten rounds once.
+"""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from typing import NamedTuple
+
+from rtloop.hil.modal import Real
+
+PREFIXES = {
+    "": 0, "f": -15, "p": -12, "n": -9, "µ": -6, "u": -6, "m": -3, "c": -2, "d": -1, "k": 3, "M": 6, "G": 9,
+}  # fmt: skip
+"""Powers of ten."""
+BASES = {"m": "m", "V": "V", "s": "s", "A": "A", "N": "N", "g": "g", "K": "K", "Pa": "Pa", "Ohm": "Ohm", "Hz": "1/s"}
+"""Symbols that take a prefix."""
+NAMED = {
+    "volt": "V", "volts": "V", "millivolt": "mV", "millivolts": "mV", "meter": "m", "meters": "m", "metre": "m",
+    "metres": "m", "micrometer": "µm", "micrometers": "µm", "micrometre": "µm", "micron": "µm", "microns": "µm",
+    "nanometer": "nm", "nanometers": "nm", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s",
+    "sekunden": "s", "msec": "ms", "usec": "µs", "millisecond": "ms", "milliseconds": "ms", "microseconds": "µs",
+    "hertz": "Hz", "hr": "h", "ampere": "A", "newton": "N", "angstrom": "Å", "count": "counts",
+}  # fmt: skip
+OTHERS = {
+    "Å": (Fraction(1, 10**10), "m"), "min": (Fraction(60), "s"), "h": (Fraction(3600), "s"),
+    "%": (Fraction(1, 100), ""),
+    "1": (Fraction(1), ""), "-": (Fraction(1), ""), "": (Fraction(1), ""), "°C": (Fraction(1), "degC"),
+    "degC": (Fraction(1), "degC"), "rad": (Fraction(1), "rad"), "deg": (Fraction(1), "deg"), "°": (Fraction(1), "deg"),
+    "counts": (Fraction(1), "counts"), "LSB": (Fraction(1), "counts"),
+}  # fmt: skip
+_POWER = re.compile(r"(.*?[^\d^])\^?([-+]?\d)?$")
+_SUPERSCRIPT = str.maketrans("⁻⁰¹²³⁴", "-01234")
+_SAME = str.maketrans({"μ": "µ", "Ω": "Ohm", "⋅": "·", "*": "·"})
+
+
+class UnknownUnit(ValueError):
+    """A unit that is not understood, or two of different kinds."""
+
+
+Powers = tuple[tuple[str, int], ...]
+"""Symbols without a prefix, in order, and their exponents."""
+
+
+class Unit(NamedTuple):
+    """`scale` times the product of the `powers`."""
+
+    scale: Fraction
+    powers: Powers
+
+
+def parsed(text: str) -> Unit:
+    """What a unit means. Raises UnknownUnit."""
+    scale, powers = Fraction(1), Powers()
+    for place, part in enumerate(text.strip().translate(_SAME).split("/")):
+        sign = 1 if place == 0 else -1
+        for factor in part.strip().split("·"):
+            one, more = _factor(factor.strip(), text)
+            scale *= one**sign
+            powers = _product(powers, tuple((symbol, sign * exponent) for symbol, exponent in more))
+    return Unit(scale, powers)
+
+
+def factor_between(source: str, target: str, by: str = "") -> Fraction:
+    """What values in `source`, times one `by`, are to be multiplied by to be in `target`. Raises UnknownUnit."""
+    before, between, behind = parsed(source), parsed(by), parsed(target)
+    if _product(before.powers, between.powers) != behind.powers:
+        raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} is no {target or '1'}")
+    return before.scale * between.scale / behind.scale
+
+
+def is_unit(text: str) -> bool:
+    """Whether this is a unit that is understood; a number alone is taken for none."""
+    try:
+        parsed(text)
+    except UnknownUnit:
+        return False
+    return bool(re.search(r"[^\W\d_]|[%°]", text))
+
+
+def scaled(values: Real, factor: Fraction) -> Real:
+    """The values times the factor, rounded once where it is a whole number or one over one."""
+    if factor == 1:
+        return values
+    if abs(factor) < 1 and abs(factor.numerator) == 1:
+        return values / float(1 / factor)
+    return values * float(factor)
+
+
+def _product(one: Powers, other: Powers) -> Powers:
+    exponents = dict(one)
+    for symbol, exponent in other:
+        exponents[symbol] = exponents.get(symbol, 0) + exponent
+    return tuple(sorted((symbol, exponent) for symbol, exponent in exponents.items() if exponent))
+
+
+def _factor(text: str, whole: str) -> Unit:
+    """One of the factors of a unit, with its exponent."""
+    if text in OTHERS:
+        scale, symbol = OTHERS[text]
+        return Unit(scale, ((symbol, 1),) if symbol else ())
+    found = _POWER.fullmatch(text.translate(_SUPERSCRIPT))
+    name, exponent = (found[1], int(found[2] or 1)) if found else (text, 1)
+    name = NAMED.get(name, NAMED.get(name.lower(), name))
+    if name in OTHERS and name:
+        scale, symbol = OTHERS[name]
+        return Unit(scale**exponent, ((symbol, exponent),))
+    for base, meaning in BASES.items():
+        prefix = name.removesuffix(base)
+        if name.endswith(base) and prefix in PREFIXES:
+            symbol, sign = ("s", -1) if meaning == "1/s" else (meaning, 1)
+            return Unit((Fraction(10) ** PREFIXES[prefix]) ** exponent, ((symbol, sign * exponent),))
+    raise UnknownUnit(f"unit {whole!r} is not known; such as V, mV, µm, nm, m, s, ms, Hz, µm/V are")

@@ -1,0 +1,55 @@
+"""Which signals and ticks of a recording are meant: by name, by time, every so many."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.reader import Rows
+from rtloop.recording.load import Recording
+from rtloop.signals import COMMON, DEADLINE, TICK
+
+ALWAYS = (COMMON[TICK].name, COMMON[DEADLINE].name)
+"""Without them nobody knows which ticks a file holds."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """`signals` are names or patterns such as `x_*`, all by default; times in s since the start; `every` nth tick."""
+
+    signals: tuple[str, ...] = ()
+    start_s: float = 0.0
+    end_s: float = math.inf
+    every: int = 1
+
+    def names(self, recording: Recording) -> tuple[str, ...]:
+        """The signals that are meant, in the recording's order, with ALWAYS. Raises RecordingError for one unknown."""
+        if not self.signals:
+            return recording.columns
+        for pattern in self.signals:
+            if not any(fnmatchcase(name, pattern) for name in recording.columns):
+                there = ", ".join(recording.columns)
+                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; there are {there}")
+        meant = (*ALWAYS, *self.signals)
+        return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in meant))
+
+    def blocks(self, recording: Recording, names: Sequence[str]) -> Generator[Rows]:
+        """Arrays (n, names) of the ticks that are meant. Raises RecordingError where a stretch holds none."""
+        whole = self.start_s <= 0.0 and math.isinf(self.end_s)
+        asked = ["tick", *names]
+        found, first = False, 0.0
+        for rows in recording.blocks(asked) if whole else recording.between(asked, self.start_s, self.end_s):
+            if not found and len(rows):
+                found, first = True, rows[0, 0]
+            kept = rows if self.every == 1 else rows[(rows[:, 0] - first) % self.every == 0]
+            if len(kept):
+                yield kept[:, 1:]
+        if not found and not whole:
+            until = "" if math.isinf(self.end_s) else f" until {self.end_s:g} s"
+            raise RecordingError(f"{recording.paths[0]}: holds no tick from {self.start_s:g} s on{until}")
+
+
+ALL = Selection()

@@ -1,0 +1,104 @@
+"""Tables in text as programs write them: every number is found, exactly, and what is none is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.interchange.from_csv import read_csv
+from rtloop.interchange.table import UnreadableData
+
+TIME = np.arange(300) * 1e-4
+VOLTS = np.sin(2 * np.pi * 50 * TIME)
+
+
+def rows(delimiter: str, decimal: str = ".") -> str:
+    lines = (f"{t!r}{delimiter}{v!r}" for t, v in zip(TIME.tolist(), VOLTS.tolist(), strict=True))
+    return "\n".join(lines).replace(".", decimal) + "\n"
+
+
+def german() -> bytes:
+    body = rows(";", ",").replace("\n", ";gut\r\n")
+    return ("\ufeffZeit;Piezo Out;Bemerkung\r\ns;V;\r\n" + body).encode()
+
+
+WORDS = f"Messung für März\r\n\r\nZeit [s];Größe [V]\r\n{rows(';', ',')}"
+SCOPE = f"Time,Channel A\n(s),(V)\n\n{rows(',')}"
+WRITTEN = {
+    "excel of a German": (german(), ["Zeit", "Piezo Out"], {"Zeit": "s", "Piezo Out": "V"}),
+    "words above, cp1252": (WORDS.encode("cp1252"), ["Zeit [s]", "Größe [V]"], {}),
+    "a scope": (SCOPE.encode(), ["Time", "Channel A"], {"Time": "s", "Channel A": "V"}),
+    "tabs behind a comment": (f"% of MATLAB\n% t\tu\n{rows(chr(9))}".encode(), ["t", "u"], {}),
+    "no names": (rows("  ").encode(), ["column_1", "column_2"], {}),
+    "UTF-16": (f"t,u\n{rows(',')}".encode("utf-16"), ["t", "u"], {}),
+    "quotes": (f'"t","u, filtered"\n{rows(",")}'.encode(), ["t", "u, filtered"], {}),
+    "a timetable of MATLAB": (f"Time,u\n{rows(' sec,')}".encode(), ["Time", "u"], {"Time": "sec"}),
+    "a delimiter at the end": (f"t;u\n{rows(';')}".replace("\n", ";\n").encode(), ["t", "u"], {}),
+}
+
+
+@pytest.mark.parametrize("case", WRITTEN)
+def test_every_manner_of_writing_is_read_exactly(case: str, tmp_path: Path):
+    content, names, units = WRITTEN[case]
+    (tmp_path / "scan.csv").write_bytes(content)
+    table = read_csv(tmp_path / "scan.csv")
+    assert list(table.columns) == names
+    assert [column.tobytes() for column in table.columns.values()] == [TIME.tobytes(), VOLTS.tobytes()]
+    assert table.units == units
+
+
+def test_what_was_found_out_is_shown(tmp_path: Path):
+    (tmp_path / "scan.csv").write_bytes(german())
+    about = read_csv(tmp_path / "scan.csv").about
+    assert about["table"] == "columns divided by ';', decimal ',', utf-8, numbers from line 3 on"
+    assert about["left out"] == "Bemerkung (text)"
+
+
+def test_a_decimal_comma_that_comes_late(tmp_path: Path):
+    at_rest = "".join(f"{k};0\n" for k in range(20_000))
+    (tmp_path / "scan.csv").write_text("t;u\n" + at_rest + "".join(f"{k};0,5\n" for k in range(20_000, 40_000)))
+    assert read_csv(tmp_path / "scan.csv").columns["u"].tolist() == [0.0] * 20_000 + [0.5] * 20_000
+
+
+def test_what_is_missing_is_no_number(tmp_path: Path):
+    (tmp_path / "scan.csv").write_text("t,u\n0,nan\n1,\n2,inf\n3,-inf\n4,1e-300\n5,NULL\n")
+    found = read_csv(tmp_path / "scan.csv").columns["u"]
+    assert np.array_equal(found, [np.nan, np.nan, np.inf, -np.inf, 1e-300, np.nan], equal_nan=True)
+
+
+def test_dates_are_times(tmp_path: Path):
+    (tmp_path / "scan.csv").write_text("".join(f"2024-03-01 23:59:59.{k:03d},{k}\n" for k in range(100)))
+    table = read_csv(tmp_path / "scan.csv")
+    assert table.time == "column_1"
+    assert np.allclose(table.columns["column_1"], np.arange(100) * 1e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty"),
+        ("hello\nworld\n", "holds no table"),
+        ("t,u\n", "holds no table"),
+        (
+            "t,u\n" + "0,1\n" * 200 + "0,on\n" + "0,1\n" * 200,
+            r"column 'u': 'on' is no number \(row 201 .* about line 202\)",
+        ),
+        ("t;u\n" + "0;1,5\n" * 200 + "0;1.234,5\n", r"column 'u': '1.234,5' is no number .* line 202"),
+        ("t,u\n" + "0,1\n" * 200 + "0,1,2\n", "Expected 2 fields in line 202, saw 3"),
+        ("2024-03-01 23:59:59,1\n" * 200 + "yesterday,1\n", "line 201 holds no date"),
+        ("t,u\n" + "0,1\n" * 100 + "\0" * 100, "no text"),
+    ],
+)
+def test_what_is_no_table_says_where(text: str, message: str, tmp_path: Path):
+    (tmp_path / "scan.csv").write_text(text)
+    with pytest.raises(UnreadableData, match=message):
+        read_csv(tmp_path / "scan.csv")
+
+
+def test_a_hole_beyond_what_was_looked_at_first(tmp_path: Path):
+    with (tmp_path / "scan.csv").open("wb") as file:
+        file.write(b"t,u\n" + b"0,1\n1,2\n" * 40_000 + bytes(100_000) + b"0,1\n1,2\n" * 120_000)
+    with pytest.raises(UnreadableData, match="holds zeros, which are no text"):
+        read_csv(tmp_path / "scan.csv")

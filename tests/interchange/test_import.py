@@ -1,0 +1,204 @@
+"""`rtloop import` as a laboratory meets it: what is shown, what is told, and what a recording of it is good for."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from scipy.io import loadmat, savemat
+
+from rtloop.cli import main
+from rtloop.interchange import aside
+from rtloop.interchange.reading import read_here
+from rtloop.recording.load import load
+from tests.interchange.controldesk import read_v5, write_controldesk
+
+DOCUMENT = Path(__file__).parents[2] / "docs/data.md"
+COUNT = 3000
+TIME = np.arange(COUNT) * 1e-4
+VOLTS = np.sin(2 * np.pi * 50 * TIME)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the commands run; files are read in this process, to be quick."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("rtloop.commands.importing.read_table", read_here)
+    return tmp_path
+
+
+def run(*arguments: Any) -> Result:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def answer(*arguments: Any, code: int = 0) -> dict[str, Any]:
+    result = run(*arguments, "--json")
+    assert result.exit_code == code, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def scan(folder: Path) -> Path:
+    """Drive in mV, position in nm."""
+    savemat(folder / "scan.mat", {"t": TIME, "drive_mV": 1e3 * VOLTS, "pos_nm": 500 * VOLTS, "T": VOLTS + 21})
+    return folder / "scan.mat"
+
+
+def test_without_a_mapping_it_shows_what_is_there_and_how_to_map_it(scan: Path):
+    result = run("import", scan)
+    assert result.exit_code == 2
+    assert "3,000 rows, 10000 Hz by t [s]" in result.stdout
+    assert re.search(r"^drive_mV +mV +-1000 +1000$", result.stdout, re.MULTILINE)
+    assert "--map 'x_drive_v=drive_mV [mV]' \\\n    --map 'x_position_um=pos_nm [nm]'" in result.stdout
+    assert not scan.with_suffix(".mcap").exists()
+    report = answer("import", scan, code=2)
+    assert [column["name"] for column in report["columns"]] == ["t", "drive_mV", "pos_nm", "T"]
+
+
+def test_a_recording_of_it_is_one_that_the_other_commands_take(scan: Path, folder: Path):
+    report = answer("import", scan, "--map", "drive_v=drive_mV", "--map", "x_position_um=pos_nm", "--map", "T")
+    assert (report["ticks"], report["rate_hz"], report["time"]) == (COUNT, 10_000.0, "t [s]")
+    assert report["notes"] == ["no unit is known of the time 't'; it is taken for s"]
+    recording = load(folder / "scan.mcap")
+    assert recording.columns == ("tick", "deadline_ns", "x_drive_v", "x_position_um", "T")
+    assert np.array_equal(recording["x_drive_v"], 1e3 * VOLTS / 1e3)
+    assert np.array_equal(recording["x_position_um"], 500 * VOLTS / 1e3)
+    assert np.array_equal(recording["deadline_ns"], np.arange(COUNT) * 100_000.0)
+    assert (recording.header["law"], recording.header["axes"]) == (None, ["x"])
+    assert recording.header["imported"]["mapping"] == {
+        "x_drive_v": "drive_mV [mV]", "x_position_um": "pos_nm [nm]", "T": "T"
+    }  # fmt: skip
+    assert recording.problems == []
+    summary = answer("info", "scan.mcap")
+    assert (summary["ticks_logged"], summary["ticks_lost"], summary["complete"]) == (COUNT, 0, True)
+    assert summary["axes"] == [{"name": "x", "rms_error_um": None, "max_abs_drive_v": pytest.approx(1.0)}]
+    assert [one["name"] for one in summary["ranges"]] == ["x_drive_v", "x_position_um", "T"]
+    assert "from scan.mat" in run("info", "scan.mcap").stdout
+    assert run("plot", "scan.mcap").exit_code == run("plot", "scan.mcap", "--html").exit_code == 0
+    assert answer("cut", "scan.mcap", "--from", 0.1, "--until", 0.2, "--out", "cut.mcap")["ticks"] == 1000
+    assert answer("info", "cut.mcap")["complete"]
+    assert answer("export", "scan.mcap", "--to", "npz")["ticks"] == COUNT
+    assert answer("recover", "scan.mcap", "--out", "again.mcap")["ticks"] == COUNT
+
+
+@pytest.mark.parametrize("options", [[], ["--resimulate"], ["--config", "paper.toml"]])
+def test_a_replay_says_kindly_that_nothing_of_a_law_is_in_it(options: list[str], scan: Path):
+    run("import", scan, "--all")
+    result = run("replay", "scan.mcap", *options)
+    assert result.exit_code == 66
+    assert "holds signals that were imported from scan.mat, and nothing of a law" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_all_columns_under_their_own_names(scan: Path):
+    names = [one["name"] for one in answer("import", scan, "--all", "--map", "x_drive_v=drive_mV")["signals"]]
+    assert names == ["x_drive_v", "pos_nm", "T"]
+    assert load("scan.mcap").units["pos_nm"] == "nm"
+    assert run("plot", "scan.mcap").exit_code == 0
+
+
+def test_times_that_jitter_and_samples_that_are_missing_are_told_and_kept(folder: Path):
+    random = np.random.default_rng(1)
+    times = np.delete(TIME + random.uniform(-5e-6, 5e-6, COUNT) + 1e-5, np.arange(1000, 1004))
+    savemat(folder / "scan.mat", {"time": times, "u": np.delete(VOLTS, np.arange(1000, 1004))})
+    notes = answer("import", "scan.mat", "--map", "x_drive_v=u [V]", "--time", "time [s]")["notes"]
+    found = re.fullmatch(
+        r"sample times jitter: by ([\d.]+) µs rms, ([\d.]+) µs at most, about a period of .*", notes[0]
+    )
+    assert found
+    assert float(found[1]) == pytest.approx(
+        10 / 6**0.5, rel=0.05
+    )  # the difference of two that are spread evenly over 10
+    assert 9 < float(found[2]) <= 10.1
+    assert re.match(r"about 4 samples missing, in 1 place, first behind 0.09", notes[1])
+    recording = load("scan.mcap")
+    assert np.array_equal(recording["deadline_ns"], np.rint(times * 1e9))
+    assert recording.header["imported"]["notes"] == notes
+    assert "jitter" in run("info", "scan.mcap").stdout
+
+
+def test_a_rate_counts_where_the_time_is_not_believed(folder: Path):
+    savemat(folder / "scan.mat", {"time": np.round(TIME, 3), "u": VOLTS})
+    result = run("import", "scan.mat", "--all")
+    assert result.exit_code == 1
+    assert "time 'time': does not grow: 0 s in row 2 after 0" in result.stderr
+    report = answer("import", "scan.mat", "--all", "--rate", 44_100)
+    assert report["rate_hz"] == 44_100
+    assert [one["name"] for one in report["signals"]] == ["u"]
+    assert np.array_equal(load("scan.mcap")["deadline_ns"], np.rint(np.arange(COUNT) / 44_100 * 1e9))
+
+
+def test_a_rate_that_cannot_be_asks_for_the_unit(folder: Path):
+    savemat(folder / "scan.mat", {"time": np.arange(9.0) * 5000, "u": VOLTS[:9]})
+    assert "0.0002 Hz by the time 'time' in s; 0.001 to 1e+06 Hz" in run("import", "scan.mat", "--all").stderr
+
+
+def test_a_time_before_the_start_is_counted_from_its_first_sample(folder: Path):
+    savemat(folder / "scan.mat", {"time_ms": 1e3 * (TIME - 0.05), "u": VOLTS})
+    report = answer("import", "scan.mat", "--map", "x_drive_v=u", "--time", "time_ms")
+    assert (report["rate_hz"], report["time"]) == (10_000.0, "time_ms [ms]")
+    assert "the time begins at -50 ms in the file; it is counted from there" in report["notes"]
+    assert np.array_equal(load("scan.mcap")["deadline_ns"], np.arange(COUNT) * 100_000.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["--map", "x_position_um=drive_mV"], 1, "x_position_um: column 'drive_mV': mV is no µm"),
+        (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; there are "),
+        (["--map", "tick=t"], 1, "tick is made of the time"),
+        (["--map", "mode=T"], 1, "mode: 21; a whole number from 0 to 3 is allowed"),
+        (["--all", "--time", "T"], 1, "time 'T': does not grow"),
+        (["--all", "--time", "t [ns]"], 1, "time 't': does not grow: 0.0001 ns in row 2"),
+        (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm is no s"),
+        (["--all", "--group", "slow"], 1, "no group 'slow'; there are '3,000 rows'"),
+        (["--all", "--mapping", "absent.toml"], 66, "absent.toml: No such file"),
+        (["--all", "--rate", "0"], 2, "0.0 is not in the range"),
+        (["--all", "--rate", "10", "--time", "t"], 2, "one of them is allowed"),
+    ],
+)
+def test_what_cannot_be_done_is_one_message_and_leaves_nothing(options: list[str], code: int, message: str, scan: Path):
+    result = run("import", scan, *options)
+    assert result.exit_code == code
+    assert message in result.stderr
+    assert [file.name for file in scan.parent.iterdir()] == ["scan.mat"]
+
+
+def test_an_output_that_exists_stays_as_it_is(scan: Path, folder: Path):
+    (folder / "scan.mcap").write_bytes(b"precious")
+    result = run("import", scan, "--all")
+    assert result.exit_code == 73
+    assert (folder / "scan.mcap").read_bytes() == b"precious"
+    assert {file.name for file in folder.iterdir()} == {"scan.mat", "scan.mcap"}
+
+
+def test_the_document_does_what_it_says(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    """From dSPACE and back: the commands of docs/data.md, with its mapping, on a file in ControlDesk's layout."""
+    monkeypatch.setattr("rtloop.commands.importing.read_table", aside.read_table)
+    text = DOCUMENT.read_text()
+    (folder / "map.toml").write_text(re.search(r"```toml\n(.*?)```", text, re.DOTALL)[1])  # type: ignore[index]
+    signals = {
+        '"Model Root"/Piezo/Out1': (VOLTS, ""),
+        "Model Root/Sensor/In1": (VOLTS / 5, "V"),
+        "Temperature": (np.full(COUNT, 21.5), "°C"),
+    }
+    write_controldesk(folder / "scan_0412.mat", TIME, signals)
+    commands = [line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    assert len(commands) == 4
+    for command in commands:
+        result = run(*command.removeprefix("rtloop ").split())
+        assert result.exit_code == 0, result.output
+    assert (folder / "scan_0412.png").stat().st_size > 10_000
+    time_s, back, units = read_v5(folder / "scan_back.mat")
+    assert np.allclose(time_s, TIME, rtol=0, atol=1e-12)
+    assert np.array_equal(back["x_drive_v"], 20 * VOLTS)
+    assert np.array_equal(back["x_position_um"], VOLTS / 5 * 2.5 - 3)
+    assert units == {"tick": "1", "deadline_ns": "ns", "x_drive_v": "V", "x_position_um": "µm", "Temperature": "°C"}
+    assert loadmat(folder / "scan_back.mat", simplify_cells=True)["scan_back"]["X"]["Name"] == "Time"

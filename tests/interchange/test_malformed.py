@@ -1,0 +1,123 @@
+"""Files that are damaged, lie, or are much too large: one line that says so, and no memory to speak of."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from scipy.io import savemat
+
+from rtloop.interchange import aside, from_mat
+from rtloop.interchange.reading import read_here
+from rtloop.interchange.table import UnreadableData
+
+HUGE = 2 << 30
+MEMORY_MIB = 400
+"""Of a process that refuses all of these files; the libraries alone take 200."""
+
+
+def sparse(path: Path, head: bytes = b"") -> None:
+    """A file of 2 GiB that takes no room."""
+    with path.open("wb") as file:
+        file.write(head)
+        file.truncate(HUGE)
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> dict[str, str]:
+    """What is to be said, by the name of the file."""
+    savemat(tmp_path / "good.mat", {"t": np.arange(1000.0), "u": np.arange(1000.0)})
+    good = (tmp_path / "good.mat").read_bytes()
+    (tmp_path / "good.mat").unlink()
+    (tmp_path / "cut.mat").write_bytes(good[:5000])
+    (tmp_path / "junk.mat").write_bytes(good[:128] + b"\x07" * 500)
+    (tmp_path / "words.mat").write_bytes(b"hello there")
+    sparse(tmp_path / "zeros.mat")
+    sparse(tmp_path / "hole.mat", good[:128])
+    sparse(tmp_path / "claim.mat", good[:128] + np.array([14, HUGE - 136], "<u4").tobytes())
+    sparse(tmp_path / "zeros.csv")
+    sparse(tmp_path / "hole.csv", b"t,u\n" + b"0,1\n" * 1000)
+    sparse(tmp_path / "zeros.h5", b"\x89HDF\r\n\x1a\n")
+    with h5py.File(tmp_path / "claim.h5", "w") as file:
+        file.create_dataset("x", (1 << 28,), "f8", chunks=(1 << 16,))
+    sparse(tmp_path / "zeros.npz", b"PK\x03\x04")
+    sparse(tmp_path / "zeros.parquet", b"PAR1")
+    (tmp_path / "empty.csv").write_bytes(b"")
+    (tmp_path / "folder.mat").mkdir()
+    return {
+        "cut.mat": "cut off: its element at byte 128 ends behind the file",
+        "junk.mat": "no element of a MAT file stands at byte 128",
+        "words.mat": "not a MAT file",
+        "zeros.mat": "not a MAT file",
+        "hole.mat": "no element of a MAT file stands at byte 128",
+        "claim.mat": "holds more than 1 GiB",
+        "zeros.csv": "no text",
+        "hole.csv": "no text",
+        "zeros.h5": "not an HDF5 file",
+        "claim.h5": "x: the file's numbers take more than 1 GiB",
+        "zeros.npz": "not an npz file",
+        "zeros.parquet": "not a Parquet file",
+        "empty.csv": "empty",
+        "folder.mat": "Is a directory",
+    }
+
+
+def test_each_is_refused_in_a_line_and_in_bounded_memory(bad: dict[str, str], tmp_path: Path):
+    command = [sys.executable, "-W", "error", "-m", __name__, *(str(tmp_path / name) for name in bad)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.stderr == ""
+    *lines, memory = result.stdout.splitlines()
+    assert len(lines) == len(bad)
+    for line, (name, message) in zip(lines, bad.items(), strict=True):
+        assert line.startswith(f"{tmp_path / name}: ")
+        assert message in line
+    assert int(memory) < MEMORY_MIB
+
+
+def test_what_expands_beyond_the_bound_is_not_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    savemat(tmp_path / "scan.mat", {"x": np.zeros(1 << 20)}, do_compression=True)
+    assert (tmp_path / "scan.mat").stat().st_size < 1 << 16
+    assert read_here(tmp_path / "scan.mat").columns["x"].size == 1 << 20
+    monkeypatch.setattr(from_mat, "BYTES_AT_MOST", 1 << 22)
+    monkeypatch.setattr(scipy.io, "loadmat", lambda *_, **__: pytest.fail("it is not to be read"))
+    with pytest.raises(UnreadableData, match="holds more than"):
+        read_here(tmp_path / "scan.mat")
+
+
+def test_a_library_that_crashes_is_an_error_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "sitecustomize.py").write_text("import os\nos.kill(os.getpid(), 11)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(UnreadableData, match=r"scan.mat: damaged: .* \(SIGSEGV\)"):
+        aside.read_table(tmp_path / "scan.mat")
+
+
+def test_a_process_aside_reads_the_same(tmp_path: Path):
+    numbers = np.random.default_rng(3).normal(size=100_000)
+    savemat(tmp_path / "scan.mat", {"t": np.arange(100_000.0), "u": numbers})
+    table, expected = aside.read_table(tmp_path / "scan.mat"), read_here(tmp_path / "scan.mat")
+    assert {name: values.tobytes() for name, values in table.columns.items()} == {
+        name: values.tobytes() for name, values in expected.columns.items()
+    }
+    assert (table.time, dict(table.about)) == (expected.time, dict(expected.about))
+    with pytest.raises(UnreadableData, match="no group 'x'"):
+        aside.read_table(tmp_path / "scan.mat", "x")
+
+
+def main() -> None:
+    """Say what is wrong with each file, and then the memory that this process had at most, in MiB."""
+    for name in sys.argv[1:]:
+        try:
+            read_here(Path(name))
+        except UnreadableData as fault:
+            print(str(fault).replace("\n", "⏎"))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)
+
+
+if __name__ == "__main__":
+    main()

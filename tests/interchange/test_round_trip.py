@@ -1,0 +1,144 @@
+"""What is exported is exact: read by libraries that know nothing of rtloop, and by the import, byte for byte."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from rtloop.errors import RtloopError
+from rtloop.interchange import to_mat
+from rtloop.interchange.export import FORMATS, export
+from rtloop.interchange.importing import import_data
+from rtloop.interchange.reading import read_here
+from rtloop.interchange.wanted import Wanted
+from rtloop.recording.load import Recording, load
+from rtloop.recording.views.selection import Selection
+from rtloop.recording.views.summary import summarise
+from tests.interchange.controldesk import read_v5, read_v73
+from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
+
+COUNT = 4_000
+ODD = (-0.0, 5e-324, -np.inf, 1.7976931348623157e308, 1 / 3, np.nan)
+EVERY_KIND = [(to, 1 << 29) for to in FORMATS] + [("mat", 0)]
+"""Formats, and up to how many bytes a MAT file is of version 5."""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """In virtual time, so that what was not measured is NaN."""
+    rows = make_rows(COUNT, paced=False)
+    rows[100 : 100 + len(ODD), COLUMNS.index("x_error_um")] = ODD
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    return load(write_recording(path, rows, paced=False))
+
+
+def exported(recording: Recording, to: str, folder: Path, selection: Selection | None = None) -> Path:
+    return Path(export(recording.paths[0], to, folder / f"back{FORMATS[to]}", None, selection or Selection())["output"])
+
+
+def imported(path: Path) -> Recording:
+    report = import_data(path, Wanted(), path.with_suffix(".mcap"), table=read_here(path))
+    return load(report["output"])
+
+
+@pytest.mark.parametrize(("to", "v5_bytes"), EVERY_KIND)
+def test_import_of_export_is_the_recording(
+    to: str, v5_bytes: int, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(to_mat, "LARGEST_V5_BYTES", v5_bytes)
+    back = imported(exported(recording, to, tmp_path))
+    assert set(back) == set(recording)
+    assert [name for name in recording if back[name].tobytes() != recording[name].tobytes()] == []
+    assert back.problems == []
+    assert (back.header["rate_hz"], back.header["axes"]) == (10_000.0, ["x"])
+    assert back.units == recording.units
+
+
+@pytest.mark.parametrize(("v5_bytes", "read"), [(1 << 29, read_v5), (0, read_v73)])
+def test_mat_is_what_a_script_for_controldesk_reads(
+    v5_bytes: int, read, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(to_mat, "LARGEST_V5_BYTES", v5_bytes)
+    time_s, signals, units = read(exported(recording, "mat", tmp_path))
+    assert np.array_equal(time_s, recording.time_s)
+    assert list(signals) == list(COLUMNS)
+    assert [name for name in signals if signals[name].tobytes() != recording[name].tobytes()] == []
+    assert units == recording.units
+
+
+def test_mat_says_where_it_comes_from(recording: Recording, tmp_path: Path):
+    found = loadmat(exported(recording, "mat", tmp_path), simplify_cells=True)["back"]
+    assert found["Description"]["General"] == "test, recorded by rtloop at 10000 Hz"
+    assert json.loads(found["Info"]["Header"])["rate_hz"] == 10_000.0
+    assert json.loads(found["Info"]["Events"]) == recording.events
+
+
+@pytest.mark.parametrize(
+    ("stem", "variable"),
+    [("run", "run"), ("2024-03 scan", "rec_2024_03_scan"), ("ä" * 3, "rec____"), ("a" * 80, "a" * 63)],
+)
+def test_a_variable_is_called_as_its_file_as_far_as_matlab_takes_it(stem: str, variable: str):
+    assert to_mat.variable_of(Path(f"{stem}.mat")) == variable
+
+
+def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):
+    with h5py.File(exported(recording, "hdf5", tmp_path)) as file:
+        assert set(file) == {*COLUMNS, "header_json", "events_json"}
+        assert all(file[name][()].tobytes() == recording[name].tobytes() for name in COLUMNS)
+        assert file["x_drive_v"].attrs["unit"] == "V"
+        assert json.loads(file["events_json"][()]) == recording.events
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_stretch_some_signals_and_every_so_many(to: str, recording: Recording, tmp_path: Path):
+    selection = Selection(("x_*_v", "mode"), 0.1, 0.3, 7)
+    table = read_here(exported(recording, to, tmp_path, selection))
+    kept = slice(1000, 3001, 7)
+    expected = ["tick", "deadline_ns", "mode", "x_adc_v", "x_demand_v", "x_drive_v"]
+    assert sorted(set(table.columns) - {"Time"}) == sorted(expected)
+    assert all(table.columns[name].tobytes() == recording[name][kept].tobytes() for name in expected)
+
+
+def test_what_cannot_be_selected_leaves_no_file(recording: Recording, tmp_path: Path):
+    with pytest.raises(RtloopError, match=r"no signal 'y_\*'; there are tick, deadline_ns, "):
+        exported(recording, "csv", tmp_path, Selection(("y_*",)))
+    for to in FORMATS:
+        with pytest.raises(RtloopError, match="holds no tick from 7 s on until 8 s"):
+            exported(recording, to, tmp_path, Selection((), 7.0, 8.0))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_tenth_tick_comes_back_as_a_slower_recording(recording: Recording, tmp_path: Path):
+    back = imported(exported(recording, "npz", tmp_path, Selection(every=10)))
+    assert back.header["rate_hz"] == 1000.0
+    assert np.array_equal(back["tick"], np.arange(COUNT // 10))
+    assert np.array_equal(back["deadline_ns"], recording["deadline_ns"][::10])
+    assert "they are counted anew" in back.header["imported"]["notes"][-1]
+
+
+def test_lost_ticks_stay_lost(tmp_path: Path):
+    ticks = np.delete(np.arange(500.0, 4000.0), np.arange(700, 720))
+    np.savez(tmp_path / "run.npz", tick=ticks, deadline_ns=ticks * 1e5, x_drive_v=ticks)
+    back = imported(tmp_path / "run.npz")
+    assert np.array_equal(back["tick"], ticks)
+    assert (summarise(back.paths).ticks_lost, back.problems) == (20, [])
+    assert back.header["imported"]["notes"] == ["about 20 samples missing, in 1 place, first behind 0.1199 s"]
+
+
+def test_frames(recording: Recording, tmp_path: Path):
+    frame = recording.to_pandas(["x_*", "mode"], 0.1, 0.2, 2)
+    assert frame.index.name == "time_s"
+    assert np.array_equal(frame.index, recording.time_s[1000:2001:2])
+    assert frame["x_drive_v"].to_numpy().tobytes() == recording["x_drive_v"][1000:2001:2].tobytes()
+    assert (frame.attrs["units"]["x_drive_v"], frame.attrs["events"]) == ("V", recording.events)
+    data = recording.to_xarray()
+    assert set(data.data_vars) == set(COLUMNS)
+    assert data["x_position_um"].values.tobytes() == recording["x_position_um"].tobytes()
+    assert data["x_position_um"].attrs == {"units": "µm", "long_name": "x: measured position x"}
+    assert json.loads(data.attrs["events"]) == recording.events
+    assert data.sel(time_s=slice(0.1, 0.2)).sizes["time_s"] == 1001

@@ -1,0 +1,140 @@
+"""Units by name, and the words of a mapping."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.errors import ConfigError
+from rtloop.interchange.mapping import axes_of, column_of, own_name, signal_name
+from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.units import UnknownUnit, factor_between, is_unit
+from rtloop.interchange.wanted import Wanted, mapping_beside, read_mapping, wanted_by
+
+HERE = Path("scan.csv")
+NAMES = ('"Model Root"/Piezo/Out1', "Sensor (nm)", "Piezo Out", "raw", "pos_nm", "b/raw2")
+TABLE = Table(
+    {name: np.array([0.0, 1.0, 3.0]) for name in NAMES},
+    {"Piezo Out": "mV"},
+    about={"left out": "Remark (text)"},
+)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "factor"),
+    [
+        ("nm", "µm", Fraction(1, 1000)),
+        ("mV", "V", Fraction(1, 1000)),
+        ("m", "um", Fraction(10**6)),
+        ("V·µm/V", "nm", Fraction(1000)),
+        ("μm", "µm", Fraction(1)),
+        ("Å", "nm", Fraction(1, 10)),
+        ("kHz", "1/s", Fraction(1000)),
+        ("m/s²", "µm/s^2", Fraction(10**6)),
+        ("Volts", "mV", Fraction(1000)),
+        ("min", "s", Fraction(60)),
+    ],
+)
+def test_units_are_converted_by_name(source: str, target: str, factor: Fraction):
+    assert factor_between(source, target) == factor
+
+
+@pytest.mark.parametrize(("source", "target"), [("V", "µm"), ("furlong", "m"), ("m/", "m²"), ("s", "Hz")])
+def test_what_cannot_be_converted_is_refused(source: str, target: str):
+    with pytest.raises(UnknownUnit):
+        factor_between(source, target)
+
+
+def test_what_is_a_unit_and_what_is_not():
+    assert all(map(is_unit, ("V", "µm/V", "%", "°C", "ms", "1/s")))
+    assert not any(map(is_unit, ("", "measured", "1", "/", "x", "Out 1")))
+
+
+@pytest.mark.parametrize(
+    ("signal", "source", "expected"),
+    [
+        ("x_drive_v", "Piezo Out", [0.0, 0.001, 0.003]),
+        ("x_drive_v", "piezo out [V] * 20", [0.0, 20.0, 60.0]),
+        ("x_drive_v", "Piezo/Out1 [mV]", [0.0, 0.001, 0.003]),
+        ("x_position_um", "Sensor", [0.0, 0.001, 0.003]),
+        ("x_position_um", "raw [V] * 2.5 µm/V - 3 µm", [-3.0, -0.5, 4.5]),
+        ("x_position_um", "raw [mV] * -250 nm/mV + 1", [1.0, 0.75, 0.25]),
+        ("x_position_um", "raw * 0.25 µm/mV", [0.0, 0.25, 0.75]),
+        ("x_position_um", "pos_nm", [0.0, 0.001, 0.003]),
+        ("temperature", "raw2 [°C]", [0.0, 1.0, 3.0]),
+    ],
+)
+def test_a_mapping_converts(signal: str, source: str, expected: list[float]):
+    assert column_of(TABLE, HERE, signal, source).values(TABLE).tolist() == expected
+
+
+def test_what_is_assumed_of_a_unit_is_said():
+    assert "no unit is known of 'raw'; it is taken for µm" in str(
+        column_of(TABLE, HERE, "x_position_um", "raw").assumed
+    )
+    assert "says that 'Piezo Out' is in mV; it is taken for V" in str(
+        column_of(TABLE, HERE, "x_drive_v", "Piezo Out [V]").assumed
+    )
+    assert column_of(TABLE, HERE, "x_drive_v", "Piezo Out [mV]").assumed is None
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("Piezo Out", r"x_position_um: column 'Piezo Out': mV is no µm; its unit stands in brackets"),
+        ("Piezo Out * 2 µm/A", "mV · µm/A is no µm"),
+        ("raw [parsec]", "unit 'parsec' is not known"),
+        ("Piezo Uot", r"no column 'Piezo Uot'; there are 'Piezo Out'.*\(left out: Remark \(text\)\)"),
+    ],
+)
+def test_a_mapping_that_cannot_be_says_why(source: str, message: str):
+    with pytest.raises(UnreadableData, match=message):
+        column_of(TABLE, HERE, "x_position_um", source)
+
+
+def test_a_name_that_fits_several_columns_is_refused():
+    table = Table({"a/Out1": np.zeros(2), "b/Out1": np.zeros(2)})
+    with pytest.raises(UnreadableData, match="several are called so: 'a/Out1', 'b/Out1'"):
+        column_of(table, HERE, "x_drive_v", "Out1")
+
+
+def test_names():
+    assert signal_name("drive_v") == "x_drive_v"
+    assert signal_name("y_drive_v") == "y_drive_v"
+    assert [own_name(name) for name in ("Größe (µm)", "1", "tick", '"Model Root"/A')] == [
+        "Grosse", "column_1", "file_tick", "Model_Root_A"
+    ]  # fmt: skip
+    assert axes_of(["x_drive_v", "long_name_position_um", "temperature"]) == ["x", "long_name"]
+    assert axes_of(["x_drive_v", "x_true_position_um", "x_2_drive_v"]) == ["x", "x_2"]
+
+
+def test_the_mapping_beside_the_data(tmp_path: Path):
+    data = tmp_path / "scan.mat"
+    assert mapping_beside(data) is None
+    (tmp_path / "map.toml").write_text('rate_hz = 100.0\nkeep = ["T"]\n[signals]\nx_drive_v = "U [V]"\n')
+    assert mapping_beside(data) == tmp_path / "map.toml"
+    found = read_mapping(tmp_path / "map.toml")
+    assert found == Wanted({"x_drive_v": "U [V]"}, ("T",), rate_hz=100.0)
+    (tmp_path / "scan.map.toml").write_text("all = true\n")
+    assert mapping_beside(data) == tmp_path / "scan.map.toml"
+    assert wanted_by(["x_drive_v=a=b", "A = 1", "T"], Wanted()) == Wanted({"x_drive_v": "a=b", "A": "1"}, ("T",))
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("signals = 3", "signals: input should be a valid dict"),
+        ("tiem = 't'", "tiem: extra inputs are not permitted"),
+        ("rate_hz = 0.0", "rate_hz: input should be greater than or equal to 0.001"),
+        ("[signals]\n'x y' = 'a'", "signals: 'x y'; letters, digits and _ make a name"),
+        ("[", "not valid TOML"),
+    ],
+)
+def test_a_mapping_that_is_wrong_says_where(text: str, fault: str, tmp_path: Path):
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(ConfigError, match="1 fault") as caught:
+        read_mapping(tmp_path / "map.toml")
+    assert fault in str(caught.value)
