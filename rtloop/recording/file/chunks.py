@@ -29,11 +29,15 @@ INDEX_HEAD_BYTES = PREFIX.size + 6
 
 
 class Entry(NamedTuple):
-    """Where a chunk record is, in bytes, and what the index says about it, if there is one."""
+    """Where a chunk record is, in bytes, and what the index says about it, if there is one.
+
+    `span`: of slow messages out of a file that another tool wrote, the first and the last log time of those meant.
+    """
 
     offset: int
     length: int
     index: ChunkIndex | None  # pyright: ignore[reportIncompatibleMethodOverride]
+    span: tuple[int, int] | None = None
 
 
 class Source:
