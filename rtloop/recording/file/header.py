@@ -6,6 +6,7 @@ import hashlib
 import io
 import struct
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +69,12 @@ def merged_header(path: Path, payloads: Sequence[bytes]) -> tuple[dict[str, Any]
     """
     headers = sorted((read_header(path, one) for one in payloads), key=lambda one: one.get("sequence", 1))
     first, numbers = headers[0], [int(header.get("sequence", 1)) for header in headers]
-    runs = {tuple(map(str, map(header.get, OF_A_RUN))): header["name"] for header in headers}
+    runs = {tuple(str(header.get(key)) for key in OF_A_RUN): header for header in headers}
     if len(runs) > 1:
+        names = ", ".join(f"{one['name']!r} of {_moment(one['created_unix_ns'])}" for one in runs.values())
         raise RecordingError(
-            f"{path}: holds {len(runs)} runs, {', '.join(map(repr, runs.values()))}, whose ticks cannot be told apart; "
-            "the files that it was merged from are read each by itself"
+            f"{path}: holds {len(runs)} runs, {names}, whose ticks cannot be told apart; the files that it was merged "
+            "from can be read, each by itself"
         )
     if len(set(numbers)) < len(numbers):
         raise RecordingError(f"{path}: holds a part of the run twice: the same file was merged with itself")
@@ -85,3 +87,7 @@ def absent(numbers: Iterable[int]) -> list[str]:
     if len(there) == 1:
         return []
     return [f"part {number} of the run is missing" for number in range(1, max(there)) if number not in there]
+
+
+def _moment(unix_ns: int) -> str:
+    return f"{datetime.fromtimestamp(unix_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -57,18 +57,21 @@ class Own:
 def layout_of(source: Source) -> Own | Rewritten:
     """The chunks of a recording. Raises RecordingError where the file is another's, of a newer version, or damaged."""
     written_by = library(source)
+    if written_by not in OWN:
+        try:
+            return Rewritten(source)
+        except NoRecording as reason:
+            try:  # it may be rtloop's own with a damaged name
+                return Own(source)
+            except DamagedChunk:
+                raise reason from None
     try:
         own = Own(source)
     except DamagedChunk as damage:
         try:
             return Rewritten(source)
         except NoRecording:
-            if written_by not in OWN or format.PROFILE.encode() not in source.read(len(MAGIC), 64):
+            if format.PROFILE.encode() not in source.read(len(MAGIC), 64):
                 raise
             raise RecordingError(f"{source.path}: the beginning of the recording is damaged ({damage})") from None
-    if written_by in OWN and not own.is_mixed:
-        return own
-    try:
-        return Rewritten(source)
-    except NoRecording:
-        return own
+    return Rewritten(source) if own.is_mixed else own

@@ -26,7 +26,7 @@ from rtloop.recording.file.container import DamagedChunk, pack_message
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.header import absent, merged_header
 from rtloop.recording.foreign.fields import Undecodable, encoding
-from rtloop.recording.foreign.stretches import Run, Stretch, Topics, contents, runs, stretches
+from rtloop.recording.foreign.stretches import Run, Stretch, Topics, contents, halves, runs, stretches
 from rtloop.recording.foreign.ticks import TickDecoder
 
 NUMBERS = {channel.topic: channel.id for channel in format.channels()}
@@ -68,9 +68,12 @@ class Rewritten:
         self._source, self._topics = source, Topics()
         self._stretches, self.problems = stretches(source)
         self.left_out = [*self.problems]
+        largest = max((stretch.size for stretch in self._stretches), default=1)
+        self.ahead = min(max(AHEAD_BYTES // largest, 1), AHEAD)
+        """Chunks that may be unpacked beyond the one that is asked for."""
         self._payloads: list[bytes] = []
         self._counts: Counter[int] = Counter()
-        self._damage: dict[int, str] = {}
+        self._damage: dict[Stretch, str] = {}
         self._replaced: dict[bytes, bytes] = {}
         self._slow = lru_cache(REMEMBERED)(self._slow_messages)
         filled, slow = self._survey()
@@ -88,18 +91,12 @@ class Rewritten:
             self._replaced = self._one_end(len(sequences))
             self._slow.cache_clear()
 
-    @property
-    def ahead(self) -> int:
-        """Chunks that may be unpacked beyond the one that is asked for."""
-        largest = max((stretch.size for stretch in self._stretches), default=1)
-        return min(max(AHEAD_BYTES // max(largest, 1), 1), AHEAD)
-
     def content(self, entry: Entry) -> bytes:
         """The records of a chunk as rtloop would have written them. Raises DamagedChunk."""
         stretch = Stretch(entry.offset, entry.length, 0)
         if entry.span is None:
-            if entry.offset in self._damage:
-                raise DamagedChunk(self._damage[entry.offset])
+            if entry.index is None:
+                raise DamagedChunk(next(why for one, why in self._damage.items() if one.offset == entry.offset))
             return self._decoder.records(run for number, run in self._runs(stretch) if number == format.TICKS)
         first, last = entry.span
         return b"".join(pack_message(*one) for one in self._slow(stretch) if first <= one.log_time <= last)
@@ -108,18 +105,22 @@ class Rewritten:
         """Where ticks and slow messages lie, which has to be known before any of it is handed out."""
         filled: list[Filled] = []
         slow: list[Slow] = []
-        for stretch in self._stretches:
-            ticks, others = [], []
+        waiting = self._stretches[::-1]
+        while waiting:
+            stretch = waiting.pop()
             try:
-                for number, run in self._runs(stretch):
-                    self._counts[run.channel] += len(run.records)
-                    if number == format.CONFIGURATION:
-                        self._payloads += run.payloads
-                    elif number is not None:
-                        (ticks if number == format.TICKS else others).append(run.log_times)
+                found = list(self._runs(stretch))
             except DamagedChunk as reason:
-                self._damage[stretch.offset] = str(reason)
+                smaller = halves(self._source, stretch)  # what is damaged is to be as little as can be
+                waiting += smaller[::-1]
+                if not smaller:
+                    self._damage[stretch] = str(reason)
                 continue
+            for number, run in found:
+                self._counts[run.channel] += len(run.records)
+                self._payloads += run.payloads if number == format.CONFIGURATION else []
+            ticks = [run.log_times for number, run in found if number == format.TICKS]
+            others = [run.log_times for number, run in found if number in (format.EVENTS, format.LAW)]
             if ticks:
                 filled.append(Filled(min(int(t.min()) for t in ticks), max(int(t.max()) for t in ticks), stretch))
             if others:
@@ -163,10 +164,9 @@ class Rewritten:
                 first = int(log_times[places == place].min())
                 found.append(((place, 0, first), _entry(stretch, dict.fromkeys((format.EVENTS, format.LAW), 0), span)))
         offsets = sorted(one.stretch.offset for one in filled)
-        for stretch in self._stretches:
-            if stretch.offset in self._damage:
-                place = int(np.searchsorted(offsets, stretch.offset))
-                found.append(((place, -1, stretch.offset), Entry(stretch.offset, stretch.length, None)))
+        for stretch in self._damage:
+            place = int(np.searchsorted(offsets, stretch.offset))
+            found.append(((place, -1, stretch.offset), Entry(stretch.offset, stretch.length, None)))
         return [entry for _, entry in sorted(found, key=lambda one: one[0])]
 
     def _one_end(self, parts: int) -> dict[bytes, bytes]:
@@ -198,7 +198,7 @@ class Rewritten:
             for number, count in self._counts.most_common(MOST_SHOWN)
         ]
         holds = ", ".join(found) + (", …" if len(self._counts) > MOST_SHOWN else "") or "no message"
-        damage = next((f"; at byte {offset} it is damaged: {why}" for offset, why in self._damage.items()), "")
+        damage = next((f"; at byte {stretch.offset} it is damaged: {why}" for stretch, why in self._damage.items()), "")
         if {NUMBERS.get(channels[number].topic) for number in self._counts} & {format.TICKS, format.LAW}:
             lacks = "a recording of rtloop without its topic /configuration, which says what the others hold"
             return f"{lacks}: there are {holds}{damage}; `rtloop import` reads its numbers"

@@ -91,7 +91,7 @@ def library(source: Source) -> str:
 
 
 def stretches(source: Source) -> tuple[list[Stretch], list[str]]:
-    """All of a file that may hold messages, and what is wrong with it."""
+    """All of a file that may hold messages, and why some of it is left out."""
     found: list[Stretch] = []
     problems: list[str] = []
     position = len(MAGIC)
@@ -105,8 +105,8 @@ def stretches(source: Source) -> tuple[list[Stretch], list[str]]:
             return found, problems
         length = record_length(window, at) if at + PREFIX.size <= len(window) else source.size
         if position + length > source.size:
-            rest = source.size - position
-            problems.append(f"it was not finished: {rest} bytes behind its last whole record are left out")
+            if position < source.size:
+                problems.append(f"it ends in the middle of a record: {source.size - position} bytes are left out")
             return found, problems
         if opcode in CONTENT:
             whole = length >= HEAD.size and at + HEAD.size <= len(window)
@@ -120,12 +120,28 @@ def stretches(source: Source) -> tuple[list[Stretch], list[str]]:
 
 
 def _add(found: list[Stretch], new: Stretch) -> None:
-    """To the last stretch where it goes on there and is not too large yet."""
-    last = found[-1] if found else None
-    if last and last.offset + last.length == new.offset and last.size + new.size <= STRETCH_BYTES:
-        found[-1] = Stretch(last.offset, last.length + new.length, last.size + new.size)
+    """To the last stretch, with what else lies between, unless that becomes too large."""
+    last = found[-1] if found else Stretch(0, 0, STRETCH_BYTES)
+    between = new.offset - last.offset - last.length
+    if last.size + between + new.size <= STRETCH_BYTES:
+        found[-1] = Stretch(last.offset, last.length + between + new.length, last.size + between + new.size)
     else:
         found.append(new)
+
+
+def halves(source: Source, stretch: Stretch) -> list[Stretch]:
+    """The same records in two stretches; none where it is a single one."""
+    data, position, places = source.read(stretch.offset, stretch.length), 0, []
+    while position + PREFIX.size <= len(data):
+        places.append(position)
+        position += record_length(data, position)
+    if len(places) < 2:
+        return []
+    cut = places[len(places) // 2]
+    return [
+        Stretch(stretch.offset, cut, stretch.size),
+        Stretch(stretch.offset + cut, stretch.length - cut, stretch.size),
+    ]
 
 
 def contents(source: Source, stretch: Stretch) -> Iterator[memoryview]:
