@@ -28,7 +28,7 @@ from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.export import export
 from rtloop.recording.views.plot import plot
 from rtloop.recording.views.summary import summarise
-from tests.recording.real_loop import PAPER, RealLoop, changed, record
+from tests.recording.real_loop import PAPER, RealLoop
 from tests.recording.rewriting import NO_INDEX, Said, merged, messages, without_end, write
 
 TICKS, BURST, SNAPSHOT_TICKS = 900, 60, 150
@@ -58,27 +58,31 @@ class Run(NamedTuple):
         return np.column_stack([found[str(number)] for number in range(len(columns))])
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A short run with commands, many chunks and snapshots of the law."""
-    path = tmp_path_factory.mktemp("own") / "run.mcap"
-    text = changed() + "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in SCHEDULE)
+def recorded(path: Path, **options: float) -> list[Path]:
+    """The files of a short run with commands, many chunks and snapshots of the law."""
+    text = PAPER + "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in SCHEDULE)
     loop = RealLoop(text)
     loop.take_snapshots_every(SNAPSHOT_TICKS)
-    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0))
-    session._written_s = -np.inf
+    session = Session(loop.block, path, loop.header, Options(min_free_bytes=0, **options))  # type: ignore[arg-type]
     while loop.tick < TICKS:
         loop.run(BURST)
         session.drain()
         session._write_all()
-    session.finish("finished")
+    return [Path(one) for one in session.finish("finished")["paths"]]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    [path] = recorded(tmp_path_factory.mktemp("own") / "run.mcap")
     return Run(path, messages(path))
 
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A run in three files."""
-    return record(tmp_path_factory.mktemp("parts") / "run.mcap", PAPER, 25_000, rotate_s=1.0)
+    """The same in three files."""
+    found = recorded(tmp_path_factory.mktemp("parts") / "run.mcap", rotate_s=2 * SNAPSHOT_TICKS / 10_000)
+    assert len(found) == 3
+    return found
 
 
 def bits(rows: Any) -> bytes:
@@ -110,12 +114,11 @@ def test_the_stock_writer(run: Run, tmp_path: Path, ticks: str, compression: Com
     assert csv[0].read_bytes() == csv[1].read_bytes()
 
 
-@pytest.mark.parametrize("ticks", ["as it is", "json"])
-def test_a_picture_of_it(run: Run, tmp_path: Path, ticks: str):
-    path = write(tmp_path / "anew.mcap", run.said, ticks=ticks, compression=CompressionType.LZ4)
-    pictures = [plot(one, tmp_path / f"{i}.png", start_s=0.02, end_s=0.08) for i, one in enumerate((path, run.path))]
-    assert pictures[0].read_bytes()[:4] == b"\x89PNG"
-    assert len(pictures[0].read_bytes()) > 50_000
+def test_a_picture_of_it(run: Run, tmp_path: Path):
+    path = write(tmp_path / "anew.mcap", run.said, ticks="json", compression=CompressionType.LZ4)
+    picture = plot(path, tmp_path / "anew.png", start_s=0.02, end_s=0.08)
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert picture.stat().st_size > 50_000
 
 
 BARE = {"index_types": NO_INDEX, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False}
@@ -151,7 +154,7 @@ ORDERS: dict[str, Callable[[list[Said]], list[Said]]] = {
 }
 
 
-@pytest.mark.parametrize("chunk_size", [20_000, 1 << 20])
+@pytest.mark.parametrize("chunk_size", [60_000, 1 << 20])
 @pytest.mark.parametrize("how", ORDERS)
 def test_in_whatever_order(run: Run, tmp_path: Path, how: str, chunk_size: int, monkeypatch: pytest.MonkeyPatch):
     if chunk_size < 1 << 20 and how != "anyhow":  # each chunk is taken by itself; but for that it needs its order
@@ -254,15 +257,15 @@ def test_a_file_of_somebody_else_is_called_that(tmp_path: Path):
 
 
 def test_parts_merged_are_one_recording(parts: list[Path], tmp_path: Path):
-    path = write(tmp_path / "merged.mcap", merged(parts[::-1]), chunk_size=200_000)
+    path = write(tmp_path / "merged.mcap", merged(parts[::-1]), chunk_size=70_000)
     found, own = load(path), load(parts)
     assert bits(np.concatenate(list(found.blocks()))) == bits(np.concatenate(list(own.blocks())))
     assert [*found.snapshots()] == [*own.snapshots()]
     assert found.events[:-1] == [one for one in own.events if one["kind"] not in ("rotated", "finished")]
-    assert found.events[-1]["what"]["ticks_logged"] == 25_000
+    assert found.events[-1]["what"]["ticks_logged"] == TICKS
     assert replay(found).identical
     said = summarise(path)
-    assert (said.complete, said.ticks_logged, said.ticks_lost, said.result) == (True, 25_000, 0, "finished")
+    assert (said.complete, said.ticks_logged, said.ticks_lost, said.result) == (True, TICKS, 0, "finished")
     assert recover(path, tmp_path / "one.mcap")["complete"]
     assert summarise(tmp_path / "one.mcap").complete
 
@@ -270,7 +273,7 @@ def test_parts_merged_are_one_recording(parts: list[Path], tmp_path: Path):
 def test_a_part_that_was_not_merged_is_missed(parts: list[Path], tmp_path: Path):
     path = write(tmp_path / "merged.mcap", merged([parts[0], parts[2]]))
     assert load(path).problems == ["part 2 of the run is missing"]
-    assert [one["first_tick"] for one in replay(load(path)).not_verified] == [10_000]
+    assert [one["first_tick"] for one in replay(load(path)).not_verified] == [300]
     assert not summarise(path).complete
 
 
@@ -350,7 +353,7 @@ def test_nothing_that_was_changed_is_taken_for_what_was_recorded(run: Run, tmp_p
         ("as it is", {"spare": 1}),
     ):
         said = [one for place, one in enumerate(run.said) if one.topic != "/ticks" or place % 3 == 0]
-        good = write(path, said, ticks=ticks, chunk_size=9_000, **options).read_bytes()
+        good = write(path, said, ticks=ticks, chunk_size=20_000, **options).read_bytes()
         starts = [position for position, _ in records_of(good)]
         for _ in range(18):
             data = bytearray(good)
@@ -363,7 +366,6 @@ def test_nothing_that_was_changed_is_taken_for_what_was_recorded(run: Run, tmp_p
                 found = load(path)
                 blocks = [*found.blocks()]
                 [*found.snapshots()]
-                summarise(path)
             except RtloopError as error:
                 outcomes["refused"] += str(path) in str(error)
                 continue
@@ -441,7 +443,7 @@ def test_two_gigabytes_of_nothing(run: Run, tmp_path: Path):
     tracemalloc.start()
     try:
         require_same(path, run)
-        assert tracemalloc.get_traced_memory()[1] < 60 << 20
+        assert tracemalloc.get_traced_memory()[1] < 100 << 20
     finally:
         tracemalloc.stop()
 

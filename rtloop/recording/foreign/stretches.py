@@ -189,6 +189,8 @@ def _run(records: memoryview, length: int) -> Run:
     most = len(records) // length
     rows = np.frombuffer(records, np.uint8, most * length).reshape(most, length)
     count, step = 1, FEW_ROWS
+    if records[:_KEY] != records[length : length + _KEY]:  # the usual case where lengths differ, and many times as fast
+        most = 1
     while count < most:
         same = (rows[count : count + step, :_KEY] == rows[0, :_KEY]).all(axis=1)
         if not same.all():
