@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from prometheus_client import CollectorRegistry, Gauge, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
+from prometheus_client.utils import floatToGoString
 
 from rtloop.service.measuring.quality import LATENESS_US, Quality
 from rtloop.service.service import Service, State
@@ -109,10 +111,7 @@ class _Summed(Collector):
         for cause, value in sums.trips.items():
             trips.add_metric([cause], value)
         counts = sums.lateness.cumsum().tolist()
-        classes = [
-            *((f"{end:g}", count) for end, count in zip(LATENESS_US, counts, strict=False)),
-            ("+Inf", counts[-1]),
-        ]
+        classes = list(zip(map(floatToGoString, (*LATENESS_US, math.inf)), counts, strict=True))
         late = HistogramMetricFamily("rtloop_tick_lateness_us", "How late ticks began")
         late.add_metric([], classes, sums.lateness_sum_us)
         yield from (limited, trips, late)
