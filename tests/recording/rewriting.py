@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
-ENCODINGS = ("as it is", "json", "protobuf", "proto3")
+ENCODINGS = ("as it is", "json", "protobuf", "proto2", "proto3")
 
 
 class Said(NamedTuple):
@@ -112,7 +112,8 @@ class Encoding:
         if self._ticks == "json":
             return "json", None, json.dumps({field.name: value for field, value in message.ListFields()}).encode()
         if self._kind is None:
-            self._kind = type(message) if self._ticks == "protobuf" else _backwards(message.DESCRIPTOR.fields)
+            names = [field.name for field in message.DESCRIPTOR.fields]
+            self._kind = type(message) if self._ticks == "protobuf" else backwards(names, self._ticks)
         again = self._kind(**{field.name: value for field, value in message.ListFields()})
         described = build_file_descriptor_set(self._kind).SerializeToString()
         return "protobuf", (self._kind.DESCRIPTOR.full_name, "protobuf", described), again.SerializeToString()
@@ -122,15 +123,13 @@ def _schema(name: str, encoding: str, data: bytes) -> Schema:
     return Schema(id=1, name=name, encoding=encoding, data=data)
 
 
-def _backwards(fields: Sequence[Any]) -> Any:
-    """A message of the same fields in proto3, which leaves zeros out, with other numbers."""
-    file = FileDescriptorProto(name="another/tick.proto", package="another", syntax="proto3")
+def backwards(names: Sequence[str], syntax: str) -> Any:
+    """A message of the same fields with their numbers the other way round; proto3 leaves zeros out."""
+    file = FileDescriptorProto(name="another/tick.proto", package="another", syntax=syntax)
     message = file.message_type.add(name="Sample")
-    for place, field in enumerate(fields):
-        message.field.add(
-            name=field.name, number=len(fields) - place, type=FieldDescriptorProto.TYPE_DOUBLE,
-            label=FieldDescriptorProto.LABEL_OPTIONAL,
-        )  # fmt: skip
+    for place, name in enumerate(names):
+        kind, label = FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.LABEL_OPTIONAL
+        message.field.add(name=name, number=len(names) - place, type=kind, label=label)
     pool = DescriptorPool()
     pool.Add(file)
     return GetMessageClass(pool.FindMessageTypeByName("another.Sample"))

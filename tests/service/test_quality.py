@@ -107,6 +107,20 @@ def test_ticks_that_were_overwritten_are_said(looked: Looked):
     assert found["ticks_summed_total",] == 100 + slots
 
 
+def test_a_look_does_not_run_after_the_loop(looked: Looked, monkeypatch: pytest.MonkeyPatch):
+    """Ticks come in while others are summed up: the largest values of a minute are to be those of a minute."""
+    add, ticks = looked.quality._add, iter(range(100, 200))
+
+    def while_it_runs(rows: np.ndarray, axes: tuple[str, ...]) -> None:
+        add(rows, axes)
+        looked.loop.run(make_rows(1, first=next(ticks)))
+
+    monkeypatch.setattr(looked.quality, "_add", while_it_runs)
+    looked.run(make_rows(100))
+    assert looked.samples["ticks_summed_total",] == 100
+    assert len(looked.quality.axes["x"].peaks) == 1
+
+
 def test_they_go_on_in_the_next_loop(looked: Looked):
     tripped = make_rows(500)
     tripped[400:, FLAGS] = POSITION

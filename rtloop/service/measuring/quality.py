@@ -77,8 +77,8 @@ class Quality:
             self._supervisor, self._flags = supervisor, 0
             self._reader = RingReader(supervisor.block, "ticks")
             self._rows = np.empty((MOST_TICKS, len(supervisor.prepared.plan.columns)))
-        reader, copied = self._reader, -1
-        while reader is not None and copied:
+        reader, copied = self._reader, MOST_TICKS
+        while reader is not None and copied == MOST_TICKS:  # what comes in meanwhile can wait for the next look
             copied, lost = reader.take_into(self._rows)
             with self.lock:
                 self.unseen += lost
