@@ -23,6 +23,7 @@ from rtloop.service.can_bus import supervised_by_can
 from rtloop.service.changing.building import builder_ended
 from rtloop.service.journal import Journal
 from rtloop.service.measuring.adaptation import adapting
+from rtloop.service.measuring.quality import summed
 from rtloop.service.service import Service
 from rtloop.supervision.paths import FOLDER_MODE, refusal, socket_path
 
@@ -41,7 +42,8 @@ def serve(config: Path, duration_s: float | None = None) -> int:
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
     try:
         adapts = adapting(service, socket_path(service.configuration))
-        with builder_ended(), _listening(service), supervised_by_can(service), adapts:
+        sums = summed(service.quality, lambda: service.supervisor)
+        with builder_ended(), _listening(service), supervised_by_can(service), adapts, sums:
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()

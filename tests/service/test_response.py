@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,9 +22,12 @@ import rtloop
 from rtloop.cli import main
 from tests.design.measured_loops import RATE_HZ, TrueLoop, margins_of
 from tests.faults.bench import Bench
+from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
 from tests.service.http import answer
 
+DASHBOARD = ROOT / "deploy" / "grafana" / "rtloop.json"
+METRIC = re.compile(r"\brtloop_\w+")
 LOOP = TrueLoop(800.0, 0.02, 1, 100.0, kp=0.01)
 OMEGA = 2 * np.pi * LOOP.hz
 HELD_UM = 5.0
@@ -137,6 +142,55 @@ def test_figures_are_told_and_the_recording_gives_the_same(bench: Bench, shown: 
     written(bench, bench.status()["tick"])
     again = command(bench, "identify", "response", recording(bench), "--near-hz", "800", "--json")
     assert json.loads(again) == found
+
+
+def test_all_that_the_dashboard_asks_for_is_there(bench: Bench, shown: Shown) -> None:
+    """`rtloop_trip` is there while one is in force alone."""
+    served = {
+        sample.name
+        for family in text_string_to_metric_families(bench.client.get("/metrics"))
+        for sample in family.samples
+    }
+    board = json.loads(DASHBOARD.read_text())
+    asked = {name for panel in board["panels"] for one in panel["targets"] for name in METRIC.findall(one["expr"])}
+    assert len(asked) > 20
+    assert asked - served == {"rtloop_trip"}
+    assert METRIC.findall(board["templating"]["list"][1]["query"]["query"]) == ["rtloop_ticks"]
+    new = {"rtloop_error_square_um2_total", "rtloop_drive_square_v2_total", "rtloop_tick_lateness_us_bucket"}
+    assert new <= asked
+    assert not [name for name in served - asked if name.endswith("_total")]
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl")
+def test_the_metrics_get_to_where_prometheus_looks(bench: Bench, tmp_path: Path) -> None:
+    """By the script in deploy/grafana, each with the name of the service; and nothing stays of one that is gone."""
+    script, environment = DASHBOARD.with_name("scrape"), bench.environment
+    subprocess.run([script, "lab", tmp_path], env=environment, check=True)
+    families = [*text_string_to_metric_families((tmp_path / "rtloop-lab.prom").read_text())]
+    assert {sample.labels["service"] for family in families for sample in family.samples} == {"lab"}
+    assert {family.name for family in families} >= {
+        "rtloop_ticks",
+        "rtloop_error_square_um2",
+        "rtloop_tick_lateness_us",
+    }
+    elsewhere = environment | {"RUNTIME_DIRECTORY": str(tmp_path)}
+    assert subprocess.run([script, "lab", tmp_path], env=elsewhere, stderr=subprocess.DEVNULL).returncode == 1
+    assert not [*tmp_path.iterdir()]
+
+
+def test_sums_are_those_of_the_recording(bench: Bench) -> None:
+    sums = {
+        sample.name: sample.value
+        for family in text_string_to_metric_families(bench.client.get("/metrics"))
+        for sample in family.samples
+        if sample.name.endswith("_total")
+    }
+    ticks = int(sums["rtloop_ticks_summed_total"])
+    errors = written(bench, ticks)["x_error_um"][:ticks]
+    closed = written(bench, ticks)["mode"][:ticks] == 3
+    assert ticks > RATE_HZ
+    assert sums["rtloop_closed_loop_ticks_total"] == np.count_nonzero(closed)
+    assert sums["rtloop_error_square_um2_total"] == pytest.approx(np.sum(errors[closed] ** 2), rel=1e-9)
 
 
 def test_it_is_shown(shown: Shown) -> None:

@@ -250,6 +250,15 @@ def event_from(payload: bytes, axes: Sequence[str]) -> Event:
     return event
 
 
+def final_event(payload: bytes, axes: Sequence[str]) -> Event | None:
+    """The event that ends a file, if a message of `/events` is one."""
+    try:
+        event = event_from(payload, axes)
+    except Malformed:
+        return None
+    return event if event["kind"] in FINAL else None
+
+
 def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
     """Raise Malformed where the loop could not execute a command."""
     first, *parameters = values

@@ -26,14 +26,20 @@ from rtloop.recording.file.container import (
 
 SEARCH_BYTES = 1 << 20
 INDEX_HEAD_BYTES = PREFIX.size + 6
+LARGEST_SUMMARY_BYTES = 16 << 20
+"""Beyond the size of what it sums up: a chunk takes more room than its index."""
 
 
 class Entry(NamedTuple):
-    """Where a chunk record is, in bytes, and what the index says about it, if there is one."""
+    """Where a chunk record is, in bytes, and what the index says about it, if there is one.
+
+    `span`: of slow messages out of a file that another tool wrote, the first and the last log time of those meant.
+    """
 
     offset: int
     length: int
     index: ChunkIndex | None  # pyright: ignore[reportIncompatibleMethodOverride]
+    span: tuple[int, int] | None = None
 
 
 class Source:
@@ -78,6 +84,8 @@ def indexed_chunks(source: Source) -> list[Entry]:
         raise DamagedChunk("the file was not finished")
     opcode, length, start, _ = FOOTER_HEAD.unpack_from(tail)
     if opcode != Opcode.FOOTER or length != FOOTER_BYTES - PREFIX.size or not len(MAGIC) < start < source.size:
+        raise DamagedChunk("its end is damaged")
+    if source.size - start > start + LARGEST_SUMMARY_BYTES:
         raise DamagedChunk("its end is damaged")
     indexes = parse_summary(source.read(start, source.size - len(MAGIC) - start))
     _require_seamless(source, indexes, start - DATA_END_BYTES)

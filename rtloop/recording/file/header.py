@@ -3,35 +3,58 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import io
+import struct
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.checked import Malformed, header_from, require_columns
-from rtloop.recording.file.chunks import Entry, Source
-from rtloop.recording.file.container import MAGIC, DamagedChunk, pack_records, unpack_chunk
-from rtloop.recording.file.contents import read_chunk, split_messages
+from rtloop.recording.file.container import DamagedChunk, pack_records, split_records
+from rtloop.recording.file.contents import split_messages
+
+OF_A_RUN = ("created_unix_ns", "name", "columns")
+"""What is the same in the headers of all files of a run."""
 
 
-def read_header(path: Path, source: Source, entries: Sequence[Entry]) -> dict[str, Any]:
-    """The header of the recording. Raises RecordingError where it is another's file, a newer one, or damaged."""
+def own_header(content: bytes) -> bytes:
+    """The text of the header, in the first chunk of a file that rtloop wrote. Raises DamagedChunk for any other."""
+    messages = split_messages(content)
+    if [message.channel for message in messages] != [format.CONFIGURATION]:
+        raise DamagedChunk("it has no header")
     try:
-        if not entries:
-            raise DamagedChunk("it holds no chunk")
-        content = unpack_chunk(read_chunk(source, entries[0]))
-        payload = _payload(content)
-    except DamagedChunk as reason:
-        if format.PROFILE.encode() not in source.read(len(MAGIC), 64):
-            raise RecordingError(f"{path}: an MCAP file, but not a recording of rtloop") from None
-        raise RecordingError(f"{path}: the beginning of the recording is damaged ({reason})") from None
+        found = [
+            Channel.read(ReadDataStream(io.BytesIO(record)))
+            for opcode, record in split_records(content)
+            if opcode == Opcode.CHANNEL
+        ]
+    except (struct.error, ValueError, McapError):
+        raise DamagedChunk("its channels cannot be read") from None
+    if [(one.id, one.topic) for one in found] != [(one.id, one.topic) for one in format.channels()]:
+        raise DamagedChunk("its channels are not those of a recording")
+    return messages[0].payload
+
+
+def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dict[str, Any]:
+    """The header of the recording; `content`: the first chunk, whose schemas it is held against.
+
+    Raises RecordingError where it is one of a newer version, or malformed.
+    """
     try:
         header = header_from(payload)
         digest = hashlib.sha256(header["configuration"].encode()).hexdigest()
         if header.get("configuration_sha256") != digest:
             raise Malformed("the recorded configuration does not match its SHA-256")
-        if not content.startswith(pack_records([*format.schemas(header["columns"]), *format.channels()])):
+        schema = pack_records([*format.schemas(header["columns"]), *format.channels()])
+        if content is not None and not content.startswith(schema):
             raise Malformed("the schema of the ticks does not match the recorded columns")
         require_columns(header)
     except Malformed as reason:
@@ -39,8 +62,32 @@ def read_header(path: Path, source: Source, entries: Sequence[Entry]) -> dict[st
     return header
 
 
-def _payload(content: bytes) -> bytes:
-    for message in split_messages(content):
-        if message.channel == format.CONFIGURATION:
-            return message.payload
-    raise DamagedChunk("it has no header")
+def merged_header(path: Path, payloads: Sequence[bytes]) -> tuple[dict[str, Any], list[int]]:
+    """The header of a file that was made of the parts of one run, that of the first; and the numbers of all.
+
+    Raises RecordingError where they are not of one run.
+    """
+    headers = sorted((read_header(path, one) for one in payloads), key=lambda one: one.get("sequence", 1))
+    first, numbers = headers[0], [int(header.get("sequence", 1)) for header in headers]
+    runs = {tuple(str(header.get(key)) for key in OF_A_RUN): header for header in headers}
+    if len(runs) > 1:
+        names = ", ".join(f"{one['name']!r} of {_moment(one['created_unix_ns'])}" for one in runs.values())
+        raise RecordingError(
+            f"{path}: holds {len(runs)} runs, {names}, whose ticks cannot be told apart; the files that it was merged "
+            "from can be read, each by itself"
+        )
+    if len(set(numbers)) < len(numbers):
+        raise RecordingError(f"{path}: holds a part of the run twice: the same file was merged with itself")
+    return first, numbers
+
+
+def absent(numbers: Iterable[int]) -> list[str]:
+    """What is missing between, or in front of, the parts of a rotated run that are there; one alone is a whole one."""
+    there = set(numbers)
+    if len(there) == 1:
+        return []
+    return [f"part {number} of the run is missing" for number in range(1, max(there)) if number not in there]
+
+
+def _moment(unix_ns: int) -> str:
+    return f"{datetime.fromtimestamp(unix_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"

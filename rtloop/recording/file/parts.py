@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.header import OF_A_RUN, absent
 from rtloop.recording.file.reader import Reader
 
 Files = Path | str | Sequence[Path | str]
@@ -63,10 +64,7 @@ class Parts(ExitStack):
 
 def absent_parts(readers: Sequence[Reader]) -> list[str]:
     """What is missing between, or in front of, the files of a rotated run. One file alone is a whole recording."""
-    numbers = [_sequence(reader) for reader in readers]
-    if len(numbers) == 1:
-        return []
-    return [f"part {number} of the run is missing" for number in range(1, max(numbers)) if number not in numbers]
+    return absent(map(_sequence, readers))
 
 
 def _sequence(reader: Reader) -> int:
@@ -76,7 +74,7 @@ def _sequence(reader: Reader) -> int:
 def _require_one_run(readers: Sequence[Reader]) -> None:
     first, numbers = readers[0], [_sequence(reader) for reader in readers]
     for reader in readers[1:]:
-        if any(reader.header.get(key) != first.header.get(key) for key in ("created_unix_ns", "name", "columns")):
+        if any(reader.header.get(key) != first.header.get(key) for key in OF_A_RUN):
             raise RecordingError(f"{reader.path}: is not of the same run as {first.path}")
     for reader, number, next_number in zip(readers[1:], numbers, numbers[1:], strict=False):
         if number == next_number:

@@ -22,26 +22,23 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.account import Account
 from rtloop.recording.file.checked import Malformed, event_from
-from rtloop.recording.file.chunks import Entry, Source, indexed_chunks, scanned_chunks
-from rtloop.recording.file.container import DamagedChunk, unpack_chunk
+from rtloop.recording.file.chunks import Entry, Source
+from rtloop.recording.file.container import DamagedChunk
 from rtloop.recording.file.contents import (
     Message,
     is_ticks,
     may_hold,
     may_hold_messages,
     overlaps,
-    read_chunk,
     split_messages,
 )
 from rtloop.recording.file.events import FINAL, Event
-from rtloop.recording.file.header import read_header
+from rtloop.recording.file.layout import layout_of
 from rtloop.recording.file.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
 DIGEST_BYTES = 32
-AHEAD = 16
-"""Chunks that are decompressed beyond the one that is asked for."""
 
 
 class Snapshot(NamedTuple):
@@ -61,17 +58,18 @@ class Reader:
 
     def __init__(self, path: Path | str, *, tolerant: bool = False) -> None:
         self.path, self.tolerant = Path(path), tolerant
-        self.problems: list[str] = []
-        self.left_out: list[str] = []
         self._source = Source(self.path)
         try:
-            self._entries = self._find_chunks()
-            self.header = read_header(self.path, self._source, self._entries)
+            self._layout = layout_of(self._source)
         except BaseException:
             self._source.close()
             raise
+        self.header: dict[str, Any] = self._layout.header
+        self._entries = self._layout.entries
+        self.problems = [*self._layout.problems]
+        self.left_out = [*self._layout.left_out]
         self.columns: tuple[str, ...] = tuple(self.header["columns"])
-        self._layout = TickLayout(self.columns)
+        self._ticks = TickLayout(self.columns)
         self.first_tick: int = self.header.get("first_tick", 0)
 
     def __enter__(self) -> Self:
@@ -101,7 +99,7 @@ class Reader:
             try:
                 content = self._content(entry)
                 if is_ticks(content):
-                    return self._layout.start_ns(content)
+                    return self._ticks.start_ns(content)
             except DamagedChunk:
                 continue
         return int(self.header["created_unix_ns"])
@@ -116,7 +114,7 @@ class Reader:
         try:
             content = self._content(entry)
             if is_ticks(content):
-                return self._layout.ticks(content, self.columns)
+                return self._ticks.ticks(content, self.columns)
             return self._checked(split_messages(content))
         except DamagedChunk as reason:
             self._leave_out(entry, reason)
@@ -169,7 +167,7 @@ class Reader:
             try:
                 content = self._content(entry)
                 if is_ticks(content):
-                    ticks = self._layout.ticks(content, self.columns)
+                    ticks = self._ticks.ticks(content, self.columns)
                     account.add(ticks)
                     yield ticks.rows, []
                 else:
@@ -195,17 +193,8 @@ class Reader:
             raise RecordingError(f"{self.path}: no signal {unknown[0]!r}; there are {', '.join(self.columns)}")
         return names
 
-    def _find_chunks(self) -> list[Entry]:
-        try:
-            return indexed_chunks(self._source)
-        except DamagedChunk as reason:
-            entries, problems = scanned_chunks(self._source)
-            self.problems += [f"{reason}: read from the beginning, without its index", *problems]
-            self.left_out += problems
-            return entries
-
     def _content(self, entry: Entry) -> bytes:
-        return unpack_chunk(read_chunk(self._source, entry))
+        return self._layout.content(entry)
 
     def _ahead(self, entries: Iterable[Entry], names: Sequence[str]) -> Iterator[tuple[Entry, Future[Ticks | None]]]:
         """The entries with what comes of decompressing them."""
@@ -213,7 +202,7 @@ class Reader:
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
                 waiting.append((entry, pool.submit(self._ticks_of, entry, names)))
-                if len(waiting) >= AHEAD:
+                if len(waiting) >= self._layout.ahead:
                     yield waiting.popleft()
             while waiting:
                 yield waiting.popleft()
@@ -221,7 +210,7 @@ class Reader:
     def _ticks_of(self, entry: Entry, names: Sequence[str]) -> Ticks | None:
         """The ticks of a chunk; None if it holds something else. Raises DamagedChunk."""
         content = self._content(entry)
-        return self._layout.ticks(content, names) if is_ticks(content) else None
+        return self._ticks.ticks(content, names) if is_ticks(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
         """The messages of one of the slow topics; what is wrong with the others in their chunks is reported too."""

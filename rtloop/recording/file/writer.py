@@ -90,11 +90,13 @@ class Writer:
             raise
 
     def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
-        """Rows (n, columns) float64 of consecutive ticks, n at most `format.chunk_rows`, as one chunk."""
-        count = len(rows)
-        if count == 0:
-            return
+        """Rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
+        for start in range(0, len(rows), len(self._blank)):
+            self._write_chunk(rows[start : start + len(self._blank)])
+
+    def _write_chunk(self, rows: np.ndarray[Any, Any]) -> None:
         self._check()
+        count = len(rows)
         records = self._blank[:count]
         format.fill_ticks(records, self._columns, rows, self.start_unix_ns)
         times, index = records["_log_time"], {}

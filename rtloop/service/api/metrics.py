@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from prometheus_client import CollectorRegistry, Gauge, generate_latest
+import math
+from collections.abc import Iterator
 
+from prometheus_client import CollectorRegistry, Gauge, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+from prometheus_client.registry import Collector
+from prometheus_client.utils import floatToGoString
+
+from rtloop.service.measuring.quality import LATENESS_US, Quality
 from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, timing
 from rtloop.supervision.recording_state import recording_state
@@ -36,6 +43,13 @@ def metrics_text(service: Service) -> str:
         for quantile, value in measured["lateness_us"].items():
             lateness.labels(quantile).set(value)
     _measured(service, registry)
+    registry.register(_Summed(service.quality))
+    if service.live is not None:
+        plan = service.live.prepared.plan
+        limit = Gauge("rtloop_drive_limit_v", "Limits of the drive", ["axis", "end"], registry=registry)
+        for axis, coefficients in zip(plan.axes, plan.coefficients, strict=True):
+            for end, name in (("lowest", "drive_min_v"), ("highest", "drive_max_v")):
+                limit.labels(axis, end).set(float(coefficients[name]))
     newest = newest_signals(service)
     trip = Gauge("rtloop_trip", "1 for each cause of the trip in force", ["cause"], registry=registry)
     for cause in newest.get("trip", ()):
@@ -68,3 +82,55 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
         for name in ("hz", "damping") if newest["resonance"] else ():
             mode.labels(axis, name).set(newest["resonance"][name])
             mode_std.labels(axis, name).set(newest["resonance"][f"{name}_std"])
+
+
+class _Summed(Collector):
+    """What only grows, for rates over any interval; and the largest values of the last minute."""
+
+    def __init__(self, quality: Quality) -> None:
+        self._quality = quality
+
+    def collect(self) -> Iterator[Metric]:
+        """As it is now."""
+        with self._quality.lock:
+            yield from [*self._of_loop(), *self._of_axes()]
+
+    def _of_loop(self) -> Iterator[Metric]:
+        sums = self._quality
+        for name, text, value in (
+            ("rtloop_ticks_summed", "Ticks of all loops that the sums are of", sums.ticks),
+            ("rtloop_ticks_unseen", "Ticks that were overwritten before they could be summed up", sums.unseen),
+            ("rtloop_tick_overruns", "Ticks that ended behind the next deadline", sums.overruns),
+            ("rtloop_tick_periods_missed", "Periods that passed unused", sums.periods_missed),
+        ):
+            yield CounterMetricFamily(name, text, value)
+        limited = CounterMetricFamily("rtloop_ticks_limited", "Ticks at a limit", labels=["limit"])
+        for name, value in sums.limited.items():
+            limited.add_metric([name], value)
+        trips = CounterMetricFamily("rtloop_trips", "Trips by cause", labels=["cause"])
+        for cause, value in sums.trips.items():
+            trips.add_metric([cause], value)
+        counts = sums.lateness.cumsum().tolist()
+        classes = list(zip(map(floatToGoString, (*LATENESS_US, math.inf)), counts, strict=True))
+        late = HistogramMetricFamily("rtloop_tick_lateness_us", "How late ticks began")
+        late.add_metric([], classes, sums.lateness_sum_us)
+        yield from (limited, trips, late)
+
+    def _of_axes(self) -> Iterator[Metric]:
+        closed = CounterMetricFamily("rtloop_closed_loop_ticks", "Ticks with an error", labels=["axis"])
+        error = CounterMetricFamily(
+            "rtloop_error_square_um2", "Sum of the squared error in closed loop", labels=["axis"]
+        )
+        drive = CounterMetricFamily("rtloop_drive_square_v2", "Sum of the squared drive", labels=["axis"])
+        worst = GaugeMetricFamily("rtloop_error_peak_um", "Largest error in closed loop, of a minute", labels=["axis"])
+        ends = GaugeMetricFamily("rtloop_drive_peak_v", "Least and largest drive of a minute", labels=["axis", "end"])
+        for axis, sums in self._quality.axes.items():
+            closed.add_metric([axis], sums.closed_ticks)
+            error.add_metric([axis], sums.error_um2)
+            drive.add_metric([axis], sums.drive_v2)
+            if sums.peaks:
+                errors, lowest, highest = zip(*sums.peaks, strict=True)
+                worst.add_metric([axis], max(errors))
+                ends.add_metric([axis, "lowest"], min(lowest))
+                ends.add_metric([axis, "highest"], max(highest))
+        yield from (closed, error, drive, worst, ends)

@@ -1,0 +1,215 @@
+"""Numbers of topics that other programs wrote, against what was given to the stock writers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.timestamp_pb2 import DESCRIPTOR as TIMESTAMP
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.writer import Writer as ProtobufWriter
+from mcap_ros2.writer import Writer as Ros2Writer
+
+from rtloop.interchange.from_mcap import read_mcap
+from rtloop.interchange.table import UnreadableData
+
+START_NS, STEP_NS, ROWS = 1_700_000_000_000_000_123, 99_999, 400
+TRUTH = np.random.default_rng(5).standard_normal((ROWS, 3))
+SECONDS = np.arange(ROWS) * STEP_NS * 1e-9
+
+
+def written(path: Path, messages: list[Any], encoding: str = "json", schema: Any = None, **options: Any) -> Path:
+    """One topic, `/imu`, by the stock writer."""
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start()
+        number = writer.register_schema(*schema) if schema else 0
+        channel = writer.register_channel("/imu", encoding, number)
+        for place, one in enumerate(messages):
+            data = one if isinstance(one, bytes) else json.dumps(one).encode()
+            writer.add_message(channel, START_NS + place * STEP_NS, data, 0)
+        writer.finish()
+    return path
+
+
+def samples() -> list[dict[str, Any]]:
+    return [
+        {"name": "a", "on": bool(place % 2), "accel": {"x": row[0], "yz": [row[1], row[2]]}, "counts": place}
+        for place, row in enumerate(TRUTH.tolist())
+    ]
+
+
+def require_truth(path: Path, topic: str | None = None) -> None:
+    table = read_mcap(path, topic)
+    assert table.time == "log_time_s"
+    assert table.units["log_time_s"] == "s"
+    np.testing.assert_allclose(table.columns["log_time_s"], SECONDS, rtol=0, atol=1e-15)
+    for name, truth in (("accel.x", 0), ("accel.yz.0", 1), ("accel.yz.1", 2)):
+        assert table.columns[name].tobytes() == TRUTH[:, truth].tobytes()
+    assert table.columns["counts"].tolist() == list(range(ROWS))
+    assert table.columns["on"].tolist() == [place % 2 for place in range(ROWS)]
+
+
+@pytest.mark.parametrize("schema", [None, ("Imu", "jsonschema", b'{"type": "object"}')])
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_json(tmp_path: Path, schema: Any, compression: CompressionType):
+    path = written(tmp_path / "a.mcap", samples(), schema=schema, compression=compression, chunk_size=9_000)
+    require_truth(path)
+    require_truth(path, "/imu")
+
+
+def imu() -> Any:
+    """A class of protobuf messages: nested, repeated, with a time of protobuf's own."""
+    file = FileDescriptorProto(name="imu.proto", package="lab", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    xyz = file.message_type.add(name="Accel")
+    xyz.field.add(name="x", number=1, type=Field.TYPE_DOUBLE, label=Field.LABEL_OPTIONAL)
+    xyz.field.add(name="yz", number=2, type=Field.TYPE_DOUBLE, label=Field.LABEL_REPEATED)
+    message = file.message_type.add(name="Imu")
+    for number, (name, kind) in enumerate({"on": Field.TYPE_BOOL, "counts": Field.TYPE_UINT32}.items(), 1):
+        message.field.add(name=name, number=number, type=kind, label=Field.LABEL_OPTIONAL)
+    for number, (name, kind) in enumerate({"accel": ".lab.Accel", "at": ".google.protobuf.Timestamp"}.items(), 7):
+        message.field.add(name=name, number=number, type=Field.TYPE_MESSAGE, type_name=kind, label=Field.LABEL_OPTIONAL)
+    pool = DescriptorPool()
+    pool.AddSerializedFile(TIMESTAMP.serialized_pb)
+    pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName("lab.Imu"))
+
+
+def test_protobuf(tmp_path: Path):
+    path, kind = tmp_path / "a.mcap", imu()
+    with path.open("wb") as file, ProtobufWriter(file) as writer:
+        for place, row in enumerate(TRUTH.tolist()):
+            message = kind(on=bool(place % 2), counts=place, accel={"x": row[0], "yz": row[1:]})
+            message.at.seconds, message.at.nanos = 1_700_000_000 + place, place
+            writer.write_message("/imu", message, START_NS + place * STEP_NS, 0)
+    require_truth(path)
+    table = read_mcap(path)
+    assert table.columns["at.seconds"].tolist() == [1_700_000_000.0 + place for place in range(ROWS)]
+    assert table.columns["at.nanos"].tolist() == list(range(ROWS))
+
+
+ROS2 = """bool on
+uint32 counts
+string name
+lab_msgs/Accel accel
+================================================================================
+MSG: lab_msgs/Accel
+float64 x
+float64[] yz
+"""
+
+
+def test_ros2(tmp_path: Path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        schema = writer.register_msgdef("lab_msgs/msg/Imu", ROS2)
+        for place, row in enumerate(TRUTH.tolist()):
+            message = {"on": bool(place % 2), "counts": place, "name": "a", "accel": {"x": row[0], "yz": row[1:]}}
+            writer.write_message("/imu", schema, message, START_NS + place * STEP_NS, 0)
+        writer.finish()
+    require_truth(path)
+
+
+def test_messages_in_another_order_and_fields_that_come_and_go(tmp_path: Path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=50)
+        writer.start()
+        channels = [writer.register_channel("/a", "json", 0, {"of": name}) for name in "xy"]
+        for place in (3, 0, 2, 1):
+            data = {"k": place} | ({"odd": None if place == 1 else "Infinity"} if place % 2 else {})
+            writer.add_message(channels[place // 2], place * 1_000_000_000, json.dumps(data).encode(), 0)
+        writer.finish()
+    table = read_mcap(path)
+    assert table.columns["log_time_s"].tolist() == table.columns["k"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(table.columns["odd"], [np.nan, np.nan, np.nan, np.inf])
+
+
+def test_several_topics_are_named(tmp_path: Path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for name in ("/a", "/b"):
+            writer.add_message(writer.register_channel(name, "json", 0), 0, b'{"x": 1}', 0)
+        writer.finish()
+    assert read_mcap(path, "/b").columns["x"].tolist() == [1]
+    with pytest.raises(
+        UnreadableData, match=r"one is to be named: '/a' \(json, 1 messages\), '/b' \(json, 1 messages\)"
+    ):
+        read_mcap(path)
+    with pytest.raises(UnreadableData, match=r"no topic '/c'; there are '/a'"):
+        read_mcap(path, "/c")
+
+
+def descriptors(*files: FileDescriptorProto) -> bytes:
+    return FileDescriptorSet(file=files).SerializeToString()
+
+
+B = descriptors(FileDescriptorProto(name="b", package="lab", message_type=[DescriptorProto(name="B")]))
+CIRCLE = descriptors(FileDescriptorProto(name="a", dependency=["b"]), FileDescriptorProto(name="b", dependency=["a"]))
+RECURSIVE = ("a/msg/A", "ros2msg", b"a/A inner\n" + b"=" * 80 + b"\nMSG: a/A\na/A inner\n")
+EMPTY_ITEMS = ("a/msg/A", "ros2msg", b"a/E[] all\n" + b"=" * 80 + b"\nMSG: a/E\n# nothing\n")
+BAD: list[tuple[Any, str, Any, str]] = [
+    (b"\x93NUMPY", "cbor", None, r"its messages are cbor; json, protobuf and cdr \(ros2msg\) can be read"),
+    (b"", "ros1", ("a/A", "ros1msg", b"float64 x"), r"its messages are ros1 \(ros1msg\)"),
+    (b"", "protobuf", None, "its messages are protobuf;"),
+    (b"", "protobuf", ("A", "protobuf", b"\xff\xff"), "its schema 'A' cannot be read"),
+    (b"", "protobuf", ("A", "protobuf", CIRCLE), "its schema 'A' cannot be read"),
+    (b"\xff\xff", "protobuf", ("lab.B", "protobuf", B), "message 0: it is not what its schema says"),
+    (b"\0\1\0\0", "cdr", RECURSIVE, "message 0: it is not what its schema says"),
+    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "a message without fields, and lists"),
+    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "is not what its schema says"),
+    (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|not what its schema says"),
+    (b"{", "json", None, "message 0: it is not JSON"),
+    (b"[" * 100_000, "json", None, "message 0: it is not JSON"),
+    (b'{"a": "text"}', "json", None, "there is no number in its messages"),
+    (b'{"a": 1' + b"0" * 400 + b"}", "json", None, "too large"),
+    (b'{"a":' * 60 + b"1" + b"}" * 60, "json", None, "more than 50 deep"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("data", "encoding", "schema", "why"), BAD)
+def test_what_cannot_be_read_is_refused_in_words(tmp_path: Path, data: bytes, encoding: str, schema: Any, why: str):
+    path = written(tmp_path / "a.mcap", [data], encoding, schema)
+    with pytest.raises(UnreadableData, match=rf"a\.mcap: '/imu': .*({why})"):
+        read_mcap(path)
+
+
+def test_long_lists_are_left_out(tmp_path: Path):
+    table = read_mcap(written(tmp_path / "a.mcap", [{"picture": [0] * 5_000, "x": 1.5}]))
+    assert set(table.columns) == {"log_time_s", "x"}
+
+
+def test_each_message_with_fields_of_its_own_is_no_table(tmp_path: Path):
+    path = written(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
+    with pytest.raises(UnreadableData, match="that is no table"):
+        read_mcap(path)
+
+
+@pytest.mark.parametrize("make", [lambda path: path.write_bytes(b"PK\x03\x04"), lambda path: None, Path.mkdir])
+def test_no_mcap_file(tmp_path: Path, make: Callable[[Path], Any]):
+    make(tmp_path / "a.mcap")
+    with pytest.raises(UnreadableData, match=r"a\.mcap: "):
+        read_mcap(tmp_path / "a.mcap")
+
+
+def test_a_file_that_was_cut_off_gives_what_is_whole(tmp_path: Path):
+    path = written(tmp_path / "a.mcap", samples(), chunk_size=4_000, compression=CompressionType.NONE)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    table = read_mcap(path)
+    rows = len(table.columns["counts"])
+    assert 20 < rows < ROWS
+    assert table.columns["accel.x"].tobytes() == TRUTH[:rows, 0].tobytes()
+    assert "bytes are left out" in table.about["problems"]
