@@ -13,6 +13,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message, may_hold
 from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.overview import MEAN, OverviewLayout, Range, ranges
 from rtloop.recording.file.reader import Rows, tick_of
 from rtloop.signals import TICK
 
@@ -35,6 +36,7 @@ class Source:
         header = seekers[0].reader.header
         self.header: dict[str, Any] = {key: value for key, value in header.items() if key not in OF_THE_FILE}
         self._reach = ring_ticks(header["rate_hz"])
+        self._layout = OverviewLayout(header["columns"])
         self.problems: list[str] = []
         """What turned out to be damaged in `contents`."""
 
@@ -76,6 +78,27 @@ class Source:
                         return begin
         raise RecordingError(f"{self.path}: tick {tick}: no state of the law to begin from stands at it or before it")
 
+    def kept(self, asked: Stretch) -> Stretch:
+        """A stretch as it can be cut: from the newest snapshot at or before it, without what was left out at its ends.
+
+        Raises RecordingError where nothing of it was kept.
+        """
+        end = asked.end
+        for reader in (seeker.reader for seeker in self._seekers if seeker.reader.header.get("around")):
+            for first, count in reader.skipped:
+                if first <= asked.first < first + count:
+                    asked = Stretch(first + count, end)
+            for first, last in reader.overview[:, TICK, :MEAN]:
+                if first < end <= last:
+                    end = int(first)
+        if not asked.first < end:
+            raise RecordingError(f"{self.path}: these ticks were left out by intention: it is recorded around events")
+        return Stretch(self.begin(asked.first), end)
+
+    def skipped(self, messages: Sequence[Message]) -> list[Range]:
+        """What messages of a stretch say that was left out."""
+        return ranges(self._layout.intervals([one.payload for one in messages if one.channel == format.OVERVIEW]))
+
     def files(self, stretch: Stretch) -> list[str]:
         """The names of the files that hold ticks of it."""
         return [
@@ -94,7 +117,7 @@ class Source:
                 if place < ticks and not _may_be_slow(seeker, place):
                     continue
                 rows = seeker.rows(place, begin, stretch.end)
-                messages = [one for one in self._slow(seeker, place) if _belongs(one, stretch)]
+                messages = [one for one in self._slow(seeker, place) if self._belongs(one, stretch)]
                 self.problems += seeker.damage.get(place, [])
                 if len(rows):
                     begin = int(rows[-1, TICK]) + 1
@@ -106,17 +129,18 @@ class Source:
         found = seeker.chunk(place) if _may_be_slow(seeker, place) else None
         return found if isinstance(found, list) else []
 
+    def _belongs(self, message: Message, stretch: Stretch) -> bool:
+        """Whether an event, a snapshot or an overview is of a stretch; the end of the file is not."""
+        if message.channel == format.LAW:
+            return stretch.first <= tick_of(message) < stretch.end
+        if message.channel == format.OVERVIEW:
+            return all(stretch.first <= first and first + n <= stretch.end for first, n in self.skipped([message]))
+        if message.channel != format.EVENTS:
+            return False
+        event = json.loads(message.payload)
+        return stretch.first <= event["tick"] < stretch.end and event["kind"] not in FINAL
+
 
 def _may_be_slow(seeker: Seeker, place: int) -> bool:
     entry = seeker.reader.entries[place]
-    return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW))
-
-
-def _belongs(message: Message, stretch: Stretch) -> bool:
-    """Whether an event or a snapshot is of a stretch; the end of the file is not."""
-    if message.channel == format.LAW:
-        return stretch.first <= tick_of(message) < stretch.end
-    if message.channel != format.EVENTS:
-        return False
-    event = json.loads(message.payload)
-    return stretch.first <= event["tick"] < stretch.end and event["kind"] not in FINAL
+    return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW, format.OVERVIEW))

@@ -10,7 +10,7 @@ else: a missing tick that none of them is about was lost.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, McapRecord, Schema
@@ -43,6 +43,44 @@ def declared(columns: Sequence[str]) -> list[McapRecord]:
             schema_id=format.OVERVIEW_SCHEMA,
         ),
     ]
+
+
+class Extremes(NamedTuple):
+    """Of one signal, shape (n,) each."""
+
+    least: np.ndarray[Any, Any]
+    most: np.ndarray[Any, Any]
+    mean: np.ndarray[Any, Any]
+
+
+class Overview:
+    """What is left of the ticks that were left out: `overview["x_error_um"].most` is an array of shape (n,)."""
+
+    def __init__(self, columns: Sequence[str], intervals: Intervals) -> None:
+        self._columns, self._intervals = list(columns), intervals
+
+    def __len__(self) -> int:
+        return len(self._intervals)
+
+    def __getitem__(self, name: str) -> Extremes:
+        if name not in self._columns:
+            raise KeyError(f"no signal {name!r}; there are {', '.join(self._columns)}")
+        return Extremes(*self._intervals[:, self._columns.index(name)].T)
+
+    @property
+    def tick(self) -> np.ndarray[Any, Any]:
+        """The first tick of each interval."""
+        return self["tick"].least
+
+    @property
+    def ticks(self) -> np.ndarray[Any, Any]:
+        """How many ticks each is about."""
+        return self["tick"].most - self["tick"].least + 1
+
+    @property
+    def time_s(self) -> np.ndarray[Any, Any]:
+        """When the first of them was due, in s since the start of the run."""
+        return self["deadline_ns"].least * 1e-9
 
 
 class OverviewLayout:

@@ -187,11 +187,15 @@ class Reader:
     @cached_property
     def overview(self) -> Intervals:
         """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.overview`."""
-        found = self._overview.intervals([message.payload for message in self._messages(format.OVERVIEW)])
+        found = self.intervals_of(self._messages(format.OVERVIEW))
         good = plausible(found)
         if not good.all():
             self._report("an overview is about no ticks, or about some that another one is about")
         return found[good]
+
+    def intervals_of(self, messages: Iterable[Message]) -> Intervals:
+        """What those of `/overview` among messages of this recording say."""
+        return self._overview.intervals([one.payload for one in messages if one.channel == format.OVERVIEW])
 
     @cached_property
     def skipped(self) -> list[Range]:

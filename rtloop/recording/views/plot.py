@@ -10,12 +10,14 @@ import numpy as np
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load, unit_of
-from rtloop.recording.views.bands import Band, Mark, Progress, drawn_signals, marks, read_bands, title
+from rtloop.recording.views.bands import Band, Mark, Progress, drawn_signals, kept_spans, marks, read_bands, title
 
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
 MAX_LABELS = 12
 REFERENCE, POSITION, ERROR, DRIVE, LATENESS = "0.15", "tab:blue", "tab:red", "tab:green", "tab:purple"
+KEPT = "gold"
+"""Behind what is recorded at the full rate, where the rest is an overview."""
 
 
 def plot(
@@ -47,6 +49,10 @@ def plot(
     figure = Figure(figsize=(12, 2.0 + 2.1 * (3 * len(axes) + 1)), layout="constrained")
     FigureCanvasAgg(figure)
     _draw(figure, axes, bands, marks(recording, time_s[0], time_s[-1]))
+    for begin, end in kept_spans(recording):
+        if begin <= time_s[-1] and end >= time_s[0]:
+            for panel in figure.axes:
+                panel.axvspan(max(begin, time_s[0]), min(end, time_s[-1]), color=KEPT, alpha=0.25, linewidth=0)
     figure.suptitle(title(recording), fontsize=11, parse_math=False)
     try:
         figure.savefig(target, format=target.suffix[1:], dpi=110)

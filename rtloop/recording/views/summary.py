@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.recording.file.events import COMMANDS, RECOVERED
+from rtloop.recording.file.overview import uncovered
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.views.histogram import Histogram
@@ -55,6 +56,12 @@ class Summary:
     """Which stretch (`first`, `end`) of which `files` was asked for, where it is one."""
     ticks_logged: int
     ticks_lost: int
+    around: dict[str, Any] | None
+    """Around what it was recorded: `before_s`, `after_s`, `on`, `every_s`; None for a recording of every tick."""
+    stretches: int
+    """That were kept."""
+    ticks_skipped: int
+    """That were left out by intention."""
     periods_missed: int
     rate_hz: float
     achieved_rate_hz: float | None
@@ -168,7 +175,10 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
     ends = [reader.totals for reader in readers]
     finished = ends[-1]
     executed = finished["ticks_executed"] if finished else int(totals.last[0]) + 1 if totals.first else 0
-    lost = executed - header.get("first_tick", 0) - totals.ticks
+    begin, skipped = header.get("first_tick", 0), [one for reader in readers for one in reader.skipped]
+    executed = max([executed, *(first + count for first, count in skipped)])
+    ticks_skipped = sum(count for _, count in skipped)
+    lost = executed - begin - totals.ticks - ticks_skipped
     problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
     whole = bool(finished and finished["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
@@ -182,6 +192,9 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         cut=header.get("cut"),
         ticks_logged=totals.ticks,
         ticks_lost=lost,
+        around=header.get("around"),
+        stretches=len(uncovered(begin, executed, skipped)),
+        ticks_skipped=ticks_skipped,
         periods_missed=totals.periods_missed,
         rate_hz=rate_hz,
         achieved_rate_hz=totals.executed / totals.span_s if totals.span_s else None,
