@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rtloop.configuration.file import AroundOptions
-from rtloop.engine.memory import RING_SECONDS, ring_ticks
+from rtloop.engine.memory import RING_SECONDS, Sizes, ring_ticks
 from rtloop.recording.capture.conditions import unknown_signal
 from rtloop.recording.file.around import Around
 from rtloop.recording.file.overview import MAX_COLUMNS
@@ -17,6 +17,13 @@ MOST_BYTES = 1 << 30
 def around_of(options: AroundOptions) -> Around:
     """As the recorder is told."""
     return Around(options.before_s, options.after_s, options.on, options.every_s)
+
+
+def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
+    """Of the shared block: its ring holds what waits in the recorder's memory as well, for one that takes its place."""
+    if options is None:
+        return sizes
+    return sizes._replace(rate_hz=sizes.rate_hz * around_of(options).ring_factor(RING_SECONDS))
 
 
 def around_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz: float) -> list[str]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.around import around_faults
+from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.coefficients import axis_coefficients, joined
 from rtloop.configuration.extras import extras_of

@@ -106,6 +106,8 @@ class Memory:
 
     def cut(self, tick: int) -> None:
         """A segment ends before the snapshot of `tick`, another one begins with it."""
+        if tick == self._segments[-1].begin:
+            return
         self._segments[-1].end = tick
         self._segments.append(Segment(tick, kept=tick <= self._until))
 

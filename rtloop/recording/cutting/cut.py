@@ -139,7 +139,7 @@ def _asked(source: Source, first: int | None, end: int | None, from_s: float | N
     if from_s is not None:
         first = source.due(from_s)
     if until_s is not None:
-        end = source.due(until_s)
+        end = source.due_or_skipped(until_s)
     asked = Stretch(whole.first if first is None else first, whole.end if end is None else end)
     named = f"{source.path}: ticks from {asked.first} to before {asked.end}"
     if not asked.first < asked.end:

@@ -13,9 +13,9 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message, may_hold
 from rtloop.recording.file.events import FINAL
-from rtloop.recording.file.overview import MEAN, OverviewLayout, Range, ranges
+from rtloop.recording.file.overview import LEAST, MEAN, MOST, OverviewLayout, Range, ranges
 from rtloop.recording.file.reader import Rows, tick_of
-from rtloop.signals import TICK
+from rtloop.signals import DEADLINE, TICK
 
 OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "cut")
 """What a header says of the one file that it stands in."""
@@ -57,16 +57,28 @@ class Source:
         last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
         if first is None or last is None:
             raise RecordingError(f"{self.path}: holds no ticks")
-        return Stretch(first.first, last.last + 1)
+        skipped = [first + count for seeker in self._seekers for first, count in seeker.reader.skipped]
+        return Stretch(first.first, max(last.last + 1, *skipped, 0))
 
     def due(self, time_s: float) -> int:
         """The first tick that was due `time_s` after the start or later. Raises RecordingError where there is none."""
-        found = next((tick for seeker in self._seekers if (tick := seeker.due(time_s * 1e9)) is not None), None)
+        found = self._next_due(time_s)
         if found is None:
             last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
             end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
             raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
         return found
+
+    def due_or_skipped(self, time_s: float) -> int:
+        """As `due`; where that tick was left out by intention, the first one of the interval that it was in."""
+        for overview in (seeker.reader.overview for seeker in self._seekers):
+            within = (overview[:, DEADLINE, LEAST] <= time_s * 1e9) & (time_s * 1e9 <= overview[:, DEADLINE, MOST])
+            if within.any():
+                return int(overview[within][0, TICK, LEAST])
+        return self.due(time_s)
+
+    def _next_due(self, time_s: float) -> int | None:
+        return next((tick for seeker in self._seekers if (tick := seeker.due(time_s * 1e9)) is not None), None)
 
     def begin(self, tick: int) -> int:
         """The newest snapshot at or before `tick` whose own tick is there. Raises RecordingError."""

@@ -82,6 +82,11 @@ class Overview:
         """When the first of them was due, in s since the start of the run."""
         return self["deadline_ns"].least * 1e-9
 
+    @property
+    def end_s(self) -> np.ndarray[Any, Any]:
+        """When the last one was."""
+        return self["deadline_ns"].most * 1e-9
+
 
 class OverviewLayout:
     """The messages of a recording with `columns`."""
@@ -94,7 +99,7 @@ class OverviewLayout:
         format.fill_tags(self._blank, names)
         same = np.ones(self._dtype.itemsize, bool)
         for name in names:
-            _, start, *_ = (self._dtype.fields or {})[name]
+            _, start, *_ = (self._dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
             same[start : start + 8] = False
         self._fixed = np.flatnonzero(same)
         self._tags = self._blank.view(np.uint8)[self._fixed]

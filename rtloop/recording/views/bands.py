@@ -77,7 +77,9 @@ def read_bands(
     return {name: Band(time_s, low[:, index], high[:, index]) for index, name in enumerate(names)}
 
 
-def _overview(recording: Recording, names: list[str], start_s: float, end_s: float, points: int) -> tuple[Any, Any, Any]:
+def _overview(
+    recording: Recording, names: list[str], start_s: float, end_s: float, points: int
+) -> tuple[Any, Any, Any]:
     """Times (n,), least and largest values (n, names) of what was left out by intention, in about so many points."""
     empty = np.empty((0, len(names)))
     if not recording.skipped:
@@ -90,7 +92,9 @@ def _overview(recording: Recording, names: list[str], start_s: float, end_s: flo
     found = [overview[name] for name in names]
     low, high = (np.stack([getattr(one, part)[inside] for one in found], axis=1) for part in ("least", "most"))
     low, high = (np.where(np.abs(values) < BEYOND_DRAWING, values, np.nan) for values in (low, high))
-    return overview.time_s[inside][edges], np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
+    begins_s, ends_s = overview.time_s[inside][edges], np.fmax.reduceat(overview.end_s[inside], edges)
+    bands = (np.repeat(reduced, 2, axis=0) for reduced in (np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)))
+    return np.stack([begins_s, ends_s], axis=1).ravel(), *bands  # level from the beginning of each to its end
 
 
 def kept_spans(recording: Recording) -> list[tuple[float, float]]:
@@ -98,10 +102,9 @@ def kept_spans(recording: Recording) -> list[tuple[float, float]]:
     if not recording.skipped:
         return []
     overview, ticks = recording.overview, recording.skipped
-    ends_s = overview["deadline_ns"].most * 1e-9
     begins = np.searchsorted(overview.tick, [first for first, _ in ticks])
     ends = np.searchsorted(overview.tick, [first + count for first, count in ticks]) - 1
-    edges = [0.0, *np.stack([overview.time_s[begins], ends_s[ends]], axis=1).ravel(), np.inf]
+    edges = [0.0, *np.stack([overview.time_s[begins], overview.end_s[ends]], axis=1).ravel(), np.inf]
     return [(float(a), float(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from rtloop.recording.file.events import COMMANDS, RECOVERED
-from rtloop.recording.file.overview import uncovered
+from rtloop.recording.file.overview import LEAST, MOST, uncovered
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.views.histogram import Histogram
-from rtloop.signals import Flag, Mode
+from rtloop.signals import DEADLINE, Flag, Mode
 
 MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED)
@@ -169,6 +169,15 @@ def _seamless(end: dict[str, Any] | None) -> bool:
     return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
 
 
+def _overview_span_s(readers: Sequence[Reader], totals: Totals) -> float:
+    """From the first deadline to the last where ticks were left out by intention; 0 where none were."""
+    found = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
+    if not found or totals.first is None:
+        return 0.0
+    first, last = found[0][0, LEAST], found[-1][-1, MOST]
+    return float(max(last, totals.last[1]) - min(first, totals.first[1])) / 1e9
+
+
 def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
@@ -198,7 +207,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         periods_missed=totals.periods_missed,
         rate_hz=rate_hz,
         achieved_rate_hz=totals.executed / totals.span_s if totals.span_s else None,
-        duration_s=totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
+        duration_s=max(totals.span_s, _overview_span_s(readers, totals)) + 1 / rate_hz if totals.ticks else 0.0,
         paced=header["paced"],
         overruns=totals.overruns,
         ticks_limited=totals.limited,
