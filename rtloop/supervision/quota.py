@@ -18,6 +18,8 @@ from rtloop.errors import RtloopError
 from rtloop.recording.file.around import Around
 from rtloop.recording.file.reader import Reader
 
+OTHERWISE_MADE = ("cut", "imported")
+"""In the headers of what is no run's own file."""
 SPARE_BYTES = 64 << 20
 """Beside what is to stay free: room is made before the recorder has none."""
 BUDGET_S = 0.2
@@ -127,7 +129,7 @@ class Quota:
         try:
             with Reader(self._folder / one.name) as reader:
                 header, totals = reader.header, reader.totals
-                if totals is None or header["name"] != self._name or header.get("cut") or header.get("imported"):
+                if totals is None or header["name"] != self._name or any(map(header.get, OTHERWISE_MADE)):
                     return None
                 around = Around.of(header)
                 before_s, after_s = (around.before_s, around.after_s) if around else (BEFORE_S, AFTER_S)
@@ -135,6 +137,8 @@ class Quota:
                 rate_hz = header["rate_hz"]
                 trips = tuple((tick - round(before_s * rate_hz), tick + round(after_s * rate_hz)) for tick in ticks)
                 run = (header["name"], header["created_unix_ns"])
+                if reader.problems:
+                    return None
                 return Stored(run, reader.first_tick, totals["ticks_executed"], trips)
         except RtloopError:
             return None

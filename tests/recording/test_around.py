@@ -1,4 +1,4 @@
-"""A recording around events keeps what is around them bit for bit, tells of the rest, and replays stretch by stretch."""
+"""What a recording around events keeps, bit for bit, what it tells of the rest, and that every stretch replays."""
 
 from __future__ import annotations
 
@@ -247,7 +247,9 @@ def test_conditions_hold_where_they_say():
         (hit,) = Conditions([text], columns).find(rows, events)
         assert ((hit.first, hit.last), hit.condition) == (expected, text)
     assert Conditions(["v > 100", "v != 1e300"], columns).find(rows[7:8], []) == []  # NaN is nowhere
-    assert unknown_signal("vv > 1", columns) == "'vv > 1': no signal 'vv'; did you mean v?; there are " + ", ".join(columns)
+    assert unknown_signal("vv > 1", columns) == "'vv > 1': no signal 'vv'; did you mean v?; there are " + ", ".join(
+        columns
+    )
     for wrong in ("", "v", "v >", "abs(v > 1", "v > 1 > 2", "trips", "v > nan"):
         with pytest.raises(ValueError, match="no condition"):
             comparison_of(wrong)

@@ -127,7 +127,7 @@ class Memory:
             decided = end or (head.end is not None and head.end <= self._newest - self._before)
             if not (head.kept or decided):
                 break
-            if not head.asked:
+            if not head.asked and any(len(part.rows) for part in head.parts):
                 head.asked, due = True, file_is_due(head.begin)
                 if due:
                     head.kept = True

@@ -85,6 +85,10 @@ class SelectiveSession(Session):
         self._memory.begin_file()
         return self._memory.begin
 
+    def _finish_file(self, kind: str, result: str, end_tick: int, said_tick: int) -> None:
+        """What waits, and goes into the next file, was before `said_tick`."""
+        super()._finish_file(kind, result, end_tick, min(end_tick, said_tick))
+
     def _waiting(self, channel: int) -> int:
         return super()._waiting(channel) + self._memory.waiting(channel)
 
