@@ -61,12 +61,12 @@ class Quota:
         self.bytes = self.removed = self.removed_bytes = 0
         """What all of them take now; how many were removed, and what these took."""
 
-    def keep(self) -> list[str]:
-        """Remove what is too much; what was removed, in words."""
+    def keep(self, budget_s: float = BUDGET_S) -> list[str]:
+        """Remove what is too much; what was removed, in words. `budget_s`: for opening files."""
         said: list[str] = []
         try:
             lying = self._lying()
-            self._look(lying)
+            self._look(lying, budget_s)
             self.bytes = sum(one.bytes for one in lying)
             for one in self._removable(lying):
                 reason = self._too_much()
@@ -111,9 +111,9 @@ class Quota:
                     found.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
         return sorted(found)
 
-    def _look(self, lying: list[Lying]) -> None:
+    def _look(self, lying: list[Lying], budget_s: float) -> None:
         """Into files that were not seen before, the oldest first."""
-        until_s = time.monotonic() + BUDGET_S
+        until_s = time.monotonic() + budget_s
         self._known = {one: self._known[one] for one in lying if one in self._known}
         self._strange &= set(lying)
         for one in lying:

@@ -29,8 +29,8 @@ LONGEST_STEP_S = 0.1
 END_TIMEOUT_S = 30.0
 MAX_REPLACEMENTS = 10
 POLL_S = 0.01
-QUOTA_S = 1.0
-"""Between two looks at what the recordings take."""
+QUOTA_S, LAST_LOOK_S = 1.0, 10.0
+"""Between two looks at what the recordings take; for the one at the end."""
 
 
 class RecorderKeeper:
@@ -152,11 +152,10 @@ class RecorderKeeper:
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._totals()
         for part in self._files(".mcap.part"):
             self._repair(part)
-        self._kept_s = -QUOTA_S
-        self._keep_quota()
-        if self.quota is not None and self.quota.removed:
+        if self.quota is not None:
+            self.removals += self.quota.keep(LAST_LOOK_S)
             files, gib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**30
-            self.notes.append(f"{files} of recordings, {gib:.3g} GiB, removed by recording.keep_gib")
+            self.notes += [f"{files} of recordings, {gib:.3g} GiB, removed by recording.keep_gib"] * bool(self.removals)
         totals["paths"] = [str(path) for path in self._files(".mcap")]
         return totals
 

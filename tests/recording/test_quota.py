@@ -52,7 +52,7 @@ def keep(folder: Path, files: int) -> Quota:
     size = max(path.stat().st_size for path in folder.glob("test-*.mcap"))
     quota = Quota(folder, "test", files * size, 0)
     for _ in range(3):
-        quota.keep()
+        quota.keep(budget_s=60.0)
     return quota
 
 
@@ -108,17 +108,15 @@ def test_a_disk_that_fills_counts_as_much(tmp_path: Path, disk: SimpleNamespace)
     quota = Quota(tmp_path, "test", 1 << 40, 10 << 20)
     assert quota.keep() == []
     disk.f_bavail = (10 << 20) + SPARE_BYTES - 1
-    (said, *more) = quota.keep()
+    said, *more = quota.keep(budget_s=60.0)
     assert "less than 74 MiB are free" in said
     assert [name for name in left(tmp_path)] == [files[0].name, files[-1].name]
     assert len(more) == 1
 
 
-def test_what_was_not_looked_at_yet_is_not_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_was_not_looked_at_yet_is_not_removed(tmp_path: Path):
     files = run_of(tmp_path, "20260101T000001", 4)
-    monkeypatch.setattr("rtloop.supervision.quota.BUDGET_S", 0.0)
-    quota = Quota(tmp_path, "test", 1, 0)
-    assert quota.keep() == []
+    assert Quota(tmp_path, "test", 1, 0).keep(budget_s=0.0) == []
     assert len(left(tmp_path)) == len(files)
 
 

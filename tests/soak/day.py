@@ -166,8 +166,8 @@ def main() -> None:
             (folder / part).mkdir()
         a_quota(folder / "quota", 2.0, 12, 200.0, "a quota of 200 MiB")
         if os.geteuid() == 0:
-            with small_disk(folder / "disk", 180) as disk:
-                a_quota(disk, 2.0, 12, 1024.0, "a disk of 180 MiB, of which 32 are to stay free", 32.0)
+            with small_disk(folder / "disk", 320) as disk:
+                a_quota(disk, 2.0, 12, 1024.0, "a disk of 320 MiB, of which 32 are to stay free", 32.0)
         else:
             print("a disk that fills: skipped, only root can mount one")
         a_day(folder / "day", given.hours, given.events)
