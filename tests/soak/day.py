@@ -21,15 +21,16 @@ from rtloop.recording.load import load
 from tests.recording.real_loop import PAPER, ROOT
 
 RATE_HZ = 10_000
+"""Of the paper's loop; at any other rate the feedforward runs alone, for its controller is made for this one."""
 BEFORE_S, AFTER_S = 10, 30
-LOUD_V = 7.6
+LOUD_V = 4.5
 """Beyond what the usual reference asks for, and reached by steps of 25 µm."""
 EVENTS = ("trip", "mode", "loud")
-USUAL = 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 5.0 }'
+USUAL = 'reference = { kind = "sine", amplitude = 10.0, frequency_hz = 5.0 }'
 SEQUENCES = {
     "trip": [(0.0, 'reference = { kind = "steps", levels = [75.0, 0.0], dwell_s = 5.0 }'), (3.0, USUAL),
-             (4.0, "reset_trip = true"), (4.1, 'mode = "closed_loop"')],
-    "mode": [(0.0, 'mode = "feedforward"'), (2.0, 'mode = "closed_loop"')],
+             (4.0, "reset_trip = true"), (4.1, 'mode = "MODE"')],
+    "mode": [(0.0, 'mode = "off"'), (2.0, 'mode = "MODE"')],
     "loud": [(0.0, 'reference = { kind = "steps", levels = [25.0, -25.0], dwell_s = 0.5 }'), (2.0, USUAL)],
 }  # fmt: skip
 """What happens in an event, in seconds behind its beginning."""
@@ -42,24 +43,28 @@ class Event(NamedTuple):
     tick: int
 
 
-def events(hours: float, count: int) -> list[Event]:
+def events(hours: float, count: int, rate_hz: int = RATE_HZ) -> list[Event]:
     """So many, in turn, each somewhere in its share of the time."""
     share_s, random = hours * 3600 / count, np.random.default_rng(7)
     begins_s = [(k + random.uniform(0.3, 0.7)) * share_s for k in range(count)]
-    return [Event(EVENTS[k % len(EVENTS)], round(begin_s * RATE_HZ)) for k, begin_s in enumerate(begins_s)]
+    return [Event(EVENTS[k % len(EVENTS)], round(begin_s * rate_hz)) for k, begin_s in enumerate(begins_s)]
 
 
-def configuration(planned: list[Event], recording: str) -> str:
+def configuration(planned: list[Event], recording: str, rate_hz: int) -> str:
     """The paper's loop, with these events and lines of [recording]."""
     on = f'["trip", "mode", "abs(x_drive_v) > {LOUD_V}"]'
     around = f"around = {{ before_s = {BEFORE_S}, after_s = {AFTER_S}, on = {on} }}\n"
     steps = PAPER[PAPER.index("[axis.reference]") :].split("\n\n", 1)[0]
     text = PAPER.replace(steps, f"[axis.reference]\n{USUAL.partition('{')[2].strip(' }').replace(', ', chr(10))}\n")
     text = text.replace('folder = "recordings"\n', f'folder = "recordings"\n{around}{recording}')
-    entries = [(0, USUAL)] + [
-        (event.tick + round(at_s * RATE_HZ), what) for event in planned for at_s, what in SEQUENCES[event.kind]
-    ]
-    return text + "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in entries[1:])
+    mode = "closed_loop"
+    if rate_hz != RATE_HZ:
+        mode, text = "feedforward", text.replace("position_um = 60.0", "position_um = 35.0")
+        text = text.replace("prewarp_hz = 595.5", f"prewarp_hz = {rate_hz / 10}")
+        text = text.replace("rate_hz = 10000", f'rate_hz = {rate_hz}\nmode = "feedforward"')
+    changes = [(event.tick + round(at_s * rate_hz), what) for event in planned for at_s, what in SEQUENCES[event.kind]]
+    entries = "".join(f"\n[[schedule]]\nat_tick = {tick}\n{what}\n" for tick, what in changes)
+    return text + entries.replace("MODE", mode)
 
 
 def measured(*arguments: object) -> tuple[float, float, str]:
@@ -77,37 +82,39 @@ def measured(*arguments: object) -> tuple[float, float, str]:
     return time.monotonic() - begin_s, usage.ru_maxrss / 1024, said
 
 
-def run(folder: Path, hours: float, planned: list[Event], recording: str) -> tuple[dict[str, Any], float, Path]:
+def run(
+    folder: Path, hours: float, planned: list[Event], recording: str, rate_hz: int = RATE_HZ
+) -> tuple[dict[str, Any], float, Path]:
     """A run into `folder`/recordings: its report, how long it took, the pattern of its files."""
     config = folder / "day.toml"
-    config.write_text(configuration(planned, recording))
+    config.write_text(configuration(planned, recording, rate_hz))
     seconds, _, said = measured(
         "run", config, "--unpaced", "--duration", hours * 3600, "--out", folder / "recordings", "--json"
     )
     return json.loads(said), seconds, folder / "recordings" / "day-*.mcap"
 
 
-def require_events(files: Path | list[Path], planned: list[Event], ticks: int) -> int:
+def require_events(files: Path | list[Path], planned: list[Event], ticks: int, rate_hz: int) -> int:
     """Every tick around every event is there; how many stretches there are."""
     recording = load(files)
     assert recording.problems == [], recording.problems
     kept = uncovered(0, ticks, recording.skipped)
     for event in planned:
-        first, last = event.tick - BEFORE_S * RATE_HZ, min(event.tick + AFTER_S * RATE_HZ, ticks - 1)
+        first, last = event.tick - BEFORE_S * rate_hz, min(event.tick + AFTER_S * rate_hz, ticks - 1)
         assert any(begin <= first and last < begin + count for begin, count in kept), event
     return len(kept)
 
 
-def a_day(folder: Path, hours: float, count: int) -> None:
+def a_day(folder: Path, hours: float, count: int, rate_hz: int) -> None:
     """Bytes, stretches, replay and the time of `info`."""
-    planned, ticks = events(hours, count), round(hours * 3600 * RATE_HZ)
-    report, seconds, pattern = run(folder, hours, planned, "rotate_s = 3600.0\nkeep_gib = 100.0\n")
+    planned, ticks = events(hours, count, rate_hz), round(hours * 3600 * rate_hz)
+    report, seconds, pattern = run(folder, hours, planned, "rotate_s = 3600.0\nkeep_gib = 100.0\n", rate_hz)
     assert (report["complete"], report["ticks_lost"], report["problems"]) == (True, 0, []), report
     assert report["ticks_logged"] + report["ticks_skipped"] == ticks
     size_mib, files = report["size_bytes"] / 2**20, report["recordings"]
-    print(f"{hours:g} h at {RATE_HZ} Hz with {count} events, made in {seconds:.0f} s")
+    print(f"{hours:g} h at {rate_hz} Hz with {count} events, made in {seconds:.0f} s")
     print(f"  {len(files)} files, {size_mib:.1f} MiB in all, {size_mib / hours:.2f} MiB an hour")
-    stretches, logged = require_events(pattern, planned, ticks), report["ticks_logged"]
+    stretches, logged = require_events(pattern, planned, ticks, rate_hz), report["ticks_logged"]
     print(f"  {logged:,} of {ticks:,} ticks kept, in {stretches} stretches")
     info_s, info_mib, said = measured("info", pattern, "--json")
     assert json.loads(said)["complete"]
@@ -154,23 +161,31 @@ def small_disk(folder: Path, mib: int) -> Iterator[Path]:
         subprocess.run(["umount", folder], check=True)
 
 
+def quotas(folder: Path) -> None:
+    """A quota that is reached, and a disk that is full before."""
+    a_quota(folder / "quota", 2.0, 12, 200.0, "a quota of 200 MiB")
+    if os.geteuid() == 0:
+        with small_disk(folder / "disk", 320) as disk:
+            a_quota(disk, 2.0, 12, 1024.0, "a disk of 320 MiB, of which 32 are to stay free", 32.0)
+    else:
+        print("a disk that fills: skipped, only root can mount one")
+
+
 def main() -> None:
     """Command line entry."""
     parser = argparse.ArgumentParser(description="a simulated day, recorded around events")
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--events", type=int, default=20)
+    parser.add_argument("--rate", type=int, default=RATE_HZ, help="Hz of the day; quota and disk are shown at 10000")
+    parser.add_argument("--day-only", action="store_true", help="without quota and disk")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for part in ("day", "quota"):
             (folder / part).mkdir()
-        a_quota(folder / "quota", 2.0, 12, 200.0, "a quota of 200 MiB")
-        if os.geteuid() == 0:
-            with small_disk(folder / "disk", 320) as disk:
-                a_quota(disk, 2.0, 12, 1024.0, "a disk of 320 MiB, of which 32 are to stay free", 32.0)
-        else:
-            print("a disk that fills: skipped, only root can mount one")
-        a_day(folder / "day", given.hours, given.events)
+        if not given.day_only:
+            quotas(folder)
+        a_day(folder / "day", given.hours, given.events, given.rate)
 
 
 if __name__ == "__main__":
