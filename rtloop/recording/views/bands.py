@@ -93,8 +93,9 @@ def _overview(
     low, high = (np.stack([getattr(one, part)[inside] for one in found], axis=1) for part in ("least", "most"))
     low, high = (np.where(np.abs(values) < BEYOND_DRAWING, values, np.nan) for values in (low, high))
     begins_s, ends_s = overview.time_s[inside][edges], np.fmax.reduceat(overview.end_s[inside], edges)
-    bands = (np.repeat(reduced, 2, axis=0) for reduced in (np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)))
-    return np.stack([begins_s, ends_s], axis=1).ravel(), *bands  # level from the beginning of each to its end
+    times_s = np.stack([begins_s, ends_s], axis=1).ravel()  # level from the beginning of each to its end
+    reduced = np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
+    return times_s, np.repeat(reduced[0], 2, axis=0), np.repeat(reduced[1], 2, axis=0)
 
 
 def kept_spans(recording: Recording) -> list[tuple[float, float]]:
