@@ -154,8 +154,8 @@ class RecorderKeeper:
             self._repair(part)
         if self.quota is not None:
             self.removals += self.quota.keep(LAST_LOOK_S)
-            files, gib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**30
-            self.notes += [f"{files} of recordings, {gib:.3g} GiB, removed by recording.keep_gib"] * bool(self.removals)
+            files, mib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
+            self.notes += [f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib"] * bool(self.removals)
         totals["paths"] = [str(path) for path in self._files(".mcap")]
         return totals
 
