@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -113,6 +113,11 @@ soak-response: $(READY)
 # A service whose resonance has moved measures it, makes its taps anew, and steps and scans: four minutes.
 soak-retune: $(READY)
 	$(BIN)/python -m tests.soak.retune
+
+# A simulated day with 20 events, recorded around them: bytes, replay, `info`; a quota and, as root, a disk that fills:
+# a quarter of an hour to half an hour, 1 GB in the temporary folder; `HOURS=1` for less.
+soak-day: $(READY)
+	$(BIN)/python -m tests.soak.day --hours $(or $(HOURS),24)
 
 # One configuration on every backend that needs no hardware, side by side: two minutes.
 soak-backends: $(READY)

@@ -26,6 +26,7 @@ from rtloop.hil.options import LARGEST_INTEGER, Options
 from rtloop.law.layout import MAX_LAWS
 from rtloop.laws.contract import ANY_NUMBER
 from rtloop.laws.registry import LawReference, law_class
+from rtloop.recording.capture.conditions import comparison_of
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -90,13 +91,34 @@ class ScheduleOptions(Options):
         return self
 
 
+class AroundOptions(Options):
+    """Around which events every tick is kept; of the others an overview is."""
+
+    before_s: float = Field(default=10.0, ge=0, le=600)
+    after_s: float = Field(default=30.0, ge=0, le=86_400)
+    on: Annotated[tuple[str, ...], Field(strict=False, min_length=1, max_length=50)]
+    every_s: float = Field(default=1.0, ge=0.05, le=60)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for text in self.on:
+            try:
+                comparison_of(text)
+            except ValueError as error:
+                raise ValueError(f"on: {text!r}: {error}") from None
+        return self
+
+
 class RecordingOptions(Options):
-    """Where recordings go, and when a new file begins."""
+    """Where recordings go, when a new file begins, and what is kept."""
 
     folder: str = "recordings"
     rotate_mib: float | None = Field(default=None, gt=0)
     rotate_s: float | None = Field(default=None, gt=0)
     min_free_mib: float = Field(default=64.0, ge=0)
+    around: AroundOptions | None = None
+    keep_gib: float | None = Field(default=None, gt=0)
+    """The oldest files of this configuration's recordings are removed beyond that, none around a trip."""
     message_index: bool = True
     """16 bytes a tick, without which viewers that are not in Python refuse the file."""
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.configuration.around import around_faults
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.coefficients import axis_coefficients, joined
@@ -90,6 +91,9 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         else (configuration.loop.hold_input, configuration.loop.hold_min_v),
         enable_input=configuration.loop.enable_input,
     )
+    faults = around_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)
+    if faults:
+        raise ConfigError(configuration.source, faults)
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
 
 

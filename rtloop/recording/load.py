@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rtloop.recording.file.events import Event
+from rtloop.recording.file.overview import Overview, Range
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.signals import COMMON, DEADLINE, PER_AXIS
@@ -37,6 +39,7 @@ class Recording:
     Ticks that are missing from the recording are missing from every array alike; `tick` says which are there.
     `problems` says what is wrong with the files, as far as they were read; what is damaged is left out, and those of
     the problems that leave something out are `left_out` as well. `extents` is what each file says of its ticks.
+    `skipped` are the ticks, (first, how many), that a recording around events leaves out; `overview` tells of them.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -49,6 +52,7 @@ class Recording:
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
             self.extents = tuple(Extent(reader.first_tick, reader.totals) for reader in readers)
+            self.skipped: list[Range] = [one for reader in readers for one in reader.skipped]
             self.problems += absent_parts(readers)
             self._note_problems(readers)
 
@@ -56,6 +60,12 @@ class Recording:
     def configuration(self) -> str:
         """The text of the configuration that the run was made with."""
         return self.header.get("configuration", "")
+
+    @cached_property
+    def overview(self) -> Overview:
+        """What is left of the ticks that were left out by intention."""
+        with self._reading() as readers:
+            return Overview(self.columns, np.concatenate([reader.overview for reader in readers]))
 
     @property
     def units(self) -> dict[str, str]:

@@ -90,6 +90,7 @@ class Service:
         self._deaths_s: list[float] = []
         self._stopping = False
         self._unrecorded: str | None = None
+        self._removals_said = 0
         self._offsets_v: dict[int, float] = {}
         self._ready = False
 
@@ -221,6 +222,7 @@ class Service:
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
         said: State | None = None
+        self._removals_said = 0
         while (result := supervisor.poll()) is None:
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
@@ -258,6 +260,9 @@ class Service:
         if fault is None and self._unrecorded is not None:
             log.warning("recorded again; %d ticks are lost", recording_state(supervisor.block)["ticks_lost"])
         self._unrecorded = fault
+        for removal in supervisor.recorder.removals[self._removals_said :]:
+            log.info("%s", removal)
+        self._removals_said = len(supervisor.recorder.removals)
 
     def _tell(self, supervisor: Supervisor) -> None:
         """READY after ticks really ran; WATCHDOG only while they advance, or have ended; STATUS now and then."""

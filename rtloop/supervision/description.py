@@ -10,19 +10,21 @@ import time
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from rtloop.configuration.around import around_of
 from rtloop.configuration.prepare import Prepared
 from rtloop.engine.plan import Plan
 from rtloop.hil.native.cache import cpu_identity
 
-FORMAT = 1
+FORMAT, FORMAT_AROUND = 1, 2
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 
 
 def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
     """The header of a recording of this plan."""
     plan, configuration = prepared.plan, prepared.configuration
+    around = configuration.recording.around
     return {
-        "format": FORMAT,
+        "format": FORMAT if around is None else FORMAT_AROUND,
         "name": plan.name,
         "created_unix_ns": time.time_ns(),
         "axes": list(plan.axes),
@@ -50,6 +52,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "realtime": realtime,
         "versions": {name: _version(name) for name in PACKAGES} | {"python": sys.version.split()[0]},
         "host": {"kernel": platform.release(), "machine": platform.machine(), "cpu": _cpu(), "cpus": os.cpu_count()},
+        **({} if around is None else {"around": around_of(around)._asdict()}),
     }
 
 

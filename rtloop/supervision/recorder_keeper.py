@@ -19,6 +19,7 @@ from rtloop.recording.capture.names import Names
 from rtloop.recording.file.parts import files_of_run
 from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
+from rtloop.supervision.quota import Quota
 from rtloop.supervision.stall import StallWatch
 from rtloop.values import counted
 
@@ -28,6 +29,8 @@ LONGEST_STEP_S = 0.1
 END_TIMEOUT_S = 30.0
 MAX_REPLACEMENTS = 10
 POLL_S = 0.01
+QUOTA_S, LAST_LOOK_S = 1.0, 10.0
+"""Between two looks at what the recordings take; for the one at the end."""
 
 
 class RecorderKeeper:
@@ -52,6 +55,10 @@ class RecorderKeeper:
         """What was recorded, with all `paths`, once that is known."""
         self.replacements = 0
         self.notes: list[str] = []
+        self.quota: Quota | None = None
+        self.removals: list[str] = []
+        """What the quota removed, in words."""
+        self._kept_s = 0.0
 
     @property
     def state(self) -> int:
@@ -71,6 +78,9 @@ class RecorderKeeper:
     def start(self, header: dict[str, Any]) -> None:
         """Hand over the header; `recording` once the file is open, or `failure`."""
         self._header = header
+        if self._options.keep_gib is not None:
+            least = round(self._options.min_free_mib * 2**20)
+            self.quota = Quota(self._path.parent, header["name"], round(self._options.keep_gib * 2**30), least)
         self._thread.start()
 
     def finish(self) -> None:
@@ -88,6 +98,7 @@ class RecorderKeeper:
             self.recording = True
             while not self._finishing.wait(POLL_S):
                 self._replace_if_gone()
+                self._keep_quota()
             self.totals = self._finish()
         except RtloopError as error:
             self.failure = error
@@ -95,6 +106,11 @@ class RecorderKeeper:
             if self.totals is None:
                 reason = str(self.failure or "keeping the recorder failed")
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
+
+    def _keep_quota(self) -> None:
+        if self.quota is not None and time.monotonic() - self._kept_s >= QUOTA_S:
+            self.removals += self.quota.keep()
+            self._kept_s = time.monotonic()
 
     def _open(self) -> None:
         """Give the recorder its orders and wait until the file is open. Raises OutputError."""
@@ -136,6 +152,10 @@ class RecorderKeeper:
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._totals()
         for part in self._files(".mcap.part"):
             self._repair(part)
+        if self.quota is not None:
+            self.removals += self.quota.keep(LAST_LOOK_S)
+            files, mib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
+            self.notes += [f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib"] * bool(self.removals)
         totals["paths"] = [str(path) for path in self._files(".mcap")]
         return totals
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.configuration.around import ring_sizes
 from rtloop.configuration.prepare import Prepared
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
@@ -99,7 +100,8 @@ class Supervisor:
     ) -> None:
         require_margins(prepared)
         self.prepared = prepared
-        self.block = SharedBlock.create(prepared.plan.sizes, processes.fd)
+        options = prepared.configuration.recording
+        self.block = SharedBlock.create(ring_sizes(options.around, prepared.plan.sizes), processes.fd)
         self.realtime: dict[str, Any] = {}
         self.startup_s: float | None = None
         self.ended = False
@@ -108,7 +110,6 @@ class Supervisor:
         """Why the loop died, and what became of its outputs."""
         self._loop = processes.loop
         self.names = processes.names
-        options = prepared.configuration.recording
         self.recorder = RecorderKeeper(processes.recorder, self.block, self.names, recording, options)
         self._stall = StallWatch(stall_limit_s(stall_s, prepared.plan.pacing.rate_hz), LONGEST_STEP_S)
         self._stalled = False

@@ -36,6 +36,10 @@ def print_replay(path: Path, report: ReplayReport) -> None:
         out.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
     out.print(f"not judged: {'; '.join(report.not_judged)}")
     checked = f"{counted(report.ticks, 'tick')} and {counted(report.snapshots, 'snapshot')} of the law's state"
+    if report.skipped:
+        stretches = counted(report.stretches, "stretch", "stretches")
+        checked += f" in {stretches}"
+        out.print(f"left out by intention: {counted(report.skipped, 'tick')} beside {stretches}")
     name, found = _name(path), report.first_difference
     if report.identical:
         out.print(f"[green]identical[/]: {name}: {checked} compared in bytes")

@@ -20,6 +20,7 @@ from rtloop.recording.views.summary import Summary
 from rtloop.signals import Mode
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
+from rtloop.values import counted
 
 if TYPE_CHECKING:
     from rtloop.configuration.axis import AxisOptions
@@ -84,6 +85,11 @@ def print_summary(summary: Summary) -> None:
         "ticks", f"{summary.ticks_logged:,}", "of " + ("as many as came" if expected is None else f"{expected:,}")
     )
     shown.add_row("lost", str(summary.ticks_lost), "complete" if summary.complete else "[red]not complete[/]")
+    if around := summary.around:
+        came, on = summary.ticks_logged + summary.ticks_skipped, escape(", ".join(around["on"]))
+        kept = f"{counted(summary.stretches, 'stretch', 'stretches')}, {summary.ticks_logged:,} of {came:,} ticks kept"
+        shown.add_row("around events", f"{summary.stretches:,}", f"{kept}: {around['before_s']:g} s before and "
+                      f"{around['after_s']:g} s after {on}")  # fmt: skip
     shown.add_row("time", f"{summary.duration_s:.3f} s", f"at {summary.rate_hz:g} Hz")
     if imported := summary.imported:
         shown.add_row("imported", "", f"from {escape(imported['file'])}, time: {escape(imported['time'])}")

@@ -17,6 +17,7 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType
 from mcap_protobuf.schema import build_file_descriptor_set
+from rtloop.recording.views.export import export
 
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.session import Options, Session
@@ -26,7 +27,6 @@ from rtloop.recording.file import layout
 from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
-from rtloop.recording.views.export import export
 from rtloop.recording.views.plot import plot
 from rtloop.recording.views.summary import summarise
 from tests.recording.real_loop import PAPER, RealLoop

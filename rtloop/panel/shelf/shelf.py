@@ -19,7 +19,7 @@ BUDGET_S = 1.5
 """For opening files that were not seen before; of those that are left there is the size alone, until the next time."""
 COUNTED_BYTES = 64 << 20
 """Of larger files the trips are not counted: for that all of their events would be read."""
-UNKNOWN: dict[str, Any] = dict.fromkeys(("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut"))
+UNKNOWN: dict[str, Any] = dict.fromkeys(("complete", "ticks", "duration_s", "created_unix_s", "trips", "cut", "around"))
 
 
 class Lying(NamedTuple):
@@ -39,7 +39,8 @@ class Shelf:
         self._lock = threading.Lock()
 
     def listing(self) -> list[dict[str, Any]]:
-        """The newest first: {file, bytes, captured, complete, ticks, duration_s, created_unix_s, trips, cut}.
+        """The newest first: {file, bytes, captured, complete, ticks, duration_s, created_unix_s, trips, cut,
+        around}.
 
         What is not known, or not yet, is None.
         """
@@ -89,6 +90,7 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
                 "complete": bool(end and end["complete"]),
                 "ticks": end["ticks_logged"] if end else ticks,
                 "duration_s": span_s,
+                "around": "around" in reader.header,
                 "created_unix_s": reader.header["created_unix_ns"] / 1e9,
                 "trips": None if events is None else sum(event["kind"] == "tripped" for event in events),
                 "cut": reader.header.get("cut"),

@@ -8,10 +8,12 @@ import numpy as np
 
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.file import format
+from rtloop.recording.file.overview import LEAST, MOST, Intervals
 from rtloop.recording.file.ticks import missing
 from rtloop.signals import DEADLINE, TICK
 
 NS_PER_S = 1e9
+Rows = np.ndarray[Any, Any]
 
 
 class Place(NamedTuple):
@@ -19,6 +21,34 @@ class Place(NamedTuple):
 
     tick: int
     time_ns: int
+
+
+class Spans:
+    """Of which ticks, and times, rows (n, columns) are, or intervals (n, columns, 3) in their place."""
+
+    def __init__(self, rows: Rows, intervals: Intervals | None) -> None:
+        if intervals is None:
+            self._first = self._last = rows[:, : DEADLINE + 1]
+        else:
+            self._first, self._last = intervals[:, : DEADLINE + 1, LEAST], intervals[:, : DEADLINE + 1, MOST]
+        self.ticks = int((self._last[:, TICK] - self._first[:, TICK] + 1).sum())
+
+    @property
+    def end(self) -> int:
+        """The tick behind the last one."""
+        return int(self._last[-1, TICK]) + 1
+
+    def gaps(self, expected: int) -> list[tuple[int, int]]:
+        """(first tick, ticks) of all that is missing between them, where `expected` is to come first."""
+        begins, ends = self._first[:, TICK], np.concatenate([[expected], self._last[:-1, TICK] + 1])
+        if self._first is self._last:
+            return missing(begins, expected) if len(begins) else []
+        return [(int(ends[one]), int(begins[one] - ends[one])) for one in np.flatnonzero(begins != ends[: len(begins)])]
+
+    def place(self, tick: int, rate_hz: float) -> Place:
+        """A tick behind some of them, and its time by the last one before it."""
+        row = self._last[np.searchsorted(self._last[:, TICK], tick) - 1]
+        return Place(tick, round(row[DEADLINE] + (tick - row[TICK]) * NS_PER_S / rate_hz))
 
 
 class TickBuffer:
@@ -31,6 +61,11 @@ class TickBuffer:
 
     def __len__(self) -> int:
         return self._fill
+
+    @property
+    def end(self) -> int:
+        """The tick behind the last one, if there is any."""
+        return int(self._rows[self._fill - 1, TICK]) + 1
 
     @property
     def room(self) -> int:
@@ -70,7 +105,3 @@ class TickBuffer:
     def place(self, tick: int) -> Place:
         """A tick and its time."""
         return Place(tick, self.time_ns(tick))
-
-    def gaps(self, count: int, expected: int) -> list[tuple[int, int]]:
-        """(first tick, ticks) of all that is missing in the first `count` rows, which are to begin at `expected`."""
-        return missing(self._rows[:count, TICK], expected) if count else []

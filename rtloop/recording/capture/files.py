@@ -11,6 +11,7 @@ import numpy as np
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import Place
 from rtloop.recording.file.contents import Message
+from rtloop.recording.file.overview import Intervals
 from rtloop.recording.file.writer import Writer
 
 
@@ -46,7 +47,7 @@ class Files:
     def __init__(self, path: Path, header: dict[str, Any], options: Options, begin: Place, logged: int) -> None:
         self._path, self._header, self._options = path, header, options
         self._opened: list[Path] = []
-        self._closed_ticks, self.closed_bytes = logged, 0
+        self._closed_ticks, self.closed_bytes, self._closed_skipped = logged, 0, 0
         self.next = self.first = begin
         self.writer: Writer | None = None
 
@@ -59,6 +60,11 @@ class Files:
     def logged(self) -> int:
         """Ticks in files."""
         return self._closed_ticks + (self.writer.ticks if self.writer else 0)
+
+    @property
+    def skipped(self) -> int:
+        """Ticks that were left out, of which there are overviews."""
+        return self._closed_skipped + (self.writer.skipped if self.writer else 0)
 
     @property
     def size_bytes(self) -> int:
@@ -92,12 +98,19 @@ class Files:
         self.writer.write(messages, rows)
         self.next = end
 
+    def leave_out(self, messages: Sequence[Message], intervals: Intervals, start_unix_ns: int, end: Place) -> None:
+        """As `write`, with intervals (n, columns, 3) instead of the ticks that they are about. Raises OutputError."""
+        assert self.writer is not None
+        self.writer.start_unix_ns = start_unix_ns
+        self.writer.write_overview(messages, intervals)
+        self.next = end
+
     def finish(self, final: Callable[[int], Message]) -> OutputError | None:
         """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again."""
         writer, self.writer = self.writer, None
         if writer is None:
             return None
-        written, problem = writer.ticks, None
+        written, problem = writer.ticks + writer.skipped, None
         try:
             writer.finish(final)
         except OutputError as error:
@@ -106,8 +119,9 @@ class Files:
                 self._lose(writer)
                 return problem
             writer.close()
-        self.next = Place(self.next.tick - written + writer.ticks, self.next.time_ns)
+        self.next = Place(self.next.tick - written + writer.ticks + writer.skipped, self.next.time_ns)
         self._closed_ticks += writer.ticks
+        self._closed_skipped += writer.skipped
         self.closed_bytes += writer.size_bytes
         return problem
 

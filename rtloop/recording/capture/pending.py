@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from rtloop.recording.capture.buffer import Place, TickBuffer
@@ -32,15 +32,18 @@ class Pending:
         self._entries: list[Entry] = []
         self.dropped = 0
 
-    @property
-    def waiting_events(self) -> int:
-        """Events of the loop that wait."""
-        return sum(entry.of_loop for entry in self._entries)
+    def waiting(self, channel: int) -> int:
+        """Messages of a topic that were taken from the rings and wait; of events those of the loop."""
+        return waiting(self._entries, channel)
 
     def add_event(self, event: Event) -> None:
         """An event behind all others."""
+        self._entries.append(self.entry(event))
+
+    def entry(self, event: Event) -> Entry:
+        """An event that is to wait elsewhere."""
         message = Message(format.EVENTS, self._start_unix_ns() + event["time_ns"], json.dumps(event).encode())
-        self._entries.append(Entry(event["tick"], message, of_loop=event["who"] != RECORDER))
+        return Entry(event["tick"], message, of_loop=event["who"] != RECORDER)
 
     def add_snapshot(self, data: bytes) -> None:
         """A snapshot of the law, with its digest."""
@@ -73,6 +76,11 @@ class Pending:
     def drop(self, entries: list[Entry]) -> None:
         """Count events of the loop that will never be written."""
         self.dropped += sum(entry.of_loop for entry in entries)
+
+
+def waiting(entries: Iterable[Entry], channel: int) -> int:
+    """Messages of a topic among entries; of events those of the loop."""
+    return sum(entry.message.channel == channel and (entry.of_loop or channel != format.EVENTS) for entry in entries)
 
 
 def tick_of(snapshot: bytes) -> int:

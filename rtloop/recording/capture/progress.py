@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.contents import contents_behind, is_ticks
+from rtloop.recording.file.contents import contents_behind, is_ticks, tells_of_ticks
 
 
 class Position(NamedTuple):
@@ -63,9 +63,9 @@ class Progress:
         """Where the recorder before this one came to, whose unfinished file is `part`."""
         written, announced = self.written, self._load(ANNOUNCED)
         for content in _contents_behind(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
-            if is_ticks(content):
+            if tells_of_ticks(content):
                 written = written._replace(ticks=announced.ticks, lost=announced.lost)
-            else:
+            if not is_ticks(content):
                 written = written._replace(snapshots=announced.snapshots, events=announced.events)
         return written
 

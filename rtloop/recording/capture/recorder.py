@@ -27,6 +27,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.capture.selective import SelectiveSession
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError
 
@@ -99,7 +100,8 @@ def run(fd: int, names: Names | None = None) -> int:
     try:
         command = _read_command()
         header = command["header"]
-        session = Session(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
+        kind = SelectiveSession if header.get("around") else Session
+        session = kind(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
         block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
         result = recorder.record(session, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)

@@ -15,12 +15,13 @@ from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
-from rtloop.recording.capture.buffer import TickBuffer
+from rtloop.recording.capture.buffer import Place, Rows, Spans, TickBuffer
 from rtloop.recording.capture.files import Files, Options, left_by_another
 from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.pending import Entry, Pending, tick_of
 from rtloop.recording.capture.progress import Position, Progress
 from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import (
     FINISHED,
@@ -31,7 +32,7 @@ from rtloop.recording.file.events import (
     event_of,
     recorder_event,
 )
-from rtloop.signals import TICK
+from rtloop.recording.file.overview import Intervals
 
 FLUSH_S = 0.5
 ROOM_BYTES = 1 << 20
@@ -92,7 +93,7 @@ class Session:
             self._pending.add_event(event_of(message, self._header["axes"], time_ns, self._laws, name))
         self._ahead.extend(map(bytes, snapshots))
         while self._ahead and (tick := tick_of(self._ahead[0])) <= self.cursor:
-            self._cut_if_due(tick)
+            self._meet_snapshot(tick)
             self._pending.add_snapshot(self._ahead.popleft())
         return ticks + len(snapshots) + len(events)
 
@@ -103,13 +104,11 @@ class Session:
 
     def finish(self, result: str) -> dict[str, Any]:
         """Write the rest and the end; returns the totals that the recorder prints."""
-        while self._ahead:
-            self._pending.add_snapshot(self._ahead.popleft())
-        self._write_all()
+        self._write_the_rest(result)
         self._pending.drop(self._pending.take())
         self._finish_file(FINISHED, result, self.cursor, self.cursor)
         paths = [str(path) for path in self._files.paths]
-        lost = self.cursor - self._files.logged
+        lost = self.cursor - self._files.logged - self._files.skipped
         return {
             "path": paths[-1] if paths else str(self._path),
             "paths": paths,
@@ -121,6 +120,11 @@ class Session:
             "error": self.error,
         }
 
+    def _write_the_rest(self, result: str) -> None:
+        while self._ahead:
+            self._pending.add_snapshot(self._ahead.popleft())
+        self._write_all()
+
     @property
     def _events_lost(self) -> int:
         return self._events.lost + self._pending.dropped
@@ -128,39 +132,49 @@ class Session:
     def _complete(self, lost: int, result: str) -> bool:
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
-    def _cut_if_due(self, tick: int) -> None:
+    def _meet_snapshot(self, tick: int) -> None:
         """Go on in another file from the snapshot of `tick` on: after a failure, or where this one is large enough."""
         if self.failure:
             if self._header["paced"]:
                 self._resume(tick)
-            return
+        elif self._file_is_due(tick):
+            self._write(self._buffer.before(tick), self._pending.take(before=tick))
+            if not self.failure:
+                self._rotate(tick)
+
+    def _file_is_due(self, tick: int) -> bool:
+        """Whether the present file is large enough, where a snapshot of `tick` follows."""
         options, age_s = self._options, (tick - self._cut_tick) / self._header["rate_hz"]
         large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
         long = options.rotate_s is not None and age_s >= options.rotate_s
-        if (large or long) and tick > self._cut_tick:
-            self._rotate(tick)
+        return (large or long) and tick > self._cut_tick
 
     def _rotate(self, tick: int) -> None:
-        self._write(self._buffer.before(tick), self._pending.take(before=tick))
-        if self.failure:
-            return
+        """Go on in another file; all before `tick` is written."""
         self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
         self._cut_tick = tick
         try:
-            self._files.begin(self._files.opened(self._pending.log_time(tick)))
+            self._files.begin(self._files.opened(self._start_unix_ns() + self._place(tick).time_ns))
         except OutputError as error:
             self._fail(error)
+
+    def _place(self, tick: int) -> Place:
+        return self._buffer.place(tick)
 
     def _finish_file(self, kind: str, result: str, end_tick: int, said_tick: int) -> None:
         """Finish the file, which accounts for the ticks before `end_tick`; the event that ends it is of `said_tick`."""
 
+        writer = self._files.writer
+
         def final(logged: int) -> Message:
-            lost = end_tick - self._files.first.tick - logged
+            skipped = writer.skipped if writer else 0
+            lost = end_tick - self._files.first.tick - logged - skipped
             totals = {"ticks_executed": end_tick, "ticks_logged": logged, "ticks_lost": lost}
             totals |= {"events_lost": self._events_lost, "snapshots_lost": self._snapshots.lost, "result": result}
             what = {**totals, "complete": self._complete(lost, result), "error": self.error}
+            what |= {"ticks_skipped": skipped} if self._header.get("around") else {}
             what |= {"driver_error": self._block.fault} if kind == FINISHED else {}
-            return self._pending.own(kind, self._buffer.place(said_tick), what)
+            return self._pending.own(kind, self._place(said_tick), what)
 
         if problem := self._files.finish(final):
             self.error = self.error or str(problem)
@@ -168,8 +182,11 @@ class Session:
     def _fail(self, error: OutputError) -> None:
         """Nothing is recorded from here on, until a file could be begun."""
         self.error = self.error or str(error)
-        self._pending.add_event(recorder_event(RECORDING_FAILED, *self._files.next, {"error": str(error)}))
+        self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failed_at(), {"error": str(error)}))
         self._say(error)
+
+    def _failed_at(self) -> Place:
+        return self._files.next
 
     def _say(self, failure: OutputError) -> None:
         """Why nothing is recorded, and which tick is the first that is in no file."""
@@ -189,49 +206,66 @@ class Session:
             return
         self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
         self._files.begin(writer)
-        gap = {"first_tick": self._files.next.tick, "count": tick - self._files.next.tick}
+        begin = self._begin_behind_failure(tick)
+        gap = {"first_tick": self._files.next.tick, "count": begin - self._files.next.tick}
         self._pending.add_event(recorder_event(RECORDING_RESUMED, *self._buffer.place(tick), gap))
-        self._buffer.drop(self._buffer.before(tick))
         self._cut_tick, self.failure = tick, None
-        self._account(tick)
+        self._account(begin)
         self._block.store(Word.RECORDER_FAILURE, 0)
+
+    def _begin_behind_failure(self, tick: int) -> int:
+        """The first tick that will be in the new file, which was begun at the snapshot of `tick`."""
+        self._buffer.drop(self._buffer.before(tick))
+        return tick
 
     def _write_all(self) -> None:
         self._write(len(self._buffer), self._pending.take())
 
+    def _note_write(self) -> None:
+        self._written_s = time.monotonic()
+
     def _write(self, count: int, entries: list[Entry]) -> None:
         """Entries, then the first `count` rows. Where nothing can be written, rows are lost and events are kept."""
-        self._written_s = time.monotonic()
+        self._note_write()
         if self.failure is None:
             try:
-                self._write_to_file(count, [entry.message for entry in entries])
+                self._write_to_file(self._buffer.first(count), entries)
             except OutputError as error:
                 self._fail(error)
         if self.failure:
             self._pending.keep_events(entries)
         self._buffer.drop(count)
 
-    def _write_to_file(self, count: int, messages: list[Message]) -> None:
-        rows, end = self._buffer.first(count), self._files.next
-        if gaps := self._buffer.gaps(count, end.tick):
+    def _write_to_file(self, rows: Rows, entries: list[Entry], intervals: Intervals | None = None) -> None:
+        """Entries, then rows, or what is kept of those that are left out. Raises OutputError."""
+        end, messages = self._files.next, [entry.message for entry in entries]
+        spans, rate_hz = Spans(rows, intervals), self._header["rate_hz"]
+        if gaps := spans.gaps(end.tick):
             for first, missing in gaps:
-                place = end if first == end.tick else self._buffer.place(first)
+                place = end if first == end.tick else spans.place(first, rate_hz)
                 messages.append(self._pending.own(GAP, place, {"first_tick": first, "count": missing}))
             messages.sort(key=lambda message: message.log_time)
-        if count:
-            end = self._buffer.place(int(rows[-1, TICK]) + 1)
+        if spans.ticks:
+            end = spans.place(spans.end, rate_hz)
         reached = Position(
             end.tick,
-            self._snapshots.position - len(self._ahead),
-            self._events.position - self._pending.waiting_events,
-            end.tick - self._files.logged - count,
+            self._snapshots.position - len(self._ahead) - self._waiting(format.LAW),
+            self._events.position - self._waiting(format.EVENTS),
+            end.tick - self._files.logged - self._files.skipped - spans.ticks,
         )
         with self._progress.writing(self._files.size_bytes, reached):
-            self._files.write(messages, rows, self._start_unix_ns(), end)
+            if intervals is None:
+                self._files.write(messages, rows, self._start_unix_ns(), end)
+            else:
+                self._files.leave_out(messages, intervals, self._start_unix_ns(), end)
+
+    def _waiting(self, channel: int) -> int:
+        """Messages of a topic that were taken from the rings, and wait."""
+        return self._pending.waiting(channel)
 
     def _account(self, tick: int) -> None:
         """Ticks before `tick` are in a file, or lost; snapshots and events may still be found in the rings."""
-        lost = tick - self._files.logged
+        lost = tick - self._files.logged - self._files.skipped
         self._progress.note(self._progress.written._replace(ticks=tick, lost=lost))
 
     def _start_unix_ns(self) -> int:

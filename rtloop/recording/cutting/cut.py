@@ -16,6 +16,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import CUT, GAP, recorder_event
+from rtloop.recording.file.overview import Range, uncovered
 from rtloop.recording.file.parts import Files, Parts, find_files
 from rtloop.recording.file.reader import Rows
 from rtloop.recording.file.recover import Progress, grows
@@ -35,12 +36,14 @@ class Copy:
         self.gaps: list[tuple[int, int]] = []
         """(first tick, how many) of what is missing."""
         self._said: list[dict[str, Any]] = []
+        self._skipped: list[Range] = []
 
     def run(self, progress: Progress | None) -> None:
         """All of it, in order."""
         for messages, rows in self._source.contents(self._stretch):
             self._writer.write_messages(messages)
             self._writer.write_ticks(rows)
+            self._skipped += self._source.skipped(messages)
             self._said += [gap for message in messages if (gap := _gap(message))]
             if len(rows):
                 self._note(rows)
@@ -48,6 +51,7 @@ class Copy:
                 progress(self._writer.ticks)
         if self._next < self._stretch.end:
             self.gaps.append((self._next, self._stretch.end - self._next))
+        self.gaps = [one for first, count in self.gaps for one in uncovered(first, first + count, self._skipped)]
 
     @property
     def unexplained(self) -> int:
@@ -60,8 +64,10 @@ class Copy:
 
     def final(self, logged: int) -> Message:
         """The event that ends the file."""
-        lost = self._stretch.end - self._stretch.first - logged
+        skipped = self._writer.skipped
+        lost = self._stretch.end - self._stretch.first - logged - skipped
         totals = {"ticks_executed": self._stretch.end, "ticks_logged": logged, "ticks_lost": lost, "events_lost": 0}
+        totals |= {"ticks_skipped": skipped} if self._source.header.get("around") else {}
         problems = self._source.problems
         what = totals | {"result": CUT, "complete": lost == 0 and not problems, "problems": problems}
         event = recorder_event(CUT, self._stretch.end, round(self._end_ns), what)
@@ -98,7 +104,7 @@ def cut(
     with Parts(find_files(files)) as readers:
         source = Source([Seeker(reader) for reader in readers])
         asked = _asked(source, first, end, from_s, until_s)
-        stretch = Stretch(source.begin(asked.first), asked.end)
+        stretch = source.kept(asked)
         output = output or cut_path(source.path, asked.first)
         header = source.header | {
             "first_tick": stretch.first,
@@ -133,7 +139,7 @@ def _asked(source: Source, first: int | None, end: int | None, from_s: float | N
     if from_s is not None:
         first = source.due(from_s)
     if until_s is not None:
-        end = source.due(until_s)
+        end = source.due_or_skipped(until_s)
     asked = Stretch(whole.first if first is None else first, whole.end if end is None else end)
     named = f"{source.path}: ticks from {asked.first} to before {asked.end}"
     if not asked.first < asked.end:

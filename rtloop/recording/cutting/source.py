@@ -13,8 +13,9 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message, may_hold
 from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.overview import LEAST, MEAN, MOST, OverviewLayout, Range, ranges
 from rtloop.recording.file.reader import Rows, tick_of
-from rtloop.signals import TICK
+from rtloop.signals import DEADLINE, TICK
 
 OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "cut")
 """What a header says of the one file that it stands in."""
@@ -35,6 +36,7 @@ class Source:
         header = seekers[0].reader.header
         self.header: dict[str, Any] = {key: value for key, value in header.items() if key not in OF_THE_FILE}
         self._reach = ring_ticks(header["rate_hz"])
+        self._layout = OverviewLayout(header["columns"])
         self.problems: list[str] = []
         """What turned out to be damaged in `contents`."""
 
@@ -55,16 +57,28 @@ class Source:
         last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
         if first is None or last is None:
             raise RecordingError(f"{self.path}: holds no ticks")
-        return Stretch(first.first, last.last + 1)
+        skipped = [first + count for seeker in self._seekers for first, count in seeker.reader.skipped]
+        return Stretch(first.first, max(last.last + 1, *skipped, 0))
 
     def due(self, time_s: float) -> int:
         """The first tick that was due `time_s` after the start or later. Raises RecordingError where there is none."""
-        found = next((tick for seeker in self._seekers if (tick := seeker.due(time_s * 1e9)) is not None), None)
+        found = self._next_due(time_s)
         if found is None:
             last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
             end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
             raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
         return found
+
+    def due_or_skipped(self, time_s: float) -> int:
+        """As `due`; where that tick was left out by intention, the first one of the interval that it was in."""
+        for overview in (seeker.reader.overview for seeker in self._seekers):
+            within = (overview[:, DEADLINE, LEAST] <= time_s * 1e9) & (time_s * 1e9 <= overview[:, DEADLINE, MOST])
+            if within.any():
+                return int(overview[within][0, TICK, LEAST])
+        return self.due(time_s)
+
+    def _next_due(self, time_s: float) -> int | None:
+        return next((tick for seeker in self._seekers if (tick := seeker.due(time_s * 1e9)) is not None), None)
 
     def begin(self, tick: int) -> int:
         """The newest snapshot at or before `tick` whose own tick is there; `tick` of what was imported, which has none.
@@ -80,6 +94,27 @@ class Source:
                     if any(one.has(begin) for one in self._seekers):
                         return begin
         raise RecordingError(f"{self.path}: tick {tick}: no state of the law to begin from stands at it or before it")
+
+    def kept(self, asked: Stretch) -> Stretch:
+        """A stretch as it can be cut: from the newest snapshot at or before it, without what was left out at its ends.
+
+        Raises RecordingError where nothing of it was kept.
+        """
+        end = asked.end
+        for reader in (seeker.reader for seeker in self._seekers if seeker.reader.header.get("around")):
+            for first, count in reader.skipped:
+                if first <= asked.first < first + count:
+                    asked = Stretch(first + count, end)
+            for first, last in reader.overview[:, TICK, :MEAN]:
+                if first < end <= last:
+                    end = int(first)
+        if not asked.first < end:
+            raise RecordingError(f"{self.path}: these ticks were left out by intention: it is recorded around events")
+        return Stretch(self.begin(asked.first), end)
+
+    def skipped(self, messages: Sequence[Message]) -> list[Range]:
+        """What messages of a stretch say that was left out."""
+        return ranges(self._layout.intervals([one.payload for one in messages if one.channel == format.OVERVIEW]))
 
     def files(self, stretch: Stretch) -> list[str]:
         """The names of the files that hold ticks of it."""
@@ -99,7 +134,7 @@ class Source:
                 if place < ticks and not _may_be_slow(seeker, place):
                     continue
                 rows = seeker.rows(place, begin, stretch.end)
-                messages = [one for one in self._slow(seeker, place) if _belongs(one, stretch)]
+                messages = [one for one in self._slow(seeker, place) if self._belongs(one, stretch)]
                 self.problems += seeker.damage.get(place, [])
                 if len(rows):
                     begin = int(rows[-1, TICK]) + 1
@@ -111,17 +146,18 @@ class Source:
         found = seeker.chunk(place) if _may_be_slow(seeker, place) else None
         return found if isinstance(found, list) else []
 
+    def _belongs(self, message: Message, stretch: Stretch) -> bool:
+        """Whether an event, a snapshot or an overview is of a stretch; the end of the file is not."""
+        if message.channel == format.LAW:
+            return stretch.first <= tick_of(message) < stretch.end
+        if message.channel == format.OVERVIEW:
+            return all(stretch.first <= first and first + n <= stretch.end for first, n in self.skipped([message]))
+        if message.channel != format.EVENTS:
+            return False
+        event = json.loads(message.payload)
+        return stretch.first <= event["tick"] < stretch.end and event["kind"] not in FINAL
+
 
 def _may_be_slow(seeker: Seeker, place: int) -> bool:
     entry = seeker.reader.entries[place]
-    return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW))
-
-
-def _belongs(message: Message, stretch: Stretch) -> bool:
-    """Whether an event or a snapshot is of a stretch; the end of the file is not."""
-    if message.channel == format.LAW:
-        return stretch.first <= tick_of(message) < stretch.end
-    if message.channel != format.EVENTS:
-        return False
-    event = json.loads(message.payload)
-    return stretch.first <= event["tick"] < stretch.end and event["kind"] not in FINAL
+    return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW, format.OVERVIEW))

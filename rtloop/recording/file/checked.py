@@ -21,6 +21,7 @@ from rtloop.law.reference import Generator
 from rtloop.recording.file.events import (
     FINAL,
     GAP,
+    KEPT,
     RECORDER,
     RECORDING_FAILED,
     RECORDING_RESUMED,
@@ -97,6 +98,13 @@ class _Cut(_Checked):
     files: list[Text]
 
 
+class _Around(_Checked):
+    before_s: Annotated[float, Field(ge=0)]
+    after_s: Annotated[float, Field(ge=0)]
+    every_s: Annotated[float, Field(gt=0)]
+    on: list[Text]
+
+
 class _AnyHeader(_Checked):
     format: Annotated[int, Field(ge=1)]
     name: Text
@@ -114,6 +122,7 @@ class _AnyHeader(_Checked):
     sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
     first_tick: Tick = 0
     cut: _Cut | None = None
+    around: _Around | None = None
 
 
 class _Event(_Checked):
@@ -161,6 +170,7 @@ class _Totals(_Checked):
     complete: bool
     driver_error: Text | None = None
     gaps: list[Any] = []
+    ticks_skipped: Tick = 0
 
 
 class _Failure(_Checked):
@@ -172,8 +182,13 @@ class _Resumed(_Checked):
     count: Tick
 
 
+class _Kept(_Checked):
+    on: Text
+
+
 _OF_RECORDER: dict[str, type[_Checked]] = {
-    **dict.fromkeys(FINAL, _Totals), GAP: _Gap, RECORDING_FAILED: _Failure, RECORDING_RESUMED: _Resumed
+    **dict.fromkeys(FINAL, _Totals), GAP: _Gap, RECORDING_FAILED: _Failure, RECORDING_RESUMED: _Resumed,
+    KEPT: _Kept
 }  # fmt: skip
 
 

@@ -29,9 +29,11 @@ class Message(NamedTuple):
     payload: bytes
 
 
-def may_hold_messages(entry: Entry) -> bool:
-    """Whether a chunk may hold messages of the slow topics."""
-    return entry.index is None or any(channel != format.TICKS for channel in entry.index.message_index_offsets)
+def may_tell(entry: Entry, channel: int) -> bool:
+    """Whether a chunk may hold messages of one of the slow topics: what is left out stands in chunks of its own."""
+    if entry.index is None or channel == format.OVERVIEW:
+        return may_hold(entry, channel)
+    return any(other not in (format.TICKS, format.OVERVIEW) for other in entry.index.message_index_offsets)
 
 
 def may_hold(entry: Entry, channel: int) -> bool:
@@ -71,6 +73,11 @@ def contents_behind(path: Path, position: int) -> Iterator[bytes]:
 def is_ticks(content: bytes) -> bool:
     """Whether a chunk holds ticks."""
     return content[:1] == bytes([Opcode.MESSAGE]) and _channel(content[PREFIX.size :]) == format.TICKS
+
+
+def tells_of_ticks(content: bytes) -> bool:
+    """Whether a chunk holds ticks, or what is kept of them where they are left out."""
+    return is_ticks(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
 
 
 def split_messages(content: bytes) -> list[Message]:

@@ -17,12 +17,15 @@ from mcap.records import Channel, Schema
 
 from rtloop.signals import DEADLINE
 
-FORMAT = 1
+FORMAT = 2
+"""The newest that is read; 2 are recordings around events, all others are 1."""
 PROFILE = "rtloop"
 LIBRARY = "rtloop"
 TICKS, EVENTS, LAW, CONFIGURATION = 1, 2, 3, 4
 """Channel ids."""
-TICK_SCHEMA, EVENT_SCHEMA, CONFIGURATION_SCHEMA = 1, 2, 3
+OVERVIEW, OVERVIEW_TOPIC = 5, "/overview"
+"""Of recordings around events alone."""
+TICK_SCHEMA, EVENT_SCHEMA, CONFIGURATION_SCHEMA, OVERVIEW_SCHEMA = 1, 2, 3, 4
 LAW_ENCODING = "rtloop-law"
 """Message encoding of `/law`: SHA-256 of what follows (32 bytes), tick (uint64, little-endian), the law's own bytes."""
 MAX_CHUNK_BYTES = 1 << 20
@@ -67,14 +70,19 @@ def _text(field: int, value: bytes | str) -> bytes:
     return _varint(field << 3 | _WIRE_BYTES) + _varint(len(data)) + data
 
 
-def tick_schema(columns: Sequence[str]) -> bytes:
-    """Serialised FileDescriptorSet of `rtloop.Tick` (proto2): column i is `optional double NAME = i + 1`."""
+def doubles_schema(name: str, columns: Sequence[str]) -> bytes:
+    """Serialised FileDescriptorSet of `rtloop.NAME` (proto2): column i is `optional double COLUMN = i + 1`."""
     fields = b"".join(
-        _text(2, _text(1, name) + _number(3, number) + _number(4, 1) + _number(5, _DOUBLE))
-        for number, name in enumerate(columns, start=1)
+        _text(2, _text(1, column) + _number(3, number) + _number(4, 1) + _number(5, _DOUBLE))
+        for number, column in enumerate(columns, start=1)
     )
-    file = _text(1, "rtloop/tick.proto") + _text(2, "rtloop") + _text(4, _text(1, "Tick") + fields)
+    file = _text(1, f"rtloop/{name.lower()}.proto") + _text(2, "rtloop") + _text(4, _text(1, name) + fields)
     return _text(1, file + _text(12, "proto2"))
+
+
+def tick_schema(columns: Sequence[str]) -> bytes:
+    """The schema of `/ticks`."""
+    return doubles_schema("Tick", columns)
 
 
 def schemas(columns: Sequence[str]) -> list[Schema]:
@@ -109,9 +117,21 @@ def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
     """A tick's whole MCAP message record, prefix included, without padding; columns by name."""
     fields = [("_opcode", "u1"), ("_length", "<u8"), ("_channel", "<u2"), ("_sequence", "<u4")]
     fields += [("_log_time", "<u8"), ("_publish_time", "<u8")]
+    return np.dtype(fields + doubles(columns))
+
+
+def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
+    """The fields of a protobuf message of doubles, each behind its tag, for a numpy dtype."""
+    fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
         fields += [(f"_tag_{number}", "u1" if number <= SHORT_TAGS else "<u2"), (name, "<f8")]
-    return np.dtype(fields)
+    return fields
+
+
+def fill_tags(records: Records, columns: Sequence[str]) -> None:
+    """The tags of `doubles` in front of each column."""
+    for number in range(1, len(columns) + 1):
+        records[f"_tag_{number}"] = int.from_bytes(_varint(number << 3 | _WIRE_64BIT), "little")
 
 
 def blank_ticks(columns: Sequence[str], count: int) -> Records:
@@ -120,8 +140,7 @@ def blank_ticks(columns: Sequence[str], count: int) -> Records:
     records["_opcode"] = Opcode.MESSAGE
     records["_length"] = records.dtype.itemsize - PREFIX_BYTES
     records["_channel"] = TICKS
-    for number in range(1, len(columns) + 1):
-        records[f"_tag_{number}"] = int.from_bytes(_varint(number << 3 | _WIRE_64BIT), "little")
+    fill_tags(records, columns)
     return records
 
 

@@ -28,12 +28,13 @@ from rtloop.recording.file.contents import (
     Message,
     is_ticks,
     may_hold,
-    may_hold_messages,
+    may_tell,
     overlaps,
     split_messages,
 )
 from rtloop.recording.file.events import FINAL, Event
 from rtloop.recording.file.layout import layout_of
+from rtloop.recording.file.overview import Intervals, OverviewLayout, Range, plausible, ranges
 from rtloop.recording.file.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
@@ -69,7 +70,7 @@ class Reader:
         self.problems = [*self._layout.problems]
         self.left_out = [*self._layout.left_out]
         self.columns: tuple[str, ...] = tuple(self.header["columns"])
-        self._ticks = TickLayout(self.columns)
+        self._ticks, self._overview = TickLayout(self.columns), OverviewLayout(self.columns)
         self.first_tick: int = self.header.get("first_tick", 0)
 
     def __enter__(self) -> Self:
@@ -181,6 +182,28 @@ class Reader:
         """The events, in the order of the file."""
         return [event_from(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
 
+    @cached_property
+    def overview(self) -> Intervals:
+        """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.overview`."""
+        found = self.intervals_of(self._messages(format.OVERVIEW))
+        good = plausible(found)
+        if not good.all():
+            self._report("an overview is about no ticks, or about some that another one is about")
+        return found[good]
+
+    def intervals_of(self, messages: Iterable[Message]) -> Intervals:
+        """What those of `/overview` among messages of this recording say."""
+        return self._overview.intervals([one.payload for one in messages if one.channel == format.OVERVIEW])
+
+    @cached_property
+    def skipped(self) -> list[Range]:
+        """The ticks that were left out by intention: first one, how many."""
+        return [
+            (max(first, self.first_tick), first + count - max(first, self.first_tick))
+            for first, count in ranges(self.overview)
+            if first + count > self.first_tick
+        ]
+
     @property
     def totals(self) -> dict[str, Any] | None:
         """What the recorder counted when it finished the file; None where it did not."""
@@ -215,7 +238,7 @@ class Reader:
     def _messages(self, channel: int) -> Iterator[Message]:
         """The messages of one of the slow topics; what is wrong with the others in their chunks is reported too."""
         for entry in self._entries:
-            if may_hold_messages(entry):
+            if may_tell(entry, channel):
                 yield from (message for message in self._slow(entry) if message.channel == channel)
 
     def _slow(self, entry: Entry) -> list[Message]:
@@ -236,9 +259,12 @@ class Reader:
                     event_from(message.payload, self.header["axes"])
                 elif message.channel == format.LAW:
                     _require_digest(message)
+                elif message.channel == format.OVERVIEW:
+                    self._overview.require(message.payload)
                 good.append(message)
-            except Malformed as reason:
-                self._report(str(reason) if message.channel == format.LAW else f"an event is malformed: {reason}")
+            except ValueError as reason:
+                of_event = message.channel == format.EVENTS
+                self._report(f"an event is malformed: {reason}" if of_event else str(reason))
         return good
 
     def _leave_out(self, entry: Entry, reason: DamagedChunk) -> None:

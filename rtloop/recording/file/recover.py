@@ -16,6 +16,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message
 from rtloop.recording.file.events import FINAL, FINISHED, RECOVERED, recorder_event
+from rtloop.recording.file.overview import MOST, ranges
 from rtloop.recording.file.reader import Reader, Rows
 from rtloop.recording.file.ticks import missing
 from rtloop.recording.file.writer import Writer
@@ -54,7 +55,9 @@ class Recovery:
                 self._note_gaps(rows)
                 self._writer.write_ticks(rows)
             else:
-                self._writer.write_messages([message for message in messages if self._is_content(message)])
+                kept = [message for message in messages if self._is_content(message)]
+                self._note_skipped(kept)
+                self._writer.write_messages(kept)
             if progress:
                 progress(self._writer.ticks)
 
@@ -66,6 +69,7 @@ class Recovery:
             "ticks_executed": self.next_tick,
             "ticks_logged": logged,
             "ticks_lost": sum(count for _, count in self.gaps),
+            **({"ticks_skipped": self._writer.skipped} if self._reader.header.get("around") else {}),
             "events_lost": 0,
             "result": RECOVERED,
             "complete": False,
@@ -81,6 +85,16 @@ class Recovery:
             self._final = message
             return False
         return message.channel != format.CONFIGURATION
+
+    def _note_skipped(self, messages: list[Message]) -> None:
+        """What is left out by intention is no gap."""
+        intervals = self._reader.intervals_of(messages)
+        for first, count in ranges(intervals):
+            if first > self.next_tick:
+                self.gaps.append((self.next_tick, first - self.next_tick))
+            self.next_tick = first + count
+        if len(intervals):
+            self._end_ns = float(intervals[-1, DEADLINE, MOST]) + 1e9 / self._reader.header["rate_hz"]
 
     def _note_gaps(self, rows: Rows) -> None:
         self.gaps += missing(rows[:, TICK], self.next_tick)

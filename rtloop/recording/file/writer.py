@@ -20,6 +20,7 @@ from rtloop.recording.file import format
 from rtloop.recording.file.chunkfile import ChunkFile, Content
 from rtloop.recording.file.container import PREFIX, pack_message, pack_records
 from rtloop.recording.file.contents import Message
+from rtloop.recording.file.overview import Intervals, OverviewLayout, declared, ranges
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -46,12 +47,16 @@ class Writer:
     ) -> None:
         self.path = path
         self.start_unix_ns = log_time
-        self.ticks = 0
+        self.ticks = self.skipped = 0
+        """Written, and summed up in overviews."""
+        self._skipped: list[int] = []
         self._columns: list[str] = header["columns"]
         self._message_index, self._min_free_bytes = message_index, min_free_bytes
         self._blank = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
         self._check_space(room_bytes)
         repeated = [*format.schemas(self._columns), *format.channels()]
+        if header.get("around"):
+            repeated += declared(self._columns)
         self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
         try:
             self._write_header(header, log_time, repeated)
@@ -86,7 +91,7 @@ class Writer:
         except OutputError:
             if messages:
                 with contextlib.suppress(OutputError):
-                    self._file.drop_last()
+                    self._drop_last()
             raise
 
     def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
@@ -112,6 +117,13 @@ class Writer:
         if messages:
             self._check()
             self._file.append(_content(messages))
+            if any(message.channel == format.OVERVIEW for message in messages):
+                self._note_skipped(messages)
+
+    def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
+        """Messages of the slow topics and what is left out (n, columns, 3): both, or neither."""
+        overview = OverviewLayout(self._columns).messages(intervals, self.start_unix_ns)
+        self.write_messages([*messages, *overview])
 
     def finish(self, final: Callable[[int], Message]) -> None:
         """Add the message `final(ticks written)`, the index and the end; then give the file its name.
@@ -121,7 +133,7 @@ class Writer:
         kept = len(self._file)
         while not self._end_fits(final):
             while len(self._file) >= kept:
-                self.ticks -= self._file.drop_last().get(format.TICKS, 0)
+                self._drop_last()
             kept -= 1
         self._file.publish()
 
@@ -132,6 +144,19 @@ class Writer:
     def discard(self) -> None:
         """Give up the file and remove it."""
         self._file.discard()
+
+    def _note_skipped(self, messages: Sequence[Message]) -> None:
+        payloads = [message.payload for message in messages if message.channel == format.OVERVIEW]
+        count = sum(count for _, count in ranges(OverviewLayout(self._columns).intervals(payloads)))
+        self._skipped.append(count)
+        self.skipped += count
+
+    def _drop_last(self) -> None:
+        """Take the last chunk off the file, and its ticks off the counts."""
+        counts = self._file.drop_last()
+        self.ticks -= counts.get(format.TICKS, 0)
+        if counts.get(format.OVERVIEW):
+            self.skipped -= self._skipped.pop()
 
     def _end_fits(self, final: Callable[[int], Message]) -> bool:
         try:

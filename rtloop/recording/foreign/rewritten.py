@@ -29,7 +29,8 @@ from rtloop.recording.foreign.fields import Undecodable, encoding
 from rtloop.recording.foreign.stretches import Run, Stretch, Topics, contents, halves, runs, stretches
 from rtloop.recording.foreign.ticks import TickDecoder
 
-NUMBERS = {channel.topic: channel.id for channel in format.channels()}
+NUMBERS = {channel.topic: channel.id for channel in format.channels()} | {format.OVERVIEW_TOPIC: format.OVERVIEW}
+SLOW = (format.EVENTS, format.LAW, format.OVERVIEW)
 TICKS = "/ticks"
 ALWAYS = (1 << 64) - 1
 AHEAD, AHEAD_BYTES = 16, 64 << 20
@@ -120,7 +121,7 @@ class Rewritten:
                 self._counts[run.channel] += len(run.records)
                 self._payloads += run.payloads if number == format.CONFIGURATION else []
             ticks = [run.log_times for number, run in found if number == format.TICKS]
-            others = [run.log_times for number, run in found if number in (format.EVENTS, format.LAW)]
+            others = [run.log_times for number, run in found if number in SLOW]
             if ticks:
                 filled.append(Filled(min(int(t.min()) for t in ticks), max(int(t.max()) for t in ticks), stretch))
             if others:
@@ -139,7 +140,7 @@ class Rewritten:
             (
                 Message(number, log_time, self._replaced.get(payload, payload))
                 for number, run in self._runs(stretch)
-                if number in (format.EVENTS, format.LAW)
+                if number in SLOW
                 for log_time, payload in zip(run.log_times.tolist(), run.payloads, strict=True)
                 if self._replaced.get(payload) != b""
             ),
@@ -162,7 +163,7 @@ class Rewritten:
             for place in np.unique(places).tolist():
                 span = int(ends[place - 1]) + 1 if place else 0, int(ends[place]) if place < len(ends) else ALWAYS
                 first = int(log_times[places == place].min())
-                found.append(((place, 0, first), _entry(stretch, dict.fromkeys((format.EVENTS, format.LAW), 0), span)))
+                found.append(((place, 0, first), _entry(stretch, dict.fromkeys(SLOW, 0), span)))
         offsets = sorted(one.stretch.offset for one in filled)
         for stretch in self._damage:
             place = int(np.searchsorted(offsets, stretch.offset))

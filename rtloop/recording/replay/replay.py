@@ -21,6 +21,7 @@ from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.checked import extras_of
 from rtloop.recording.file.events import GAP, RECOVERED, Event, json_value, message_of
+from rtloop.recording.file.overview import uncovered
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
@@ -102,7 +103,7 @@ class _Replay:
         self._report = ReplayReport(problems=recording.problems, not_judged=not_judged(recording.header))
         self._found = 0
         gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
-        self._gaps = sorted(gaps, key=lambda gap: gap["first_tick"])
+        self._gaps = gaps
         if (tick := misplaced_command(recording.events)) is not None:
             self._report.pass_over(tick, None, "a command stands there twice, or behind a later one")
 
@@ -135,13 +136,12 @@ class _Replay:
         if first == expected:
             return
         self._rerun = None
-        self._report.gaps.append({"first_tick": expected, "count": first - expected})
-        at = expected
-        for gap in self._gaps:
-            if gap["first_tick"] <= at:
-                at = max(at, gap["first_tick"] + gap["count"])
-        if at < first:
-            self._report.pass_over(expected, first - expected, "not in the recording")
+        missing = uncovered(expected, first, self._recording.skipped)
+        self._report.skipped += first - expected - sum(count for _, count in missing)
+        for begin, count in missing:
+            self._report.gaps.append({"first_tick": begin, "count": count})
+            if uncovered(begin, begin + count, sorted((gap["first_tick"], gap["count"]) for gap in self._gaps)):
+                self._report.pass_over(begin, count, "not in the recording")
 
     def _pass_left_out(self) -> None:
         for problem in self._recording.left_out:
@@ -205,6 +205,7 @@ class _Replay:
     def _start(self, tick: int, law: LawMemory) -> None:
         header = self._recording.header
         still_to_come = self._commands[self._commands["tick"] > tick]
+        self._report.stretches += 1
         self._rerun = Rerun(header, Tape(header), self._laws, law, still_to_come, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:

@@ -16,10 +16,13 @@ MEASURED = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.
 class ReplayReport:
     """`ticks` compared, `gaps` between them, `not_verified` of what was recorded and why, the first difference, if any.
 
-    What the recorder itself says it never had (a gap in its ring) is a gap, and nothing that was recorded.
+    What the recorder itself says it never had (a gap in its ring) is a gap, and nothing that was recorded; what it left
+    out by intention is `skipped`, a count. `stretches` begin at a snapshot and are compared each by itself.
     """
 
     ticks: int = 0
+    stretches: int = 0
+    skipped: int = 0
     gaps: list[dict[str, int]] = field(default_factory=list)
     not_verified: list[dict[str, Any]] = field(default_factory=list)
     snapshots: int = 0
@@ -50,6 +53,8 @@ class ReplayReport:
         """The object of `rtloop replay --json`."""
         return {
             "ticks": self.ticks,
+            "stretches": self.stretches,
+            "ticks_skipped": self.skipped,
             "identical": self.identical,
             "first_difference": self.first_difference,
             "not_verified": self.not_verified,

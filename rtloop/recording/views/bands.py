@@ -69,13 +69,12 @@ def read_bands(
     Raises RecordingError where there is no tick.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
-    if count == 0:
+    between = _overview(recording, names, start_s, end_s, points)
+    if count == 0 and not len(between[0]):
         until = "" if end_s == np.inf else f" before {end_s:g} s"
         raise RecordingError(f"{recording.paths[0]}: holds no tick from {start_s:g} s on{until}")
     stretch = max(-(-count // points), 1)
-    times: list[Any] = []
-    lows: list[Any] = []
-    highs: list[Any] = []
+    times, lows, highs = [between[0]], [between[1]], [between[2]]
     done = 0
     for rows in recording.between(["deadline_ns", *names], start_s, end_s):
         edges = np.arange(0, len(rows), stretch)
@@ -87,6 +86,9 @@ def read_bands(
         if progress:
             progress(done)
     time_s, low, high = np.concatenate(times), np.concatenate(lows), np.concatenate(highs)
+    if len(between[0]):
+        order = np.argsort(time_s, kind="stable")
+        time_s, low, high = time_s[order], low[order], high[order]
     return {name: Band(time_s, low[:, index], high[:, index]) for index, name in enumerate(names)}
 
 
@@ -114,6 +116,38 @@ def kind_of(name: str) -> str:
     kind = name.rpartition("_")[0].rpartition("_")[2]
     known = [signal for names in (*OF_AN_AXIS, TIMING) for signal in names]
     return kind if f"{kind}_{name.rpartition('_')[2]}" in known else name
+
+
+def _overview(
+    recording: Recording, names: list[str], start_s: float, end_s: float, points: int
+) -> tuple[Any, Any, Any]:
+    """Times (n,), least and largest values (n, names) of what was left out by intention, in about so many points."""
+    empty = np.empty((0, len(names)))
+    if not recording.skipped:
+        return np.empty(0), empty, empty
+    overview = recording.overview
+    inside = (overview.time_s >= start_s) & (overview.time_s <= end_s)
+    edges = np.arange(0, np.count_nonzero(inside), max(-(-np.count_nonzero(inside) // points), 1))
+    if not len(edges):
+        return np.empty(0), empty, empty
+    found = [overview[name] for name in names]
+    low, high = (np.stack([getattr(one, part)[inside] for one in found], axis=1) for part in ("least", "most"))
+    low, high = (np.where(np.abs(values) < BEYOND_DRAWING, values, np.nan) for values in (low, high))
+    begins_s, ends_s = overview.time_s[inside][edges], np.fmax.reduceat(overview.end_s[inside], edges)
+    times_s = np.stack([begins_s, ends_s], axis=1).ravel()  # level from the beginning of each to its end
+    reduced = np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
+    return times_s, np.repeat(reduced[0], 2, axis=0), np.repeat(reduced[1], 2, axis=0)
+
+
+def kept_spans(recording: Recording) -> list[tuple[float, float]]:
+    """From when to when each stretch lasts that was kept between others that were left out, in s since the start."""
+    if not recording.skipped:
+        return []
+    overview, ticks = recording.overview, recording.skipped
+    begins = np.searchsorted(overview.tick, [first for first, _ in ticks])
+    ends = np.searchsorted(overview.tick, [first + count for first, count in ticks]) - 1
+    edges = [0.0, *np.stack([overview.time_s[begins], overview.end_s[ends]], axis=1).ravel(), np.inf]
+    return [(float(a), float(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
 
 
 def marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:

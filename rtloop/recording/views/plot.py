@@ -10,7 +10,18 @@ import numpy as np
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
-from rtloop.recording.views.bands import Band, Mark, Panel, Progress, kind_of, marks, panels, read_bands, title
+from rtloop.recording.views.bands import (
+    Band,
+    Mark,
+    Panel,
+    Progress,
+    kept_spans,
+    kind_of,
+    marks,
+    panels,
+    read_bands,
+    title,
+)
 
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
@@ -22,6 +33,8 @@ COLOURS = {
 OTHER = "tab:brown"
 BENEATH = {"position": 2.0}
 """Width in points, where it is not 0.8, of what other lines shall be seen on."""
+KEPT = "gold"
+"""Behind what is recorded at the full rate, where the rest is an overview."""
 
 
 def plot(
@@ -53,6 +66,10 @@ def plot(
     figure = Figure(figsize=(12, 2.0 + 2.1 * len(drawn)), layout="constrained")
     FigureCanvasAgg(figure)
     _draw(figure, drawn, bands, marks(recording, time_s[0], time_s[-1]))
+    for begin, end in kept_spans(recording):
+        if begin <= time_s[-1] and end >= time_s[0]:
+            for panel in figure.axes:
+                panel.axvspan(max(begin, time_s[0]), min(end, time_s[-1]), color=KEPT, alpha=0.25, linewidth=0)
     figure.suptitle(title(recording), fontsize=11, parse_math=False)
     try:
         figure.savefig(target, format=target.suffix[1:], dpi=110)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from rtloop.recording.file.events import COMMANDS, RECOVERED
+from rtloop.recording.file.overview import LEAST, MOST, uncovered
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.views.histogram import Histogram
-from rtloop.signals import Flag, Mode
+from rtloop.signals import DEADLINE, Flag, Mode
 
 MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED)
@@ -65,6 +66,12 @@ class Summary:
     """Which stretch (`first`, `end`) of which `files` was asked for, where it is one."""
     ticks_logged: int
     ticks_lost: int
+    around: dict[str, Any] | None
+    """Around what it was recorded: `before_s`, `after_s`, `on`, `every_s`; None for a recording of every tick."""
+    stretches: int
+    """That were kept."""
+    ticks_skipped: int
+    """That were left out by intention."""
     periods_missed: int
     rate_hz: float
     achieved_rate_hz: float | None
@@ -203,13 +210,25 @@ def _seamless(end: dict[str, Any] | None) -> bool:
     return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
 
 
+def _overview_span_s(readers: Sequence[Reader], totals: Totals) -> float:
+    """From the first deadline to the last where ticks were left out by intention; 0 where none were."""
+    found = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
+    if not found or totals.first is None:
+        return 0.0
+    first, last = found[0][0, LEAST], found[-1][-1, MOST]
+    return float(max(last, totals.last[1]) - min(first, totals.first[1])) / 1e9
+
+
 def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
     finished = ends[-1]
     executed = finished["ticks_executed"] if finished else int(totals.last[0]) + 1 if totals.first else 0
-    lost = executed - header.get("first_tick", 0) - totals.ticks
+    begin, skipped = header.get("first_tick", 0), [one for reader in readers for one in reader.skipped]
+    executed = max([executed, *(first + count for first, count in skipped)])
+    ticks_skipped = sum(count for _, count in skipped)
+    lost = executed - begin - totals.ticks - ticks_skipped
     problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
     whole = bool(finished and finished["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
@@ -223,10 +242,13 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         cut=header.get("cut"),
         ticks_logged=totals.ticks,
         ticks_lost=lost,
+        around=header.get("around"),
+        stretches=len(uncovered(begin, executed, skipped)),
+        ticks_skipped=ticks_skipped,
         periods_missed=totals.periods_missed,
         rate_hz=rate_hz,
         achieved_rate_hz=totals.executed / totals.span_s if totals.span_s else None,
-        duration_s=totals.span_s + 1 / rate_hz if totals.ticks else 0.0,
+        duration_s=max(totals.span_s, _overview_span_s(readers, totals)) + 1 / rate_hz if totals.ticks else 0.0,
         paced=header["paced"],
         overruns=totals.overruns,
         ticks_limited=totals.limited,

@@ -32,6 +32,13 @@ def metrics_text(service: Service) -> str:
         Gauge("rtloop_ticks_not_recorded", "Ticks of the present loop that are in no recording", registry=registry).set(
             said["ticks_lost"]
         )
+        if (quota := supervisor.recorder.quota) is not None:
+            Gauge("rtloop_recordings_bytes", "What this configuration's recordings take", registry=registry).set(
+                quota.bytes
+            )
+            Gauge("rtloop_recordings_removed", "Files that the quota removed in this run", registry=registry).set(
+                quota.removed
+            )
     Gauge("rtloop_restarts", "Loops that ended before the present one", registry=registry).set(len(service.results))
     if measured:
         Gauge("rtloop_rate_hz", "Rate over the last ticks", registry=registry).set(measured["rate_hz"])

@@ -33,14 +33,14 @@ export class Recordings {
   arrange() {}
 
   #row(recording) {
-    const { file, complete, duration_s, bytes: size, created_unix_s, trips, captured } = recording;
+    const { file, complete, duration_s, bytes: size, created_unix_s, trips, captured, around } = recording;
     const made = created_unix_s ? new Date(created_unix_s * 1000).toLocaleString("sv") : "—";
     const act = (text, action) => make("button", { type: "button", "aria-label": `${text} of ${file}`, click: () => this.#try(action) }, text);
     return make("tr", { "aria-current": this.#shown === file && "true" },
       make("th", { scope: "row" }, file),
       make("td", {}, made), make("td", {}, duration_s == null ? "—" : duration(duration_s, 3)), make("td", {}, bytes(size)),
       make("td", {}, trips == null ? "—" : String(trips)),
-      make("td", {}, [captured ? "captured" : "", complete ? "" : "growing"].filter(Boolean).join(", ")),
+      make("td", {}, [captured ? "captured" : "", around ? "around events" : "", complete ? "" : "growing"].filter(Boolean).join(", ")),
       make("td", {}, make("span", { class: "bar" },
         act("Info", () => this.#info(file)),
         act("Plot", () => this.#plot(file)),

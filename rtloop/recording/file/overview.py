@@ -1,0 +1,170 @@
+"""What a recording around events keeps of the ticks that it leaves out: least, largest and mean value of every signal.
+
+One message of `/overview` is about ticks that follow each other: a protobuf message (proto2) with three doubles a
+column, `NAME_min`, `NAME_max`, `NAME_mean`, in the order of the columns, all present. `tick_min` and `tick_max` are the
+first and the last of its ticks, `deadline_ns_min` and `deadline_ns_max` when these were due. A value that is NaN does
+not count; where all are, so are the three. What is left out by intention is what these messages are about, and nothing
+else: a missing tick that none of them is about was lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.records import Channel, McapRecord, Schema
+
+from rtloop.recording.file import format
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.ticks import LARGEST
+from rtloop.signals import DEADLINE, TICK
+
+LEAST, MOST, MEAN = range(3)
+PARTS = ("min", "max", "mean")
+MAX_COLUMNS = 2047 // len(PARTS)
+"""Beyond that a field's tag has three bytes."""
+Intervals = np.ndarray[Any, Any]
+"""Shape (n, columns, 3)."""
+Range = tuple[int, int]
+"""First tick, how many."""
+
+
+def declared(columns: Sequence[str]) -> list[McapRecord]:
+    """The schema and channel records of the topic."""
+    data = format.doubles_schema("Overview", _names(columns))
+    return [
+        Schema(id=format.OVERVIEW_SCHEMA, name="rtloop.Overview", encoding="protobuf", data=data),
+        Channel(
+            id=format.OVERVIEW,
+            topic=format.OVERVIEW_TOPIC,
+            message_encoding="protobuf",
+            metadata={},
+            schema_id=format.OVERVIEW_SCHEMA,
+        ),
+    ]
+
+
+class Extremes(NamedTuple):
+    """Of one signal, shape (n,) each."""
+
+    least: np.ndarray[Any, Any]
+    most: np.ndarray[Any, Any]
+    mean: np.ndarray[Any, Any]
+
+
+class Overview:
+    """What is left of the ticks that were left out: `overview["x_error_um"].most` is an array of shape (n,)."""
+
+    def __init__(self, columns: Sequence[str], intervals: Intervals) -> None:
+        self._columns, self._intervals = list(columns), intervals
+
+    def __len__(self) -> int:
+        return len(self._intervals)
+
+    def __getitem__(self, name: str) -> Extremes:
+        if name not in self._columns:
+            raise KeyError(f"no signal {name!r}; there are {', '.join(self._columns)}")
+        return Extremes(*self._intervals[:, self._columns.index(name)].T)
+
+    @property
+    def tick(self) -> np.ndarray[Any, Any]:
+        """The first tick of each interval."""
+        return self["tick"].least
+
+    @property
+    def ticks(self) -> np.ndarray[Any, Any]:
+        """How many ticks each is about."""
+        return self["tick"].most - self["tick"].least + 1
+
+    @property
+    def time_s(self) -> np.ndarray[Any, Any]:
+        """When the first of them was due, in s since the start of the run."""
+        return self["deadline_ns"].least * 1e-9
+
+    @property
+    def end_s(self) -> np.ndarray[Any, Any]:
+        """When the last one was."""
+        return self["deadline_ns"].most * 1e-9
+
+
+class OverviewLayout:
+    """The messages of a recording with `columns`."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._columns, names = len(columns), _names(columns)
+        self._dtype = np.dtype(format.doubles(names))
+        self._names = names
+        self._blank = np.zeros(1, self._dtype)
+        format.fill_tags(self._blank, names)
+        same = np.ones(self._dtype.itemsize, bool)
+        for name in names:
+            _, start, *_ = (self._dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
+            same[start : start + 8] = False
+        self._fixed = np.flatnonzero(same)
+        self._tags = self._blank.view(np.uint8)[self._fixed]
+
+    def messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
+        """A message an interval, at the time of its first tick."""
+        records = np.repeat(self._blank, len(intervals))
+        for index, name in enumerate(self._names):
+            records[name] = intervals[:, index // len(PARTS), index % len(PARTS)]
+        times = intervals[:, DEADLINE, LEAST].astype(np.int64) + start_unix_ns
+        return [
+            Message(format.OVERVIEW, int(time), record.tobytes()) for time, record in zip(times, records, strict=True)
+        ]
+
+    def require(self, payload: bytes) -> None:
+        """Raise ValueError where a payload is no overview of these columns."""
+        if len(payload) != self._dtype.itemsize:
+            raise ValueError("an overview has not the length of its fields")
+        if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
+            raise ValueError("an overview has other fields than the columns")
+
+    def intervals(self, payloads: Sequence[bytes]) -> Intervals:
+        """What messages say that `require` lets pass."""
+        records = np.frombuffer(b"".join(payloads), self._dtype)
+        found = np.empty((len(records), self._columns, len(PARTS)))
+        for index, name in enumerate(self._names):
+            found[:, index // len(PARTS), index % len(PARTS)] = records[name]
+        return found
+
+
+def plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
+    """Which intervals (n, columns, 3) are about ticks behind those of all before them."""
+    good = np.ones(len(intervals), bool)
+    for column in (TICK, DEADLINE):
+        least, most = intervals[:, column, LEAST], intervals[:, column, MOST]
+        good &= (least >= 0) & (least <= most) & (most <= LARGEST) & (least == np.floor(least))
+        good &= most == np.floor(most)
+        before = np.fmax.accumulate(np.concatenate([[-1.0], most[:-1]]))
+        good &= least > before
+    return good
+
+
+def ranges(intervals: Intervals) -> list[Range]:
+    """The ticks that intervals are about, those that follow each other as one."""
+    if not len(intervals):
+        return []
+    first, end = intervals[:, TICK, LEAST].astype(np.int64), intervals[:, TICK, MOST].astype(np.int64) + 1
+    breaks = np.flatnonzero(first[1:] != end[:-1]) + 1
+    begins, ends = np.concatenate([[0], breaks]), np.concatenate([breaks, [len(first)]]) - 1
+    return [(int(first[one]), int(end[other] - first[one])) for one, other in zip(begins, ends, strict=True)]
+
+
+def uncovered(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
+    """What no range of `covered`, in the order of their ticks, has of the ticks from `first` to before `end`."""
+    found = []
+    for begin, count in covered:
+        if begin + count <= first:
+            continue
+        if begin >= end:
+            break
+        if begin > first:
+            found.append((first, begin - first))
+        first = begin + count
+    return [*found, (first, end - first)] if first < end else found
+
+
+def _names(columns: Sequence[str]) -> list[str]:
+    return [f"{column}_{part}" for column in columns for part in PARTS]

@@ -1,0 +1,149 @@
+"""How much a configuration's recordings may take: the oldest files go first, and never one around a trip.
+
+What is removed are finished files of runs of this configuration, by their name and by what they say of themselves: not
+the newest one, none with ticks around a trip, not what a capture or somebody else put there, not what cannot be read.
+Where the disk fills before the quota is reached, they go as well: the run that is recorded needs the room.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from rtloop.errors import RtloopError
+from rtloop.recording.file.around import Around
+from rtloop.recording.file.reader import Reader
+
+OTHERWISE_MADE = ("cut", "imported")
+"""In the headers of what is no run's own file."""
+SPARE_BYTES = 64 << 20
+"""Beside what is to stay free: room is made before the recorder has none."""
+BUDGET_S = 0.2
+"""For opening files at a time; what is not known yet is not removed."""
+BEFORE_S, AFTER_S = 10.0, 30.0
+"""Of a trip, where a recording of every tick says nothing else."""
+
+
+class Stored(NamedTuple):
+    """A finished file, as it says: its run, its ticks from `first` to before `end`, and those around its trips."""
+
+    run: tuple[str, int]
+    first: int
+    end: int
+    trips: tuple[tuple[int, int], ...]
+
+
+class Lying(NamedTuple):
+    """A file as it lies there, those of a run in their order."""
+
+    started: str
+    number: int
+    name: str
+    bytes: int
+    changed_ns: int
+
+
+class Quota:
+    """Of the recordings of the configuration `name` in `folder`: `keep_bytes` in all, `min_free_bytes` on the disk."""
+
+    def __init__(self, folder: Path, name: str, keep_bytes: int, min_free_bytes: int) -> None:
+        self._folder, self._name = folder, name
+        self._keep_bytes, self._free_bytes = keep_bytes, min_free_bytes + SPARE_BYTES
+        self._pattern = re.compile(
+            rf"{re.escape(name)}-(\d{{8}}T\d{{6}}(?:-\d{{1,3}})?)(?:-(\d{{4}}))?\.mcap(?:\.part)?"
+        )
+        self._known: dict[Lying, Stored] = {}
+        self._strange: set[Lying] = set()
+        self.bytes = self.removed = self.removed_bytes = 0
+        """What all of them take now; how many were removed, and what these took."""
+
+    def keep(self, budget_s: float = BUDGET_S) -> list[str]:
+        """Remove what is too much; what was removed, in words. `budget_s`: for opening files."""
+        said: list[str] = []
+        try:
+            lying = self._lying()
+            self._look(lying, budget_s)
+            self.bytes = sum(one.bytes for one in lying)
+            for one in self._removable(lying):
+                reason = self._too_much()
+                if reason is None:
+                    break
+                (self._folder / one.name).unlink()
+                self.bytes -= one.bytes
+                self.removed, self.removed_bytes = self.removed + 1, self.removed_bytes + one.bytes
+                said.append(f"{self._folder / one.name} was removed: {reason}")
+        except OSError as error:
+            said.append(f"{self._folder}: {error.strerror}")
+        return said
+
+    def _too_much(self) -> str | None:
+        """Why something is to go."""
+        if self.bytes > self._keep_bytes:
+            return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
+        status = os.statvfs(self._folder)
+        if status.f_bavail * status.f_frsize < self._free_bytes:
+            return f"less than {self._free_bytes >> 20} MiB are free"
+        return None
+
+    def _removable(self, lying: list[Lying]) -> list[Lying]:
+        """The oldest first."""
+        finished = [one for one in lying if one.name.endswith(".mcap")]
+        unseen = {one.started for one in finished if one not in self._known and one not in self._strange}
+        return [
+            one
+            for one in finished[:-1]
+            if one in self._known
+            and one.started not in unseen  # a trip may be in the next file of its run
+            and not _around_a_trip(self._known[one], self._known.values())
+        ]
+
+    def _lying(self) -> list[Lying]:
+        found = []
+        with os.scandir(self._folder) as entries:
+            for entry in entries:
+                match = self._pattern.fullmatch(entry.name)
+                if match and entry.is_file(follow_symlinks=False):
+                    status, number = entry.stat(follow_symlinks=False), int(match[2] or 1)
+                    found.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
+        return sorted(found)
+
+    def _look(self, lying: list[Lying], budget_s: float) -> None:
+        """Into files that were not seen before, the oldest first."""
+        until_s = time.monotonic() + budget_s
+        self._known = {one: self._known[one] for one in lying if one in self._known}
+        self._strange &= set(lying)
+        for one in lying:
+            new = one not in self._known and one not in self._strange and one.name.endswith(".mcap")
+            if new and time.monotonic() < until_s:
+                if (found := self._stored(one)) is None:
+                    self._strange.add(one)
+                else:
+                    self._known[one] = found
+
+    def _stored(self, one: Lying) -> Stored | None:
+        """What a file says; None where it is damaged, or none of this configuration's recordings."""
+        try:
+            with Reader(self._folder / one.name) as reader:
+                header, totals = reader.header, reader.totals
+                if totals is None or header["name"] != self._name or any(map(header.get, OTHERWISE_MADE)):
+                    return None
+                around = Around.of(header)
+                before_s, after_s = (around.before_s, around.after_s) if around else (BEFORE_S, AFTER_S)
+                ticks = [event["tick"] for event in reader.events if event["kind"] in ("tripped", "driver_failed")]
+                rate_hz = header["rate_hz"]
+                trips = tuple((tick - round(before_s * rate_hz), tick + round(after_s * rate_hz)) for tick in ticks)
+                run = (header["name"], header["created_unix_ns"])
+                if reader.problems:
+                    return None
+                return Stored(run, reader.first_tick, totals["ticks_executed"], trips)
+        except RtloopError:
+            return None
+
+
+def _around_a_trip(file: Stored, stored: Iterable[Stored]) -> bool:
+    trips = [trip for other in stored if other.run == file.run for trip in other.trips]
+    return any(first < file.end and last >= file.first for first, last in trips)

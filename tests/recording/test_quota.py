@@ -1,0 +1,132 @@
+"""What a quota removes: the oldest of a configuration's own recordings, and never one around a trip."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rtloop.engine.messages import Kind, message
+from rtloop.recording.file.contents import Message
+from rtloop.recording.file.events import event_of
+from rtloop.recording.file.format import EVENTS
+from rtloop.recording.file.writer import Writer
+from rtloop.signals import Flag
+from rtloop.supervision.quota import SPARE_BYTES, Quota
+from tests.recording.hand_made_loop import AXES, START_UNIX_NS, final_message, make_header, make_rows
+
+PART = 5_000
+"""Ticks in a file: half a second."""
+AROUND = {"before_s": 0.1, "after_s": 0.2, "every_s": 1.0, "on": ["trip"]}
+
+
+def write(folder: Path, stem: str, number: int = 1, trip: int | None = None, **header: object) -> Path:
+    """File `number` of a run, in which it tripped at a tick."""
+    first = (number - 1) * PART
+    said = make_header(sequence=number, first_tick=first, format=2, around=AROUND, **header)
+    writer = Writer(folder / f"{stem}.mcap", said, START_UNIX_NS)
+    if trip is not None:
+        record = message(Kind.TRIPPED, tick=trip, axis=0, values=[Flag.TRIP_POSITION])[0]
+        writer.write_messages([Message(EVENTS, START_UNIX_NS, json.dumps(event_of(record, AXES, 0)).encode())])
+    writer.write_ticks(make_rows(1_000, first=first))
+    writer.finish(lambda logged: final_message(first + PART, logged))
+    return writer.path
+
+
+def run_of(folder: Path, stamp: str, count: int, trip: int | None = None, name: str = "test") -> list[Path]:
+    """The files of one run, of which those that have it say at which tick it tripped."""
+    at = {} if trip is None else {trip // PART + 1: trip}
+    created = START_UNIX_NS + int(stamp[-1]) * 10**9
+    return [
+        write(folder, f"{name}-{stamp}-{number:04d}", number, at.get(number), created_unix_ns=created, name=name)
+        for number in range(1, count + 1)
+    ]
+
+
+def keep(folder: Path, files: int) -> Quota:
+    """A quota for so many files, applied."""
+    size = max(path.stat().st_size for path in folder.glob("test-*.mcap"))
+    quota = Quota(folder, "test", files * size, 0)
+    for _ in range(3):
+        quota.keep(budget_s=60.0)
+    return quota
+
+
+@pytest.fixture(autouse=True)
+def disk(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """With a TiB free."""
+    status = SimpleNamespace(f_bavail=1 << 40, f_frsize=1)
+    monkeypatch.setattr(os, "statvfs", lambda _: status)
+    return status
+
+
+def left(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_oldest_go_first(tmp_path: Path):
+    old, new = run_of(tmp_path, "20260101T000001", 3), run_of(tmp_path, "20260102T000002", 3)
+    size = sum(path.stat().st_size for path in old[:2])
+    quota = keep(tmp_path, 4)
+    assert left(tmp_path) == [path.name for path in [old[2], *new]]
+    assert (quota.removed, quota.removed_bytes) == (2, size)
+    assert quota.bytes == sum(path.stat().st_size for path in tmp_path.iterdir())
+
+
+def test_none_around_a_trip_goes_whatever_the_quota(tmp_path: Path):
+    """Nor the neighbour that begins, or ends, with what is around it; nor the newest."""
+    files = run_of(tmp_path, "20260101T000001", 7, trip=2 * PART + 500)  # before_s reaches into the second
+    late = run_of(tmp_path, "20260102T000002", 6, trip=2 * PART - 500)  # after_s reaches into the third
+    keep(tmp_path, 1)
+    assert left(tmp_path) == [path.name for path in (*files[1:3], *late[1:3], late[-1])]
+
+
+def test_what_others_put_there_stays(tmp_path: Path):
+    mine = run_of(tmp_path, "20260101T000001", 4)
+    others = [
+        write(tmp_path, "test-20260101T000001.cut-5"),
+        write(tmp_path, "test-mine"),
+        write(tmp_path, "other-20260101T000001", name="other"),
+        write(tmp_path, "test-20250101T000001", name="other"),
+        write(tmp_path, "test-20250101T000002", cut={"first": 0, "end": 9, "files": []}),
+    ]
+    damaged, unfinished = tmp_path / "test-20250101T000003.mcap", tmp_path / "test-20250101T000004.mcap.part"
+    damaged.write_bytes(mine[0].read_bytes()[:-3000])
+    unfinished.write_bytes(mine[0].read_bytes()[:-3000])
+    (tmp_path / "test-20250101T000005.mcap").symlink_to(others[0])
+    keep(tmp_path, 1)
+    expected = [mine[-1], *others, damaged, unfinished, tmp_path / "test-20250101T000005.mcap"]
+    assert left(tmp_path) == sorted(path.name for path in expected)
+
+
+def test_a_disk_that_fills_counts_as_much(tmp_path: Path, disk: SimpleNamespace):
+    files = run_of(tmp_path, "20260101T000001", 4, trip=500)
+    quota = Quota(tmp_path, "test", 1 << 40, 10 << 20)
+    assert quota.keep() == []
+    disk.f_bavail = (10 << 20) + SPARE_BYTES - 1
+    said, *more = quota.keep(budget_s=60.0)
+    assert "less than 74 MiB are free" in said
+    assert [name for name in left(tmp_path)] == [files[0].name, files[-1].name]
+    assert len(more) == 1
+
+
+def test_what_was_not_looked_at_yet_is_not_removed(tmp_path: Path):
+    files = run_of(tmp_path, "20260101T000001", 4)
+    assert Quota(tmp_path, "test", 1, 0).keep(budget_s=0.0) == []
+    assert len(left(tmp_path)) == len(files)
+
+
+def test_a_folder_that_is_gone_is_said(tmp_path: Path):
+    (said,) = Quota(tmp_path / "gone", "test", 1, 0).keep()
+    assert said.endswith("No such file or directory")
+
+
+def test_the_rows_that_are_written_here_can_be_read(tmp_path: Path):
+    from rtloop.recording.load import load
+
+    (path,) = run_of(tmp_path, "20260101T000001", 1, trip=20)
+    assert np.array_equal(load(path)["tick"], np.arange(1_000))
