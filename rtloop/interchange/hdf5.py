@@ -80,9 +80,9 @@ def _read(found: Found, dataset: Any, name: str) -> None:
 
 def _see(one: Any, seen: set[Any]) -> bool:
     """Whether an object is met for the first time."""
-    from h5py import h5o
+    import h5py
 
-    info = h5o.get_info(one.id)
+    info = h5py.h5o.get_info(one.id)  # type: ignore[attr-defined]
     place = (info.fileno, info.addr)
     new = place not in seen
     seen.add(place)
