@@ -63,3 +63,17 @@ def test_what_the_memory_has_no_room_for_is_a_gap(disk: Disk, tmp_path: Path):
     assert report.gaps == gaps
     assert (report.identical, report.ticks + report.skipped + summary.ticks_lost) == (True, 14 * SECOND)
     assert sum(event["kind"] == "tripped" for event in recording.events) == 1
+
+
+def test_a_file_that_is_begun_anew_begins_with_what_is_kept(disk: Disk, tmp_path: Path):
+    run = Selected(tmp_path / "run.mcap", around("trip"), paced=True)
+    run.run_to(12 * SECOND)
+    disk.error = errno.ENOSPC  # in which an overview of ten seconds cannot be written
+    run.run_to(16 * SECOND)
+    disk.error = None
+    run.run_to(18 * SECOND)
+    totals = run.session.finish("finished")
+    second = load(totals["paths"][1])
+    assert second["tick"][0] % SECOND == 0
+    assert replay(second).identical
+    assert totals["ticks_lost"] == 0
