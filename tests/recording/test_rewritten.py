@@ -439,6 +439,7 @@ def test_no_length_is_believed(run: Run, tmp_path: Path):
             found = load(path)
             assert bits(np.concatenate(list(found.blocks()))) == bits(run.rows), name
             assert found.problems or name == "deep JSON", name
+            assert name != "many ticks of no byte" or "take more than 32 MiB" in found.problems[0]
             assert tracemalloc.get_traced_memory()[1] < 80 << 20, name
         finally:
             tracemalloc.stop()
