@@ -17,7 +17,7 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType
 from mcap_protobuf.schema import build_file_descriptor_set
-from rtloop.recording.views.export import export
+from rtloop.interchange.export import export
 
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.session import Options, Session
