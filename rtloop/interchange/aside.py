@@ -56,7 +56,7 @@ def _received(path: Path, stream: IO[bytes]) -> Table | None:
         raise (MissingExtra if said["kind"] == MissingExtra.__name__ else UnreadableData)(said["error"])
     columns = {name: np.empty(said["rows"]) for name in said["columns"]}
     for values in columns.values():
-        rest = memoryview(values).cast("B")
+        rest = memoryview(values.data).cast("B")
         while len(rest) and (count := stream.readinto(rest)):  # type: ignore[attr-defined]
             rest = rest[count:]
         if len(rest):
@@ -81,7 +81,7 @@ def _main(path: Path, group: str | None) -> None:
     about = {"rows": rows_of(table), "columns": [*table.columns], "units": dict(table.units)}
     _say(out, about | {"time": table.time, "about": dict(table.about)})
     for values in table.columns.values():
-        out.write(memoryview(values).cast("B"))
+        out.write(memoryview(values.data).cast("B"))
     out.flush()
 
 

@@ -80,7 +80,7 @@ def _read(found: Found, dataset: Any, name: str) -> None:
 
 def _see(one: Any, seen: set[Any]) -> bool:
     """Whether an object is met for the first time."""
-    from h5py import h5o
+    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
 
     info = h5o.get_info(one.id)
     place = (info.fileno, info.addr)
