@@ -27,7 +27,7 @@ def read_here(path: Path, group: str | None = None) -> Table:
     except OSError as error:
         raise UnreadableData(f"{path}: {error.strerror}") from None
     if head.startswith(MCAP_MAGIC):
-        from rtloop.interchange.from_mcap import read_mcap  # pyright: ignore[reportMissingImports]
+        from rtloop.interchange.from_mcap import read_mcap
 
         return read_mcap(path, group)
     if head.startswith(b"MATLAB") or path.suffix.lower() == ".mat":

@@ -97,6 +97,13 @@ def test_a_replay_says_kindly_that_nothing_of_a_law_is_in_it(options: list[str],
     assert result.stderr.count("\n") == 1
 
 
+def test_a_response_cannot_be_had_of_a_loop_that_nothing_is_known_of(scan: Path):
+    run("import", scan, "--map", "x_drive_v=drive_mV", "--map", "x_position_um=pos_nm")
+    result = run("identify", "response", "scan.mcap")
+    assert result.exit_code == 1
+    assert "nothing in it says which loop was closed" in result.stderr
+
+
 def test_all_columns_under_their_own_names(scan: Path):
     names = [one["name"] for one in answer("import", scan, "--all", "--map", "x_drive_v=drive_mV")["signals"]]
     assert names == ["x_drive_v", "pos_nm", "T"]

@@ -21,6 +21,10 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     The model is that of the recorded configuration. Raises RecordingError, UnsuitableData.
     """
     recording = load(path)
+    if "imported" in recording.header:
+        raise UnsuitableData(
+            f"{path}: was imported, and nothing in it says which loop was closed; identify hysteresis, dynamics take it"
+        )
     axis = axis_of(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])
     names = {name: f"{axis}_{name}" for name in SIGNALS}
