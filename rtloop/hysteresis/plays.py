@@ -18,7 +18,8 @@ from rtloop.laws.shipped.play_model import PlayModel
 
 
 def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, before: Real | None = None) -> Real:
-    """F_r[u], (samples, plays), of virgin plays, or of plays that stood at `before` (plays,) when the drive was first seen.
+    """F_r[u], (samples, plays), of virgin plays, or of plays that stood at `before` (plays,) when the drive was first
+    seen.
 
     While the drive does not turn back, the formula holds for all samples at once with the state before the first.
     """

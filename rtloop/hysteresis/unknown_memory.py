@@ -24,17 +24,12 @@ LEAST_TURN = 1e-3
 
 
 class Missing(NamedTuple):
-    """What a drive left out, in V: from `turn_v`, the later of its two extremes, it came back to `reached_v` at the farthest
-    and not to `goal_v`, the other extreme."""
+    """What a drive left out, in V: from `turn_v`, the later of its two extremes, it came back to `reached_v` at the
+    farthest and not to `goal_v`, the other extreme."""
 
     turn_v: float
     reached_v: float
     goal_v: float
-
-
-def bounds(drive: Real, thresholds: Real) -> tuple[Real, Real]:
-    """The least and the greatest output, (samples, plays) each, that plays of unknown memory may have."""
-    return tuple(play_outputs(drive, thresholds, drive[0] + side * thresholds) for side in (-1.0, 1.0))
 
 
 def known_stroke_v(drive: Real) -> float:

@@ -1,8 +1,9 @@
 """What a sum of plays errs by on data that it was not fitted to.
 
-Of several recordings each is left out in turn: slopes and creep come from the others. What is a recording's own (offset,
-drift, memory at its beginning) comes from every other tenth of it, and is judged on the tenths between, and the other way round.
-A single recording is left out tenth by tenth; the plays remember what the drive did in the tenth that is not fitted.
+Of several recordings each is left out in turn: slopes and creep come from the others. What is a recording's own
+(offset, drift, memory at its beginning) comes from every other fortieth of it, and is judged on those between, and the other way
+round: finer than that, for what was remembered shows in those samples alone that it still governs. Of a single
+recording two twentieths are left out at a time; the plays remember what the drive did in them.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ import numpy as np
 from rtloop.design.identification.memory_fit import Common, Limits, Own, Stretch, errors, fit_memory
 from rtloop.hil.modal import Real
 
-PARTS = 10
-"""Of a recording, one of which is judged by the others."""
+FOLDS, PIECES, FINE_PIECES = 10, 20, 40
+"""A single recording is fitted so often, without so many a part of its pieces; pieces by which its own is judged."""
 GROUPS = 5
 """At most so many fits: more recordings than that are left out several at a time."""
 
 
 def fitted(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> tuple[Common, list[Own]]:
-    """Slopes, creep and what is each recording's own. `memories`, of each, are the rises of its memory curve to begin at.
+    """Slopes, creep and what is each recording's own. `memories`, of each, are the rises of its memory curve to begin
+    at.
 
     First without drift and creep, which an unsuitable memory would otherwise be made up for by.
     """
@@ -29,11 +31,12 @@ def fitted(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limit
     flat = _flat(limits)
     owns = [_beginning(one, flat, rises) for one, rises in zip(bare, memories, strict=True)]
     common, owns = fit_memory(bare, flat, owns, limits)
-    if all(one.own.shape == full.own.shape for one, full in zip(bare, stretches, strict=True)):
-        if stretches[0].creep.shape[1] == 0:
-            return common, owns
+    if stretches[0].creep.shape[1] == 0 and stretches[0].own.shape[1] == 1:
+        return common, owns
     common = Common(common.slopes, np.zeros(stretches[0].creep.shape[1]))
-    return fit_memory(stretches, common, [_with_terms(one, full) for one, full in zip(owns, stretches, strict=True)], limits)
+    return fit_memory(
+        stretches, common, [_with_terms(one, full) for one, full in zip(owns, stretches, strict=True)], limits
+    )
 
 
 def nearest(stretch: Stretch, memories: Sequence[Real], limits: Limits, common: Common | None = None) -> Real:
@@ -58,7 +61,7 @@ def own_of(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Own
 
 def judged(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Real:
     """Errors in µm (blocks,) of a recording that the model knows nothing of."""
-    found, even = np.empty(stretch.position_um.size), _parts(stretch) % 2 == 0
+    found, even = np.empty(stretch.position_um.size), _pieces(stretch, FINE_PIECES) % 2 == 0
     for half in (even, ~even):
         own = own_of(stretch.only(half), common, rises, limits)
         found[~half] = errors(stretch.only(~half), common, own)
@@ -68,7 +71,7 @@ def judged(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Rea
 def held_out(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> list[Real]:
     """Errors in µm of every recording, (blocks,) each, by fits that it had no part in."""
     if len(stretches) == 1:
-        return [_tenth_by_tenth(stretches[0], memories, limits)]
+        return [_piece_by_piece(stretches[0], memories, limits)]
     found: list[Real] = [np.empty(0)] * len(stretches)
     for group in range(min(GROUPS, len(stretches))):
         others = [i for i in range(len(stretches)) if i % GROUPS != group]
@@ -78,16 +81,17 @@ def held_out(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Lim
     return found
 
 
-def _tenth_by_tenth(stretch: Stretch, memories: Sequence[Real], limits: Limits) -> Real:
-    found, parts = np.empty(stretch.position_um.size), _parts(stretch)
-    for part in range(PARTS):
-        common, owns = fitted([stretch.only(parts != part)], memories, limits)
-        found[parts == part] = errors(stretch.only(parts == part), common, owns[0])
+def _piece_by_piece(stretch: Stretch, memories: Sequence[Real], limits: Limits) -> Real:
+    found, folds = np.empty(stretch.position_um.size), _pieces(stretch, PIECES) % FOLDS
+    for fold in range(FOLDS):
+        common, owns = fitted([stretch.only(folds != fold)], memories, limits)
+        found[folds == fold] = errors(stretch.only(folds == fold), common, owns[0])
     return found
 
 
-def _parts(stretch: Stretch) -> Real:
-    return np.arange(stretch.position_um.size) * PARTS // stretch.position_um.size
+def _pieces(stretch: Stretch, pieces: int) -> Real:
+    """Number of the piece that each block belongs to."""
+    return np.arange(stretch.position_um.size) * pieces // stretch.position_um.size
 
 
 def _flat(limits: Limits) -> Common:

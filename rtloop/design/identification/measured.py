@@ -33,10 +33,10 @@ class UnsuitableData(RtloopError):
 class Measured:
     """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
 
-    In a recording that was imported the two are taken as sampled together: its rows are paired anew, so that here, too, a
-    drive's position is that of the next tick. `command_um` is NaN where it was not recorded. `even` says that no tick is
-    missing or late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is when each tick was due,
-    from any beginning on; None stands for equal intervals.
+    In a recording that was imported the two are taken as sampled together: its rows are paired anew, so that here,
+    too, a drive's position is that of the next tick. `command_um` is NaN where it was not recorded. `even` says that
+    no tick is missing or late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is
+    when each tick was due, from any beginning on; None stands for equal intervals.
     """
 
     name: str
@@ -64,14 +64,15 @@ def measured(path: Path, axis: str | None = None) -> Measured:
         raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
     if "flags" in recording:
         _refuse_trip(path, recording["flags"])
-    adc, command = f"{axis}_adc_v", f"{axis}_command_um"
-    require_usable(str(path), drive, position, recording[adc] if adc in recording else position)
+    reading = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
+    require_usable(str(path), drive, position, recording[reading])
     intervals = np.diff(deadlines)
     if not np.all(intervals > 0):
         raise UnsuitableData(f"{path}: time stands still or goes back at tick {int(np.argmax(intervals <= 0)) + 1}")
     period_ns = float(np.median(intervals))
     missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
     even = not missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
+    command = f"{axis}_command_um"
     given = recording[command] if command in recording else np.full(drive.size, np.nan)
     if "imported" in recording.header:
         drive, given, position, deadlines = drive[1:], given[1:], position[:-1], deadlines[1:]

@@ -1,11 +1,12 @@
 """Slopes of a sum of plays and the memory that each recording began with, both unknown, by least squares.
 
-    x_k = Σ s_i (F_i − F_{i+1})_k + creep_k·c + own_k·o,     F_i,k = min(max(z_i, low_ik), high_ik),     z_i = u_0 + Σ_{j≤i} d_j
+    x_k = Σ s_i (F_i − F_{i+1})_k + creep_k·c + own_k·o
+    F_i,k = min(max(z_i, low_ik), high_ik),     z_i = u_0 + Σ_{j≤i} d_j
 
-s_i are the slopes of the initial loading curve, common to all recordings, as are c; the rises d of the memory curve and o
-(offset, drift) are each recording's own. |d_j| ≤ r_j − r_{j−1} (`unknown_memory`) and s_i ≥ least are bounds on single
-unknowns, and each step is a linear problem with bounds: Gauss-Newton, where a damping of the rises alone (Levenberg 1944)
-keeps them near while a play's end lies beyond the samples that know of it.
+s_i are the slopes of the initial loading curve, common to all recordings, as are c; the rises d of the memory curve
+and o (offset, drift) are each recording's own. |d_j| ≤ r_j − r_{j−1} (`unknown_memory`) and s_i ≥ least are bounds on
+single unknowns, and each step is a linear problem with bounds: Gauss-Newton, where a damping of the rises alone
+(Levenberg 1944) keeps them near while a play's end lies beyond the samples that know of it.
 
 The slopes of neighbours are held together by RIDGE, which matters for those alone that the data leave open.
 """
@@ -23,7 +24,8 @@ from rtloop.hil.modal import Real
 RIDGE = 1e-3
 """Error in µm rms that a difference of two slopes counts as, per µm that it makes over the drive's range."""
 DAMPING, HARDER, SOFTER, LEAST_DAMPING = 3e-3, 4.0, 0.25, 3e-7
-"""Of the rises, per µm that they move the position at the mean slope: at first, after a failed step, after a good one."""
+"""Of the rises, per µm that they move the position at the mean slope: at first, after a failed step, after a good
+one."""
 STEPS, TRIALS, DONE = 60, 8, 1e-5
 """At most so many steps, each tried so often; the last is that which gains less than this part."""
 FLOOR = 1e-7
@@ -69,7 +71,8 @@ class Equations(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Thresholds in V (plays,), least slope in µm/V, and the largest drive and position ranges, by which things are small."""
+    """Thresholds in V (plays,), least slope in µm/V, and the largest drive and position ranges, by which things are
+    small."""
 
     thresholds_v: Real
     least_slope: float
@@ -79,7 +82,11 @@ class Limits(NamedTuple):
 
 def output(stretch: Stretch, common: Common, own: Own) -> Real:
     """Position in µm (blocks,)."""
-    return _plays(stretch, own) @ np.diff(common.slopes, prepend=0.0) + stretch.creep @ common.creep + stretch.own @ own.terms
+    return (
+        _plays(stretch, own) @ np.diff(common.slopes, prepend=0.0)
+        + stretch.creep @ common.creep
+        + stretch.own @ own.terms
+    )
 
 
 def errors(stretch: Stretch, common: Common, own: Own) -> Real:
@@ -136,7 +143,7 @@ def _linearised(stretches: Sequence[Stretch], common: Common, owns: Sequence[Own
         by_rise = np.cumsum((free * np.diff(common.slopes, prepend=0.0))[:, ::-1], axis=1)[:, ::-1]
         by_slope = plays - np.append(plays[:, 1:], np.zeros((plays.shape[0], 1)), axis=1)
         parts = (by_slope, stretch.creep, stretch.own, by_rise, errors(stretch, common, own)[:, None])
-        triangle = np.linalg.qr(np.hstack(parts), mode="r")
+        triangle = np.asarray(np.linalg.qr(np.hstack(parts), mode="r"))
         rows = np.zeros((triangle.shape[0], shared + private * len(owns)))
         rows[:, :shared] = triangle[:, :shared]
         rows[:, shared + index * private : shared + (index + 1) * private] = triangle[:, shared:-1]
@@ -157,7 +164,11 @@ def _step(
     no_terms = np.full(owns[0].terms.size, np.inf)
     creep = np.full(common.creep.size, np.inf)
     slopes = np.full(common.slopes.size, np.inf)
-    low = [limits.least_slope - common.slopes, -creep, *(part for own in owns for part in (-no_terms, -gaps - own.rises))]
+    low = [
+        limits.least_slope - common.slopes,
+        -creep,
+        *(part for own in owns for part in (-no_terms, -gaps - own.rises)),
+    ]
     high = [slopes, creep, *(part for own in owns for part in (no_terms, gaps - own.rises))]
     weight = [np.full(slopes.size + creep.size, FLOOR)]
     weight += [part for _ in owns for part in (np.full(no_terms.size, FLOOR), np.full(gaps.size, damping))]

@@ -26,7 +26,8 @@ AT_ONCE = 100_000
 class Kept(NamedTuple):
     """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, each (blocks,).
 
-    `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where unknown.
+    `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where
+    unknown.
     """
 
     name: str
@@ -44,8 +45,8 @@ def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kep
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most)
     time_s = run.seconds[:-1] - run.seconds[0]
     before = None if before_v is None else np.asarray(before_v, float)
-    averages = (averaged(values[:, None], size)[:, 0] for values in (time_s, drive, run.position_um[1:]))
-    return Kept(run.name, *averages, drive, size, before)
+    time_s, slow, position = averaged(np.column_stack([time_s, drive, run.position_um[1:]]), size).T
+    return Kept(run.name, time_s, slow, position, drive, size, before)
 
 
 def stretch(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: float) -> Stretch:
