@@ -1,8 +1,8 @@
 """What a sum of plays errs by on data that it was not fitted to.
 
 Of several recordings each is left out in turn: slopes and creep come from the others. What is a recording's own
-(offset, drift, memory at its beginning) comes from every other fortieth of it, and is judged on those between, and the other way
-round: finer than that, for what was remembered shows in those samples alone that it still governs. Of a single
+(offset, drift, memory at its beginning) comes from every other fortieth of it, and is judged on those between, and
+the other way round: so fine, for what was remembered shows in those samples alone that it still governs. Of a single
 recording two twentieths are left out at a time; the plays remember what the drive did in them.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.design.identification.memory_fit import Common, Limits, Own, Stretch, errors, fit_memory
 from rtloop.hil.modal import Real
@@ -89,7 +90,7 @@ def _piece_by_piece(stretch: Stretch, memories: Sequence[Real], limits: Limits) 
     return found
 
 
-def _pieces(stretch: Stretch, pieces: int) -> Real:
+def _pieces(stretch: Stretch, pieces: int) -> npt.NDArray[np.intp]:
     """Number of the piece that each block belongs to."""
     return np.arange(stretch.position_um.size) * pieces // stretch.position_um.size
 
@@ -99,7 +100,7 @@ def _flat(limits: Limits) -> Common:
 
 
 def _beginning(stretch: Stretch, common: Common, rises: Real) -> Own:
-    return Own(np.array([np.mean(errors(stretch, common, Own(np.zeros(1), rises)))]), rises)
+    return Own(np.full(1, float(np.mean(errors(stretch, common, Own(np.zeros(1), rises))))), rises)
 
 
 def _bare(stretch: Stretch) -> Stretch:

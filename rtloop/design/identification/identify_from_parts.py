@@ -113,8 +113,8 @@ def _given(thresholds: Real, stroke_v: float, largest_v: float, missing: str) ->
     beyond = thresholds[thresholds >= 0.5 * stroke_v]
     if beyond.size:
         raise UnsuitableData(
-            f"thresholds from {beyond[0]:g} V on cannot be told: the longest stroke of known memory has {stroke_v:.4g} V "
-            f"and shows plays below {0.5 * stroke_v:.4g} V{f'; {missing}' if missing else ''}"
+            f"thresholds from {beyond[0]:g} V on cannot be told: the longest stroke of known memory has {stroke_v:.4g} "
+            f"V and shows plays below {0.5 * stroke_v:.4g} V{f'; {missing}' if missing else ''}"
         )
     return _with_larger(thresholds, "given", 0.5 * stroke_v, largest_v)
 
@@ -132,14 +132,14 @@ def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
     widest = max(work.runs, key=lambda run: float(np.ptp(run.full_v)))
     turn_v, reached_v, goal_v = missing_stroke(widest.full_v)
     missing = (
-        f"missing: the drive from {reached_v:.4g} V on to {goal_v:.4g} V, in one stroke from {turn_v:.4g} V, which would "
-        f"show plays from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
+        f"missing: the drive from {reached_v:.4g} V on to {goal_v:.4g} V, in one stroke from {turn_v:.4g} V, which "
+        f"would show plays from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
     )
     if stroke_v < LEAST_KNOWN * work.largest_v:
         raise UnsuitableData(
-            f"{', '.join(run.name for run in runs)}: too little excitation: what the actuator remembers at first is not "
-            f"known, and the longest stroke from where it is known has {stroke_v:.4g} V of the {work.largest_v:.4g} V "
-            f"that the drive covers; at least {100 * LEAST_KNOWN:g} % are needed; {missing}"
+            f"{', '.join(run.name for run in runs)}: too little excitation: what the actuator remembers at first is "
+            f"not known, and the longest stroke from where it is known has {stroke_v:.4g} V of the "
+            f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN:g} % are needed; {missing}"
         )
     return stroke_v, missing
 

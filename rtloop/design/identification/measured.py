@@ -52,7 +52,7 @@ class Measured:
     @property
     def seconds(self) -> Real:
         """When each tick was due (ticks,), from any beginning on."""
-        return self.period_s * np.arange(self.drive_v.size) if self.time_s is None else self.time_s
+        return self.period_s * np.arange(self.drive_v.size, dtype=np.float64) if self.time_s is None else self.time_s
 
 
 def measured(path: Path, axis: str | None = None) -> Measured:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
 from rtloop.hil.modal import Real
@@ -34,7 +35,8 @@ FLOOR = 1e-7
 
 class Stretch(NamedTuple):
     """One recording, averaged over blocks: bounds of the plays (blocks, plays), creep (blocks, terms), own terms
-    (blocks, terms), position in µm (blocks,). `first_v` is where the drive began. low = high says that memory is known."""
+    (blocks, terms), position in µm (blocks,). `first_v` is where the drive began. low = high says that memory is known.
+    """
 
     first_v: float
     low: Real
@@ -43,7 +45,7 @@ class Stretch(NamedTuple):
     own: Real
     position_um: Real
 
-    def only(self, kept: Real) -> Stretch:
+    def only(self, kept: npt.NDArray[np.bool_]) -> Stretch:
         """Of these blocks, a mask."""
         return Stretch(self.first_v, *(rows[kept] for rows in self[1:]))
 
