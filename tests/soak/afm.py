@@ -36,7 +36,9 @@ def main() -> None:
             ("download", "--quiet", "--no-deps", "--no-binary", ":all:", "--dest", name, AFMFORMATS),
             ("install", "--quiet", "--target", str(folder / "reader"), AFMFORMATS),
         ):
-            done = subprocess.run([sys.executable, "-m", "pip", "--disable-pip-version-check", *what], capture_output=True)
+            done = subprocess.run(
+                [sys.executable, "-m", "pip", "--disable-pip-version-check", *what], capture_output=True
+            )
             if done.returncode:
                 print(f"skipped: pip {what[0]}: {done.stderr.decode().strip().splitlines()[-1]}")
                 return
@@ -68,7 +70,8 @@ def shown(path: Path, folder: Path) -> float:
         remarks += [f"for strokes up to {found['stroke_v']:.3g}"] if i == 0 else []
         kind = "fitted" if row["fitted"] else "held out"
         print(
-            f"{name if i == 0 else '':48}{i:6}  {kind:8}{share:8.3f}{row['max_error_percent']:11.3f}  {', '.join(remarks)}",
+            f"{name if i == 0 else '':48}{i:6}  {kind:8}{share:8.3f}{row['max_error_percent']:11.3f}  "
+            f"{', '.join(remarks)}",
             flush=True,
         )
     return max((row["max_error_percent"] for row in found["held_out"][1:]), default=0.0)

@@ -3,7 +3,7 @@
 Of several recordings each is left out in turn: slopes and creep come from the others. What is a recording's own
 (offset, drift, memory at its beginning) comes from every other fortieth of it, and is judged on those between, and
 the other way round: so fine, for what was remembered shows in those samples alone that it still governs. Of a single
-recording two twentieths are left out at a time; the plays remember what the drive did in them.
+recording four fortieths are left out at a time; the plays remember what the drive did in them.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy.typing as npt
 from rtloop.design.identification.memory_fit import Common, Limits, Own, Stretch, errors, fit_memory
 from rtloop.hil.modal import Real
 
-FOLDS, PIECES, FINE_PIECES = 10, 20, 40
-"""A single recording is fitted so often, without so many a part of its pieces; pieces by which its own is judged."""
+PIECES, FOLDS = 40, 10
+"""A recording is judged piece by piece; a single one is fitted so often, each time without as many of them."""
 GROUPS = 5
 """At most so many fits: more recordings than that are left out several at a time."""
 
@@ -62,7 +62,7 @@ def own_of(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Own
 
 def judged(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Real:
     """Errors in µm (blocks,) of a recording that the model knows nothing of."""
-    found, even = np.empty(stretch.position_um.size), _pieces(stretch, FINE_PIECES) % 2 == 0
+    found, even = np.empty(stretch.position_um.size), _pieces(stretch, PIECES) % 2 == 0
     for half in (even, ~even):
         own = own_of(stretch.only(half), common, rises, limits)
         found[~half] = errors(stretch.only(~half), common, own)

@@ -27,7 +27,7 @@ RIDGE = 1e-3
 DAMPING, HARDER, SOFTER, LEAST_DAMPING = 3e-3, 4.0, 0.25, 3e-7
 """Of the rises, per µm that they move the position at the mean slope: at first, after a failed step, after a good
 one."""
-STEPS, TRIALS, DONE = 60, 8, 1e-5
+STEPS, TRIALS, DONE = 40, 8, 1e-4
 """At most so many steps, each tried so often; the last is that which gains less than this part."""
 FLOOR = 1e-7
 """Least weight of every unknown, so that one that does nothing stays where it is."""

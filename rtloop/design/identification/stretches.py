@@ -15,7 +15,7 @@ from rtloop.hysteresis.plays import play_outputs
 
 Term = Literal["drift", "creep"]
 
-BLOCKS, LEAST_BLOCKS = 6000, 300
+BLOCKS, LEAST_BLOCKS = 3000, 300
 """Averaged samples of all recordings together, and of each at least."""
 CREEP_PARTS = (30.0, 6.0, 1.0)
 """Creep has time constants of the longest recording's duration over these."""
