@@ -40,7 +40,7 @@ def recorded(truth: Any, seed: int, noise_um: float = 0.02, drift_um: float = 0.
 
 def test_one_part_of_a_loop_gives_the_weights_that_it_shows() -> None:
     past = np.interp(np.arange(90), [0, 30, 60, 89], [0.0, 6.0, -3.0, 1.0])
-    drive = np.interp(np.arange(SAMPLES), [0, 120, 360, SAMPLES - 1], [1.0, 8.0, -8.0, 8.0])
+    drive = np.interp(np.linspace(0, 1, SAMPLES), [0, 0.2, 0.6, 1], [1.0, 8.0, -8.0, 8.0])
     position = sum_of_plays(np.append(past, drive))[past.size :] - 7.0
     found = identify_from_parts([run_of(drive, position)], thresholds_v=THRESHOLDS_V.tolist())
     assert np.allclose(np.cumsum(found.shape.model.weights), np.cumsum(WEIGHTS_UM_PER_V), atol=0.05)
@@ -57,7 +57,7 @@ def test_a_drive_that_never_turns_back_is_told_what_it_misses() -> None:
 
 def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
     """From the middle to 8 V, to −8 V, and back to −2 V: the last stroke has 6 V, the one before begins half known."""
-    drive = np.interp(np.arange(SAMPLES), [0, 150, 450, SAMPLES - 1], [2.0, 8.0, -8.0, -2.0])
+    drive = np.interp(np.linspace(0, 1, SAMPLES), [0, 0.25, 0.75, 1], [2.0, 8.0, -8.0, -2.0])
     run = run_of(drive, sum_of_plays(drive) + np.random.default_rng(1).normal(0, 0.01, SAMPLES))
     found = identify_from_parts([run], 6, "chebyshev-from-0")
     assert found.stroke_v == pytest.approx(6.0, abs=0.1)

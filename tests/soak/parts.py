@@ -37,11 +37,10 @@ class Rig:
     def runs(self) -> list[Measured]:
         """Recordings: a tick's position was measured before its drive was written."""
         period_s = DURATION_S / SAMPLES
-        pairs = zip(self.drives_v, self.positions_um, strict=True)
-        return [
-            Measured(f"part {i}", period_s, np.append(u, u[-1]), np.append(x[0], x), np.append(x[0], x), True, "", "")
-            for i, (u, x) in enumerate(pairs)
+        pairs = [
+            (np.append(u, u[-1]), np.append(x[0], x)) for u, x in zip(self.drives_v, self.positions_um, strict=True)
         ]
+        return [Measured(f"part {i}", period_s, u, x, x, True, "", "") for i, (u, x) in enumerate(pairs)]
 
 
 def main() -> None:
