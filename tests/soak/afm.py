@@ -79,7 +79,7 @@ def shown(path: Path, folder: Path) -> float:
 
 def recordings(path: Path, folder: Path) -> list[Path]:
     """Every curve of a file as an imported recording."""
-    import afmformats
+    import afmformats  # pyright: ignore[reportMissingImports]
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -89,8 +89,8 @@ def recordings(path: Path, folder: Path) -> list[Path]:
         if "height (measured)" not in curve.columns:
             continue
         source, made_here = folder / f"{path.stem}-{i}.npz", folder / f"{path.stem}-{i}.mcap"
-        names = {"t": "time", "piezo": "height (piezo)", "sensor": "height (measured)"}
-        np.savez(source, **{short: np.array(curve[long]) for short, long in names.items()})
+        t, piezo, sensor = (np.array(curve[name]) for name in ("time", "height (piezo)", "height (measured)"))
+        np.savez(source, t=t, piezo=piezo, sensor=sensor)
         maps = ("--time", "t [s]", "--map", "x_drive_v=piezo [V] * 1e6", "--map", "x_position_um=sensor [m]")
         command("import", source, *maps, "--out", made_here)
         made.append(made_here)

@@ -48,9 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=50)
     given = parser.parse_args()
-    print(
-        f"{'rig':>4}{'files':>7}{'noise nm':>10}{'reported µm':>13}{'known µm':>10}{'ratio':>7}{'true ratio':>12}  terms"
-    )
+    print(" rig  files  noise nm  reported µm  known µm  ratio  true ratio  terms")
     ratios, true_ratios, refused = [], [], 0
     for seed in range(given.draws):
         rig = drawn(seed)
