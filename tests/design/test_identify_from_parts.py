@@ -55,13 +55,13 @@ def test_a_drive_that_never_turns_back_is_told_what_it_misses() -> None:
 
 
 def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
-    """From the middle to 8 V, to −8 V, and back to −2 V: the last stroke has 6 V, the one before begins half known."""
+    """From 2 V to 8 V, to −8 V, and back to −2 V (7.973 V are sampled): the last stroke has 6 V, the one before begins half known."""
     drive = np.interp(np.linspace(0, 1, SAMPLES), [0, 0.25, 0.75, 1], [2.0, 8.0, -8.0, -2.0])
     run = run_of(drive, sum_of_plays(drive) + np.random.default_rng(1).normal(0, 0.01, SAMPLES))
     found = identify_from_parts([run], 6, "chebyshev-from-0")
     assert found.stroke_v == pytest.approx(6.0, abs=0.1)
     assert found.shape.model.thresholds.max() < 3.0
-    assert found.missing.startswith("missing: the drive from -2 V on to 8 V, in one stroke from -8 V")
+    assert found.missing.startswith("missing: the drive from -2 V on to 7.973 V, in one stroke from -7.973 V")
     with pytest.raises(UnsuitableData, match=r"thresholds from 4 V on cannot be told.*missing"):
         identify_from_parts([run], thresholds_v=[0.0, 1.0, 4.0])
 
