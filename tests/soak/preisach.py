@@ -1,4 +1,4 @@
-"""A Preisach actuator: the error reported as held out beside that on recordings that come later. `make soak-preisach`."""
+"""A Preisach actuator: the error reported as held out beside that on later recordings. `make soak-preisach`."""
 
 from __future__ import annotations
 
