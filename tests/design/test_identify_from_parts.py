@@ -55,9 +55,7 @@ def test_a_drive_that_never_turns_back_is_told_what_it_misses() -> None:
 
 
 def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
-    """From 2 V to 8 V (7.973 V are sampled), to −8 V, back to −2 V: the last stroke has 6 V, and that before begins half
-    known.
-    """
+    """From 2 V to 8 V (7.973 V are sampled), to −8 V, back to −2 V: the last stroke has 6 V, all of it known."""
     drive = np.interp(np.linspace(0, 1, SAMPLES), [0, 0.25, 0.75, 1], [2.0, 8.0, -8.0, -2.0])
     run = run_of(drive, sum_of_plays(drive) + np.random.default_rng(1).normal(0, 0.01, SAMPLES))
     found = identify_from_parts([run], 6, "chebyshev-from-0")
