@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-preisach soak-afm soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -88,6 +88,18 @@ soak-forged: $(READY)
 # Identification on 50 rigs drawn at random, three times: about ten minutes.
 soak-identification: $(READY)
 	$(BIN)/python -m tests.soak.identification
+
+# Hysteresis from parts of loops on 50 rigs drawn at random, memory unknown beside memory known: ten minutes of one core.
+soak-parts: $(READY)
+	$(BIN)/python -m tests.soak.parts --draws $(or $(DRAWS),50)
+
+# The error reported of a Preisach actuator, which no sum of plays is, beside the error on later recordings: a minute.
+soak-preisach: $(READY)
+	$(BIN)/python -m tests.soak.preisach
+
+# Hysteresis of commercial AFMs' scanners, whose recordings are fetched from the package registry: two minutes of one core.
+soak-afm: $(READY)
+	$(BIN)/python -m tests.soak.afm
 
 # Recordings, identification, synthesis and a run on forty rigs drawn at random: about ten minutes.
 soak-chain: $(READY)

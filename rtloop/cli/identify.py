@@ -52,6 +52,11 @@ def identify() -> None:
     "--weights", default="invertible", show_default=True, type=click.Choice(["invertible", "free"]),
     help="Keep every partial sum above 0, so that an inverse exists, or not.",
 )  # fmt: skip
+@click.option(
+    "--memory", default="auto", show_default=True, type=click.Choice(["auto", "rest", "unknown"]),
+    help="Of the actuator at the start of each RUN: none (rest), or estimated; auto asks where its drive begins.",
+)  # fmt: skip
+@click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model on; repeatable.")
 @OUT
 @PLOT
 @JSON
@@ -59,12 +64,15 @@ def identify() -> None:
 def hysteresis(
     runs: tuple[Path, ...], axis: str | None, operators: int,
     placement: Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"],
-    thresholds: tuple[float, ...] | None, weights: Literal["invertible", "free"], out: Path | None, plot: Path | None,
+    thresholds: tuple[float, ...] | None, weights: Literal["invertible", "free"],
+    memory: Literal["auto", "rest", "unknown"], validate: tuple[Path, ...], out: Path | None, plot: Path | None,
     as_json: bool,
 ) -> int:  # fmt: skip
-    """Thresholds and weights from recorded slow sines.
+    """Thresholds and weights from recorded slow drives.
 
-    Each RUN begins at rest and shows its initial loading curve.
+    Sines from rest tell most: RUNs that each begin at 0 V on a depolarised actuator and show its initial loading
+    curve. Any others do as well: part of a loop, from anywhere. What the actuator remembered is then estimated, and
+    plays that no stroke has shown beyond doubt are left out. The error is that on data held out of the fit.
     """
     from rtloop.commands.identify import hysteresis_report
     from rtloop.terminal.identification import print_hysteresis
@@ -76,6 +84,8 @@ def hysteresis(
         placement=placement,
         thresholds_v=thresholds,
         weights=weights,
+        memory=memory,
+        validate=validate,
         out=out,
         plot=plot,
     )

@@ -22,7 +22,16 @@ from rtloop.design.identification.identified import (
 )
 from rtloop.design.identification.identify_delay import delayed
 from rtloop.design.identification.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identification.identify_hysteresis import Placement, Weights, identify_hysteresis, unexplained_um
+from rtloop.design.identification.identify_from_parts import PartsFit, identify_from_parts
+from rtloop.design.identification.identify_hysteresis import (
+    HysteresisFit,
+    Placement,
+    Weights,
+    begins_at_rest,
+    identify_hysteresis,
+    unexplained_um,
+)
+from rtloop.design.identification.judgement import Judgement, judged_from_rest
 from rtloop.design.identification.measured import Measured, UnsuitableData, measured
 from rtloop.design.identification.prediction_error import LARGEST_ORDER
 from rtloop.errors import ConfigError
@@ -33,6 +42,7 @@ from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.values import fields_of, plain
 
 Input = Literal["hysteresis", "command", "drive"]
+Memory = Literal["auto", "rest", "unknown"]
 RANDOM_COMMANDS = 20_000
 
 
@@ -44,22 +54,38 @@ def hysteresis_report(
     placement: Placement = "auto",
     thresholds_v: Sequence[float] | None = None,
     weights: Weights = "invertible",
+    memory: Memory = "auto",
+    validate: Sequence[Path] = (),
     out: Path | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
     """Identify, write what was asked for, and report. Raises RtloopError."""
-    runs = [measured(path, axis) for path in paths]
+    runs, others = ([measured(path, axis) for path in group] for group in (paths, validate))
+    known = memory == "rest" or (memory == "auto" and all(begins_at_rest(run) for run in runs))
     try:
-        fit = identify_hysteresis(runs, count, placement, thresholds_v, weights)
+        if known:
+            fit = identify_hysteresis(runs, count, placement, thresholds_v, weights)
+            judged = judged_from_rest(runs, fit, others)
+            more: dict[str, Any] = {"unexplained_um": unexplained_um(runs, fit)}
+        else:
+            found = identify_from_parts(runs, count, placement, thresholds_v, weights, others)
+            fit, judged, more = found.shape, (found.judgements, found.others), _chosen(found)
     except ValueError as fault:
         raise ConfigError("identify hysteresis", [str(fault)]) from None
+    rows = [_judged(one, fitted) for fitted, group in zip((True, False), judged, strict=True) for one in group]
     if out is not None:
-        write_new(out, feedforward_section(fit.model, hysteresis_provenance(fit, runs)))
+        write_new(out, feedforward_section(fit.model, [*hysteresis_provenance(fit, runs), *_held_out(rows, more)]))
     if plot is not None:
         from rtloop.design.identification.plots import plot_hysteresis
 
-        plot_hysteresis(fit, runs[0], plot)
+        plot_hysteresis(fit, [*judged[0], *judged[1]], plot)
     return plain(
+        _hysteresis(runs, fit) | {"unexplained_um": None} | more | {"held_out": rows, "output": out, "plot": plot}
+    )
+
+
+def _hysteresis(runs: Sequence[Measured], fit: HysteresisFit) -> dict[str, Any]:
+    return (
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs]}
         | fields_of(fit)
         | {
@@ -67,11 +93,39 @@ def hysteresis_report(
             "measured_h_percent": fit.measured_loop.percent,
             "model_h_percent": fit.model_loop.percent,
             "invertible": fit.invertible,
-            "unexplained_um": unexplained_um(runs, fit),
-            "output": out,
-            "plot": plot,
         }
     )
+
+
+def _chosen(found: PartsFit) -> dict[str, Any]:
+    return {
+        "terms": found.terms,
+        "tried_um": dict(found.tried),
+        "stroke_v": found.stroke_v,
+        "missing": found.missing,
+    } | {"creep_um": found.creep_um if "creep" in found.terms else 0.0}
+
+
+def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
+    """A row of the report."""
+    return {
+        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "max_error_um": one.max_um,
+        "max_error_percent": 100 * one.max_um / one.range_um, "range_um": one.range_um, "offset_um": one.offset_um,
+        "drift_um": one.drift_um, "memory": "rest" if one.from_rest else "estimated", "known_from_s": one.known_from_s,
+        "unsettled": one.unsettled, "unsettled_um": one.unsettled_um,
+    }  # fmt: skip
+
+
+def _held_out(rows: Sequence[dict[str, Any]], more: dict[str, Any]) -> list[str]:
+    """Comments of what is written: the error on what was held out, and for which strokes the model is."""
+    worst = max(rows, key=lambda row: row["max_error_percent"])
+    lines = [
+        f"held out: {worst['rms_error_um']:.3g} µm rms, at most {worst['max_error_percent']:.3g} % of "
+        f"{worst['range_um']:.4g} µm, in {Path(worst['recording']).name}; memory at the start: {worst['memory']}"
+    ]
+    if more.get("missing"):
+        lines.append(f"for strokes of up to {more['stroke_v']:.4g} V; {more['missing']}")
+    return lines
 
 
 def excitation(run: Measured, how: Input, feedforward: PlayModel | None) -> Excitation:
@@ -84,6 +138,8 @@ def excitation(run: Measured, how: Input, feedforward: PlayModel | None) -> Exci
     if how == "hysteresis":
         assert feedforward is not None
         return Excitation(run.name, model_output(feedforward, run.drive_v), run.position_um, run.period_s)
+    if how == "command" and np.isnan(run.command_um).all():
+        raise UnsuitableData(f"{run.name}: it has no recorded command; --input drive or hysteresis is possible")
     return Excitation(run.name, run.drive_v if how == "drive" else run.command_um, run.position_um, run.period_s)
 
 
@@ -136,7 +192,8 @@ def compensation_report(
     command_um: float | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
-    """P∘P̂⁻¹ of the identified actuator and the compensator of `config`, with ρ and ξ, simulated. Raises RtloopError."""
+    """P∘P̂⁻¹ of the identified actuator and the compensator of `config`, with ρ and ξ, simulated. Raises
+    RtloopError."""
     compensator = read_feedforward(config, axis)
     if command_um is None:
         axes = load_configuration(config).axes

@@ -1,6 +1,6 @@
 """Play operators over whole recordings, and the initial loading curve that stands for a sum of them.
 
-    F_r[u]_k = max(u_k − r, min(u_k + r, F_r[u]_k−1)),     F_r = 0 before the first sample
+    F_r[u]_k = max(u_k − r, min(u_k + r, F_r[u]_k−1)),     F_r = 0 before the first sample of a virgin play
     φ(u) = Σ p_i max(u − r_i, 0)                           initial loading curve, u ≥ 0
 
 Krasnosel'skii & Pokrovskii, Systems with Hysteresis, 1989; Kuhnen, European Journal of Control 9, 2003.
@@ -17,14 +17,16 @@ from rtloop.hil.modal import Real
 from rtloop.laws.shipped.play_model import PlayModel
 
 
-def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike) -> Real:
-    """F_r[u], (samples, plays), of virgin plays.
+def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, before: Real | None = None) -> Real:
+    """F_r[u], (samples, plays), of virgin plays, or of plays that stood at `before` (plays,) when the drive was first
+    seen.
 
     While the drive does not turn back, the formula holds for all samples at once with the state before the first.
     """
-    u, r = np.concatenate([[0.0], np.asarray(drive, dtype=float)]), np.asarray(thresholds, dtype=float)
+    u, r = np.asarray(drive, dtype=float), np.asarray(thresholds, dtype=float)
+    u = np.concatenate([[0.0] if before is None else u[:1], u])
     outputs = np.empty((u.size, r.size))
-    last = np.zeros(r.size)
+    last = np.zeros(r.size) if before is None else before
     bounds = [0, *(_reversals(u) + 1).tolist(), u.size]
     for start, end in pairwise(bounds):
         part = u[start:end, None]

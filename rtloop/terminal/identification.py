@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -18,19 +19,44 @@ def print_hysteresis(report: dict[str, Any]) -> None:
         shown.add_row(str(i), f"{r:.4f}", f"{p:.4f}")
     out.print(shown)
     out.print(
-        f"error {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
+        f"error of the fit {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
         f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm); noise {report['noise_um']:.3g} µm"
     )
+    _print_held_out(out, report)
     if report["unexplained_um"]:
         out.print(
             f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms are left however many "
             "there are; small steps and loops of other sizes may differ from the model's by more"
         )
     out.print(f"h/H {_number(report['measured_h_percent'])} % measured, {_number(report['model_h_percent'])} % model")
-    out.print("sensor offset: " + ", ".join(f"{offset:.4g} µm" for offset in report["offsets_um"]))
     if not report["invertible"]:
         out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; --weights invertible keeps them so")
     _print_files(out, report)
+
+
+def _print_held_out(out: Console, report: dict[str, Any]) -> None:
+    """What the model errs by on each recording when that has no part in it, and what was taken along."""
+    shown = table(
+        "held out", "error µm rms", "at most µm", "% of range", "offset µm", "drift µm", "memory at the start"
+    )
+    for row in report["held_out"]:
+        memory = "from rest" if row["memory"] == "rest" else f"estimated; {_known(row['known_from_s'])}"
+        shown.add_row(
+            Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"), f"{row['rms_error_um']:.3g}",
+            f"{row['max_error_um']:.3g}", f"{row['max_error_percent']:.3g}", f"{row['offset_um']:.4g}",
+            f"{row['drift_um']:.3g}", memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
+        )  # fmt: skip
+    out.print(shown)
+    if "tried_um" in report:
+        tried = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
+        out.print(f"held out, µm rms: {tried}; taken: {' + '.join(('plays', *report['terms']))}")
+        out.print(
+            f"for strokes of up to {report['stroke_v']:.4g} V" + (f"; {report['missing']}" if report["missing"] else "")
+        )
+
+
+def _known(from_s: float | None) -> str:
+    return "never known wholly" if from_s is None else f"known from {from_s:.3g} s on"
 
 
 def print_dynamics(report: dict[str, Any]) -> None:

@@ -189,6 +189,12 @@ def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Rea
     return solution[:plays], solution[plays:]
 
 
+def begins_at_rest(run: Measured) -> bool:
+    """Its first drive is next to 0 V, and it holds the major loop: what `identify_hysteresis` asks for."""
+    turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
+    return abs(run.drive_v[0]) <= REST * float(np.abs(run.drive_v).max()) and turns.size >= 2
+
+
 def _require_loop(run: Measured) -> None:
     """Raise UnsuitableData for a drive that does not start at rest or makes no loop."""
     drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())

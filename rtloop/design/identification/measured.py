@@ -33,7 +33,10 @@ class UnsuitableData(RtloopError):
 class Measured:
     """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
 
-    `even` says that no tick is missing or late by a period; `digest` is the SHA-256 of the recording's files.
+    In a recording that was imported the two are taken as sampled together: its rows are paired anew, so that here,
+    too, a drive's position is that of the next tick. `command_um` is NaN where it was not recorded. `even` says that
+    no tick is missing or late by a period; `digest` is the SHA-256 of the recording's files. `time_s` (ticks,) is
+    when each tick was due, from any beginning on; None stands for equal intervals.
     """
 
     name: str
@@ -44,25 +47,46 @@ class Measured:
     even: bool
     configuration: str
     digest: str
+    time_s: Real | None = None
+
+    @property
+    def seconds(self) -> Real:
+        """When each tick was due (ticks,), from any beginning on."""
+        return self.period_s * np.arange(self.drive_v.size, dtype=np.float64) if self.time_s is None else self.time_s
 
 
 def measured(path: Path, axis: str | None = None) -> Measured:
     """One recording's axis (the only one, if there is one). Raises RecordingError, UnsuitableData."""
     recording = load(path)
     axis = axis_of(recording, axis, path)
-    wanted = ("drive_v", "position_um", "command_um", "adc_v")
-    drive, position, command, adc = recording.read(*(f"{axis}_{name}" for name in wanted))
-    deadlines, missed, flags = recording.read("deadline_ns", "periods_missed", "flags")
+    drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
     if drive.size < LEAST_TICKS:
         raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
-    _refuse_trip(path, flags)
-    require_usable(str(path), drive, position, adc)
+    if "flags" in recording:
+        _refuse_trip(path, recording["flags"])
+    reading = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
+    require_usable(str(path), drive, position, recording[reading])
     intervals = np.diff(deadlines)
+    if not np.all(intervals > 0):
+        raise UnsuitableData(f"{path}: time stands still or goes back at tick {int(np.argmax(intervals <= 0)) + 1}")
     period_ns = float(np.median(intervals))
-    even = not np.any(missed[1:]) and bool(np.all(np.abs(intervals - period_ns) <= 1))
+    missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
+    even = not missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
+    command = f"{axis}_command_um"
+    given = recording[command] if command in recording else np.full(drive.size, np.nan)
+    if "imported" in recording.header:
+        drive, given, position, deadlines = drive[1:], given[1:], position[:-1], deadlines[1:]
     return Measured(
-        str(path), period_ns * 1e-9, drive, position, command, even, recording.configuration, _digest(recording.paths)
-    )
+        str(path), period_ns * 1e-9, drive, position, given, even, recording.configuration, _digest(recording.paths),
+        deadlines * 1e-9,
+    )  # fmt: skip
+
+
+def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
+    absent = [name for name in names if name not in recording]
+    if absent:
+        raise UnsuitableData(f"{path}: it has no {', '.join(absent)}; identification needs them")
+    return recording.read(*names)
 
 
 def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> None:

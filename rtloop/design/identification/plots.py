@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,28 +11,36 @@ import numpy as np
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.identification.identify_dynamics import DynamicsFit, Excitation
 from rtloop.design.identification.identify_hysteresis import HysteresisFit
-from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.judgement import Judgement
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import Residual, compensated
-from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.play_model import PlayModel
 
 POINTS = 20_000
 
 
-def plot_hysteresis(fit: HysteresisFit, run: Measured, output: Path) -> None:
-    """Measured and modelled loop (Fig 4 of the paper), and the error in time. Raises OutputError, MissingExtra."""
-    figure, (loop, error) = figure_of(1, 2)
-    kept = slice(None, None, max(1, run.drive_v.size // POINTS))
-    drive, position = run.drive_v[:-1], run.position_um[1:] - fit.offsets_um[0]
-    model = model_output(fit.model, drive)
-    loop.plot(drive[kept], position[kept], color="tab:blue", linewidth=2, label="measured")
-    loop.plot(drive[kept], model[kept], color="0.15", linewidth=0.8, label="model")
+def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output: Path) -> None:
+    """Measured and modelled loops (Fig 4 of the paper), each held out of the model that is drawn with it, and the
+    errors.
+
+    Raises OutputError, MissingExtra.
+    """
+    figure, (loop, in_time, over_drive) = figure_of(1, 3, (17, 5))
+    for i, one in enumerate(judgements):
+        name = {"label": Path(one.name).name} if len(judgements) > 1 else {}
+        color = f"C{i}"
+        position, time_s = one.position_um - one.offset_um, one.time_s - one.time_s[0]
+        loop.plot(one.drive_v, position, color=color, linewidth=2, **({"label": "measured"} | name))
+        model = {"label": "model, held out"} if i == len(judgements) - 1 else {}
+        loop.plot(one.drive_v, position - one.error_um, color="0.15", linewidth=0.8, **model)
+        in_time.plot(time_s, one.error_um, color=color, linewidth=0.8, **name)
+        over_drive.plot(one.drive_v, one.error_um, color=color, linewidth=0.8)
     label(loop, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
-    error.plot(np.arange(drive.size)[kept] * run.period_s, (position - model)[kept], color="tab:red", linewidth=0.8)
-    label(error, "time / s", "measured − model / µm", f"{fit.rms_error_um:.3g} µm rms", legend=False)
+    rms_um = float(np.sqrt(np.mean([one.rms_um**2 for one in judgements])))
+    label(in_time, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1)
+    label(over_drive, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
     save(figure, output)
 
 

@@ -1,0 +1,154 @@
+"""What recordings are under a sum of plays that they had no part in: errors as held out, offset, drift, memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.design.identification.held_out import fitted, held_out, judged, nearest, own_of
+from rtloop.design.identification.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
+from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.memory_fit import Common, Limits, Own, Stretch, errors, output
+from rtloop.design.identification.stretches import Kept, Term, kept, stretch
+from rtloop.hil.modal import Real
+from rtloop.hysteresis.unknown_memory import known_from, settled_memory
+
+UNSETTLED = 0.08
+"""Part of its range by which a recording's beginning may depart from a loop that repeats itself: scanners whose
+branches differ in shape, or creep, depart by half of it where their loops close."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A recording under a model that it had no part in: averaged samples (blocks,), and what was found of its own.
+
+    `error_um` is held out, `left_um` what the model that is written leaves of the recording. `from_rest` says that
+    its memory was given; else it was estimated. `known_from_s` is when the memory of all plays that are written is
+    known, None where never; `unsettled_um` how far its beginning departs from a loop that repeats itself; `drift_um`
+    the drift over its duration.
+    """
+
+    name: str
+    time_s: Real
+    drive_v: Real
+    position_um: Real
+    error_um: Real
+    left_um: Real
+    offset_um: float
+    drift_um: float
+    from_rest: bool
+    known_from_s: float | None
+    unsettled_um: float
+
+    @property
+    def range_um(self) -> float:
+        """What the position covers."""
+        return float(np.ptp(self.position_um))
+
+    @property
+    def rms_um(self) -> float:
+        """Of the errors as held out."""
+        return float(np.sqrt(np.mean(self.error_um**2)))
+
+    @property
+    def max_um(self) -> float:
+        """The largest error as held out."""
+        return float(np.abs(self.error_um).max())
+
+    @property
+    def unsettled(self) -> bool:
+        """Its beginning is no part of a loop that repeats itself."""
+        return not self.from_rest and self.unsettled_um > UNSETTLED * self.range_um
+
+
+class Trial(NamedTuple):
+    """Thresholds, those that are written first, and terms; how they were placed."""
+
+    thresholds_v: Real
+    written: int
+    placed: str
+    terms: tuple[Term, ...]
+
+
+class Work(NamedTuple):
+    """Recordings that share a model, the largest ranges of drive and position among them, the least slope, the
+    longest."""
+
+    runs: Sequence[Kept]
+    largest_v: float
+    range_um: float
+    least_slope: float
+    duration_s: float
+
+    def limits(self, trial: Trial) -> Limits:
+        """Of a fit."""
+        return Limits(trial.thresholds_v, self.least_slope, self.largest_v, self.range_um)
+
+    def stretch(self, run: Kept, trial: Trial) -> Stretch:
+        """The equations of one recording."""
+        return stretch(run, trial.thresholds_v, trial.terms, self.duration_s)
+
+
+def judged_from_rest(
+    runs: Sequence[Measured], shape: HysteresisFit, others: Sequence[Measured] = ()
+) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
+    """`runs`, each from rest and held out in turn, and `others`, of unknown memory, under plays placed as in
+    `shape`."""
+    work = prepared_work(runs, shape.weights, [np.zeros(1)] * len(runs))
+    trial = Trial(shape.model.thresholds, shape.model.thresholds.size, shape.placement, ())
+    return judgements_of(work, trial, others)[1:]
+
+
+def prepared_work(runs: Sequence[Measured], weights: Weights, before_v: Sequence[npt.ArrayLike | None] | None) -> Work:
+    """Recordings, averaged; `before_v` is the drive of each since rest, where that is known."""
+    before = [None] * len(runs) if before_v is None else before_v
+    parts = [kept(run, len(runs), one) for run, one in zip(runs, before, strict=True)]
+    largest_v = max(float(np.ptp(run.full_v)) for run in parts)
+    range_um = max(float(np.ptp(run.position_um)) for run in parts)
+    least = LEAST_SLOPE * range_um / largest_v if weights == "invertible" else -np.inf
+    return Work(parts, largest_v, range_um, least, max(float(run.time_s[-1]) for run in parts))
+
+
+def prepared(
+    work: Work, runs: Sequence[Kept], trial: Trial, common: Common | None = None
+) -> tuple[list[Stretch], list[Real]]:
+    """Equations of every run, and the rises of its memory curve to begin at: settled, level, or half as steep as can
+    be."""
+    gaps, found = np.diff(trial.thresholds_v, prepend=0.0), []
+    stretches = [work.stretch(run, trial) for run in runs]
+    for run, one in zip(runs, stretches, strict=True):
+        settled = np.clip(np.diff(settled_memory(run.drive_v, trial.thresholds_v), prepend=run.full_v[0]), -gaps, gaps)
+        starts = [settled, np.zeros(gaps.size), 0.5 * gaps, -0.5 * gaps] if run.before_v is None else [settled]
+        found.append(nearest(one, starts, work.limits(trial), common))
+    return stretches, found
+
+
+def judgements_of(
+    work: Work, trial: Trial, others: Sequence[Measured]
+) -> tuple[Common, tuple[Judgement, ...], tuple[Judgement, ...]]:
+    """Of all recordings, by fits that each had no part in; what they share, and is their own, by a fit to all."""
+    stretches, memories = prepared(work, work.runs, trial)
+    limits = work.limits(trial)
+    common, owns = fitted(stretches, memories, limits)
+    found = held_out(stretches, memories, limits)
+    first = tuple(_judgement(*one, common, trial) for one in zip(work.runs, stretches, owns, found, strict=True))
+    runs, then = [kept(run, len(others)) for run in others], []
+    for run, one, rises in zip(runs, *prepared(work, runs, trial, common), strict=True):
+        own, error = own_of(one, common, rises, limits), judged(one, common, rises, limits)
+        then.append(_judgement(run, one, own, error, common, trial))
+    return common, first, tuple(then)
+
+
+def _judgement(run: Kept, one: Stretch, own: Own, error: Real, common: Common, trial: Trial) -> Judgement:
+    settled = np.diff(settled_memory(run.drive_v, trial.thresholds_v), prepend=run.full_v[0])
+    apart = output(one, common, own) - output(one, common, own._replace(rises=settled))
+    known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[trial.written - 1]))
+    return Judgement(
+        run.name, run.time_s, run.drive_v, run.position_um, error, errors(one, common, own), float(own.terms[0]),
+        float(own.terms[1:].sum()), run.before_v is not None, None if known is None else float(run.time_s[known]),
+        float(np.abs(apart - apart[-1]).max()),
+    )  # fmt: skip

@@ -1,0 +1,105 @@
+"""Hysteresis from parts of loops whose beginning nobody knows: against actuators of the tests' own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.design.identification.identify_from_parts import identify_from_parts
+from rtloop.design.identification.measured import Measured, UnsuitableData
+from rtloop.hysteresis.unknown_memory import known_from, known_stroke_v, missing_stroke
+from tests.design.other_truths import (
+    THRESHOLDS_V,
+    WEIGHTS_UM_PER_V,
+    bouc_wen,
+    part_of_a_drive,
+    sum_of_plays,
+)
+
+Array = np.ndarray[Any, Any]
+SAMPLES = 300
+
+
+def run_of(drive: Array, position: Array, name: str = "made") -> Measured:
+    """A tick's position was measured before its drive was written."""
+    shifted = np.append(position[0], position)
+    return Measured(name, 0.01, np.append(drive, drive[-1]), shifted, shifted, True, "", "")
+
+
+def recorded(truth: Any, seed: int, noise_um: float = 0.02, drift_um: float = 0.0) -> tuple[Measured, Array]:
+    """A part of a drive after a past that is not recorded; and what it would be without noise."""
+    random = np.random.default_rng(seed)
+    past, drive = part_of_a_drive(random, SAMPLES)
+    clean = truth(np.concatenate([past, drive]))[past.size :] + random.uniform(-3, 3)
+    clean = clean + drift_um * np.linspace(-0.5, 0.5, SAMPLES)
+    return run_of(drive, clean + random.normal(0, noise_um, SAMPLES), f"part {seed}"), clean
+
+
+def test_one_part_of_a_loop_gives_the_weights_that_it_shows() -> None:
+    past = np.interp(np.arange(90), [0, 30, 60, 89], [0.0, 6.0, -3.0, 1.0])
+    drive = np.interp(np.linspace(0, 1, SAMPLES), [0, 0.2, 0.6, 1], [1.0, 8.0, -8.0, 8.0])
+    position = sum_of_plays(np.append(past, drive))[past.size :] - 7.0
+    found = identify_from_parts([run_of(drive, position)], thresholds_v=THRESHOLDS_V.tolist())
+    assert np.allclose(np.cumsum(found.shape.model.weights), np.cumsum(WEIGHTS_UM_PER_V), atol=0.05)
+    assert found.judgements[0].rms_um < 0.5
+    assert not found.judgements[0].from_rest
+    assert found.missing == ""
+
+
+def test_a_drive_that_never_turns_back_is_told_what_it_misses() -> None:
+    drive = np.linspace(-2.0, 8.0, SAMPLES)
+    with pytest.raises(UnsuitableData, match=r"missing: the drive from 8 V on to -2 V, in one stroke from 8 V"):
+        identify_from_parts([run_of(drive, sum_of_plays(drive))])
+
+
+def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
+    """From 2 V to 8 V (7.973 V are sampled), to −8 V, back to −2 V: the last stroke has 6 V, all of it known."""
+    drive = np.interp(np.linspace(0, 1, SAMPLES), [0, 0.25, 0.75, 1], [2.0, 8.0, -8.0, -2.0])
+    run = run_of(drive, sum_of_plays(drive) + np.random.default_rng(1).normal(0, 0.01, SAMPLES))
+    found = identify_from_parts([run], 6, "chebyshev-from-0")
+    assert found.stroke_v == pytest.approx(6.0, abs=0.1)
+    assert found.shape.model.thresholds.max() < 3.0
+    assert found.missing.startswith("missing: the drive from -2 V on to 7.973 V, in one stroke from -7.973 V")
+    with pytest.raises(UnsuitableData, match=r"thresholds from 4 V on cannot be told.*missing"):
+        identify_from_parts([run], thresholds_v=[0.0, 1.0, 4.0])
+
+
+def test_known_strokes_by_hand() -> None:
+    drive = np.array([0.0, 5.0, -5.0, 3.0])
+    assert known_stroke_v(drive) == 8.0
+    assert known_stroke_v(np.array([0.0, 5.0, -5.0])) == 5.0
+    assert missing_stroke(drive) == (-5.0, 3.0, 5.0)
+    assert [known_from(drive, r) for r in (2.0, 5.0, 5.1)] == [1, 2, None]
+
+
+def test_drift_stays_where_it_lessens_the_error_held_out_and_only_there() -> None:
+    drive = 1.0 + 8.0 * np.sin(np.linspace(0.5, 15.0, SAMPLES))
+    noise = np.random.default_rng(1).normal(0, 0.02, SAMPLES)
+    for drift_um, terms in ((2.0, ("drift",)), (0.0, ())):
+        run = run_of(drive, sum_of_plays(drive) + noise + drift_um * np.linspace(-0.5, 0.5, SAMPLES))
+        found = identify_from_parts([run], 8, "chebyshev-from-0")
+        assert found.terms == terms, found.tried
+        assert found.judgements[0].drift_um == pytest.approx(drift_um, abs=0.1)
+
+
+@pytest.mark.parametrize("truth", [bouc_wen])
+def test_the_error_that_is_reported_is_that_on_fresh_data(truth: Any) -> None:
+    """No sum of plays: rms held out against rms on as many recordings that come later, noise aside."""
+    runs = [recorded(truth, seed)[0] for seed in range(4)]
+    fresh = [recorded(truth, seed) for seed in range(100, 104)]
+    found = identify_from_parts(runs, 8, "chebyshev-from-0", others=[run for run, _ in fresh])
+    reported = np.sqrt(np.mean([one.rms_um**2 for one in found.judgements]))
+    wrong = [one.position_um - one.error_um - averaged(clean, one.error_um.size)
+             for one, (_, clean) in zip(found.others, fresh, strict=True)]  # fmt: skip
+    true = np.sqrt(np.mean(np.square(wrong)))
+    print(f"{truth.__name__}: reported {reported:.4f}, true {true:.4f} µm, fit {found.shape.rms_error_um:.4f} µm")
+    assert true > 0.05
+    assert reported == pytest.approx(true, rel=0.2)
+
+
+def averaged(values: Array, blocks: int) -> Array:
+    """Means of as many blocks."""
+    size = values.size // blocks
+    return values[: blocks * size].reshape(blocks, size).mean(axis=1)
