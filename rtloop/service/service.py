@@ -39,7 +39,7 @@ from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.naming import recording_path
 from rtloop.supervision.paths import block_path
-from rtloop.supervision.recording_state import recording_fault, recording_state
+from rtloop.supervision.recording_state import Gaps
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
 POLL_S = 0.005
@@ -87,7 +87,6 @@ class Service:
         self._reloading = threading.Lock()
         self._deaths_s: list[float] = []
         self._stopping = False
-        self._unrecorded: str | None = None
         self._offsets_v: dict[int, float] = {}
         self._ready = False
 
@@ -219,6 +218,7 @@ class Service:
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
         said: State | None = None
+        gaps = Gaps(supervisor.block)
         while (result := supervisor.poll()) is None:
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
@@ -230,7 +230,8 @@ class Service:
                 self._reload.clear()
                 self._aside(self._apply_reload)
             self._tell(supervisor)
-            self._say_whether_recorded(supervisor)
+            if news := gaps.news():
+                log.error("%s", news)
             state = self.state
             if state is not said:
                 row = supervisor.latest()
@@ -247,15 +248,6 @@ class Service:
         if result.error:
             log.error("%s", result.error)
         return result
-
-    def _say_whether_recorded(self, supervisor: Supervisor) -> None:
-        """A line when ticks are not recorded any more, and one when they are again."""
-        fault = recording_fault(supervisor.block)
-        if fault is not None and fault != self._unrecorded:
-            log.error("%s", fault)
-        if fault is None and self._unrecorded is not None:
-            log.warning("recorded again; %d ticks are lost", recording_state(supervisor.block)["ticks_lost"])
-        self._unrecorded = fault
 
     def _tell(self, supervisor: Supervisor) -> None:
         """READY after ticks really ran; WATCHDOG only while they advance, or have ended; STATUS now and then."""
