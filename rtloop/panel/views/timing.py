@@ -103,7 +103,7 @@ class Timing:
             and now_us
             and all_us
             and now_us > WORSE * all_us
-            and now_us > 0.05 * self._period_us
+            and now_us > MATTERS * self._period_us
         ):
             found.append(f"it gets worse: one tick in a hundred of the last {RECENT_S} s was {now_us:.0f} µs late")
         if found:
