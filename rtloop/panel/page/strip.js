@@ -57,7 +57,7 @@ export class Strip {
 
   #fresh({ connected, fresh, age_s, silence_s }) {
     document.body.classList.toggle("stale", !fresh);
-    const old_s = age_s ?? (Number.isFinite(silence_s) ? silence_s : null);
+    const old_s = age_s ?? (!connected && Number.isFinite(silence_s) ? silence_s : null);
     const age = old_s == null ? "none yet" : `${fixed(old_s, old_s < 10 ? 1 : 0)} s old`;
     say($("age"), fresh ? "live" : age);
     const why = connected ? (this.#state?.error ?? "no new ticks") : "no connection to the panel's server";

@@ -192,7 +192,7 @@ def test_a_page_that_is_there_before_its_service_says_what_it_waits_for(browser:
     page.goto(address)
     said(page, "#state-word", "unreachable")
     said(page, "#said", "No new ticks")
-    assert "no service answers" in page.get_attribute("#scope-plot .veil", "data-says")
+    assert page.get_attribute("#scope-plot .veil", "data-says").endswith("No such file or directory")
     page.context.close()
     process.kill()
 
