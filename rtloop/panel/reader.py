@@ -52,9 +52,10 @@ class Reader:
 
     def messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
         """The next events of the run that is read, (n,) of MESSAGE; those of a tick are there before it is."""
-        found = np.zeros(MOST_EVENTS, MESSAGE)
-        if self._events is None:
-            return found[:0]
+        ready = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
+        found = np.zeros(min(ready, MOST_EVENTS), MESSAGE)
+        if self._events is None or not ready:
+            return found
         copied, first, _ = drain(self._events, self._event_cursor, found)
         self._event_cursor = first + copied
         return found[:copied]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from rtloop.hil.modal import Real
 from rtloop.signals import COMMON, DEADLINE
 
 DEADLINE_NS = COMMON[DEADLINE].name
+BATCH_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,26 @@ class Stretch:
     def periods(self, rate_hz: float) -> Real:
         """Which period of the grid of deadlines each tick ran in (n,): one after the other but for holes."""
         return np.rint(self[DEADLINE_NS] * (rate_hz / 1e9))
+
+
+class Batch:
+    """Stretches of a run that are worked on together: most of what a short one costs, it costs at any length."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._ticks = BATCH_S * rate_hz
+        self._kept: list[Stretch] = []
+
+    def add(self, stretch: Stretch) -> Stretch | None:
+        """All that are kept, as soon as they last for BATCH_S."""
+        self._kept.append(stretch)
+        return self.take() if sum(map(len, self._kept)) >= self._ticks else None
+
+    def take(self) -> Stretch | None:
+        """All that are kept, one behind the other: between them ticks may be lost. None where there are none."""
+        kept, self._kept = self._kept, []
+        if not kept:
+            return None
+        return replace(kept[0], rows=np.concatenate([one.rows for one in kept]), lost=sum(one.lost for one in kept))
 
 
 def index_of(name: str, columns: Sequence[str]) -> int:

@@ -97,11 +97,6 @@ class Trigger:
         """Begin a sweep with the next tick, or as soon as the open one has ended, in any mode."""
         self._forced = True
 
-    @property
-    def waiting(self) -> bool:
-        """Whether a trigger would begin a sweep, now or after the hold-off."""
-        return self.open is None and (self._armed or self._settings.mode is not Mode.SINGLE)
-
     def close(self) -> Sweep | None:
         """End the open sweep with the last tick that was fed, where no more will come."""
         sweep, self.open = self.open, None

@@ -12,7 +12,7 @@ from typing import Any
 from rtloop.errors import RtloopError, UnavailableError
 from rtloop.panel.capture import capture, present_run
 from rtloop.panel.conditions import Condition
-from rtloop.panel.reader import Reader
+from rtloop.panel.reader import MOST_TICKS, Reader
 from rtloop.panel.trigger import Mode, Settings, Trigger
 from rtloop.recording.load import Recording, load
 from rtloop.service.client import Client
@@ -54,21 +54,20 @@ def _await_trigger(
     _require(condition.source in names, f"trigger source: {condition.source!r}; {', '.join(names)} are allowed")
     reader, trigger = Reader(Path(said["block"]), lambda: names), Trigger(settings, lambda: deepcopy(condition))
     deadline_s = time.monotonic() + timeout_s
-    while trigger.open is None:
+    while True:
         stretch = reader.read()
-        if stretch is None:
+        if stretch is not None and stretch.run > 0:
+            raise UnavailableError("capture: the loop was started anew before a trigger came")
+        if stretch is not None and stretch.end > begin:
+            old = max(begin - stretch.first, 0)
+            if sweeps := trigger.feed(replace(stretch, first=stretch.first + old, rows=stretch.rows[old:])):
+                return sweeps[0].first
+            if trigger.open is not None:
+                return trigger.open.first
+        if stretch is None or len(stretch) < MOST_TICKS:  # else there are more, and they came before now
             if time.monotonic() > deadline_s:
                 raise RtloopError(f"capture: no trigger within {timeout_s:g} s; timeout_s allows longer")
             time.sleep(POLL_S)
-            continue
-        if stretch.run > 0:
-            raise UnavailableError("capture: the loop was started anew before a trigger came")
-        if stretch.end <= begin:
-            continue
-        old = max(begin - stretch.first, 0)
-        if sweeps := trigger.feed(replace(stretch, first=stretch.first + old, rows=stretch.rows[old:])):
-            return sweeps[0].first
-    return trigger.open.first
 
 
 def _require(good: bool, fault: str) -> None:

@@ -40,7 +40,7 @@ from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.naming import recording_path
 from rtloop.supervision.paths import block_path
-from rtloop.supervision.recording_state import recording_fault, recording_state
+from rtloop.supervision.recording_state import Gaps
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
 POLL_S = 0.005
@@ -89,8 +89,6 @@ class Service:
         self._reloading = threading.Lock()
         self._deaths_s: list[float] = []
         self._stopping = False
-        self._unrecorded: str | None = None
-        self._removals_said = 0
         self._offsets_v: dict[int, float] = {}
         self._ready = False
 
@@ -222,7 +220,7 @@ class Service:
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
         said: State | None = None
-        self._removals_said = 0
+        gaps, removals_said = Gaps(supervisor.block), 0
         while (result := supervisor.poll()) is None:
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
@@ -234,7 +232,11 @@ class Service:
                 self._reload.clear()
                 self._aside(self._apply_reload)
             self._tell(supervisor)
-            self._say_whether_recorded(supervisor)
+            if news := gaps.news():
+                log.error("%s", news)
+            for removal in (removals := supervisor.recorder.removals[removals_said:]):
+                log.info("%s", removal)
+            removals_said += len(removals)
             state = self.state
             if state is not said:
                 row = supervisor.latest()
@@ -251,18 +253,6 @@ class Service:
         if result.error:
             log.error("%s", result.error)
         return result
-
-    def _say_whether_recorded(self, supervisor: Supervisor) -> None:
-        """A line when ticks are not recorded any more, and one when they are again."""
-        fault = recording_fault(supervisor.block)
-        if fault is not None and fault != self._unrecorded:
-            log.error("%s", fault)
-        if fault is None and self._unrecorded is not None:
-            log.warning("recorded again; %d ticks are lost", recording_state(supervisor.block)["ticks_lost"])
-        self._unrecorded = fault
-        for removal in supervisor.recorder.removals[self._removals_said :]:
-            log.info("%s", removal)
-        self._removals_said = len(supervisor.recorder.removals)
 
     def _tell(self, supervisor: Supervisor) -> None:
         """READY after ticks really ran; WATCHDOG only while they advance, or have ended; STATUS now and then."""

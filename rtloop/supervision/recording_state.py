@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Callable
 from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
+from rtloop.values import counted
 
 REASONS = {LOW_SPACE: "less space is free than is to stay free (recording.min_free_mib)"}
 BEHIND = 4
 """A recorder that has not taken a quarter of what the ring holds, some seconds, is dead or stuck."""
+QUIET_S = 1.0
+"""Without a fault, before a gap is over; as with ticks that are late."""
 
 
 def recording_state(block: SharedBlock) -> dict[str, Any]:
@@ -31,7 +36,35 @@ def recording_state(block: SharedBlock) -> dict[str, Any]:
     return {"state": state, "reason": reason, "since_tick": since_tick, "ticks_lost": lost}
 
 
-def recording_fault(block: SharedBlock) -> str | None:
-    """Why ticks are not recorded now, in words that stay the same as long as the fault does; None while they are."""
-    said = recording_state(block)
-    return said["reason"] and f"not recorded from tick {said['since_tick']} on: {said['reason']}"
+class Gaps:
+    """Tells each stretch of time in which ticks are not recorded twice: as it begins, and once it is over.
+
+    It is over when nothing was amiss for QUIET_S: on a host that is overloaded the recorder is behind, catches up a
+    little and is behind again, and all of that is one stretch.
+    """
+
+    def __init__(self, block: SharedBlock, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._block, self._now_s = block, now_s
+        self._reasons: set[str] = set()
+        """Said of the stretch that is not over; empty where there is none."""
+        self._begun_s = self._ill_s = 0.0
+        self._lost = 0
+
+    def news(self) -> str | None:
+        """What is to be said now; None where there is nothing."""
+        said, now_s = recording_state(self._block), self._now_s()
+        if (reason := said["reason"]) is not None:
+            self._ill_s = now_s
+            if not self._reasons:
+                self._begun_s = now_s
+            if reason in self._reasons:
+                return None
+            self._reasons.add(reason)
+            return f"not recorded from tick {said['since_tick']} on: {reason}"
+        if self._reasons and now_s - self._ill_s < QUIET_S:
+            return None
+        lost, self._lost = said["ticks_lost"] - self._lost, said["ticks_lost"]
+        if not self._reasons:
+            return None
+        self._reasons.clear()
+        return f"recorded again after {self._ill_s - self._begun_s:.1f} s; {counted(lost, 'tick')} lost"

@@ -54,7 +54,8 @@ def await_recording(bench: Bench, state: str, timeout_s: float = SAID_S) -> dict
     assert status["state"] == "running"
     said = status["recording"]
     assert said["state"] == state
-    assert ("recorded again" if state == "recording" else "not recorded from tick") in bench.log()
+    told = "recorded again" if state == "recording" else "not recorded from tick"
+    wait_for(lambda: told in bench.log(), f"{told} in the log")
     assert families["rtloop_ticks_not_recorded"].samples[0].value > 0
     assert said["ticks_lost"] > 0
     return said

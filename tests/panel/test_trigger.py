@@ -232,9 +232,7 @@ def test_a_single_sweep_waits_to_be_armed():
     rows = np.zeros((100, 4))
     rows[10::10, 3] = 1.0
     trigger = Trigger(Settings(2, Mode.SINGLE, 0.0), lambda: Edge("s", 1.0))
-    assert trigger.waiting
     assert [sweep.trigger for sweep in trigger.feed(Stretch(COLUMNS, 0, rows[:50]))] == [10]
-    assert not trigger.waiting
     trigger.arm()
     assert [sweep.trigger for sweep in trigger.feed(Stretch(COLUMNS, 50, rows[50:]))] == [50]
 

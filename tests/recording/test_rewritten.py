@@ -17,9 +17,9 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType
 from mcap_protobuf.schema import build_file_descriptor_set
-from rtloop.interchange.export import export
 
 from rtloop.errors import RtloopError
+from rtloop.interchange.export import export
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError

@@ -19,7 +19,9 @@ export class Live extends EventTarget {
     setInterval(() => this.#watch(), 100);
   }
 
+  /** Once is enough: it comes again by itself. */
   connect() {
+    if (this.#socket) return;
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}/live`);
     socket.binaryType = "arraybuffer";

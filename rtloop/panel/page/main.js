@@ -1,6 +1,6 @@
 // The page: a session, a connection, and its parts.
 
-import { get } from "./api.js";
+import { get, who } from "./api.js";
 import { showDigits } from "./desk/digits.js";
 import { Drive } from "./desk/drive.js";
 import { showEvents } from "./desk/events.js";
@@ -37,7 +37,7 @@ $("close-help").addEventListener("click", closeHelp);
 live.addEventListener("refused", ({ detail }) => strip.tell(`${detail.wish}: ${detail.error}`));
 addEventListener("rtloop-session-lost", () => askForToken());
 
-const panel = await openSession(get);
+const panel = await openSession(get, () => live.connect());
 $("name").textContent = panel.name;
 strip.begin(get);
 showDigits(live, panel);
@@ -55,8 +55,12 @@ live.addEventListener("state", async ({ detail }) => {
   run = detail.run;
   if (!another) return;
   const now = await get("/api/panel").catch(() => panel);
-  if (JSON.stringify(now.columns) !== JSON.stringify(panel.columns)) location.reload(); // the loop that came has other signals
+  if (JSON.stringify(now) !== JSON.stringify(panel)) location.reload(); // the loop that came has other signals, rate or limits
   else tuning.read();
+});
+live.addEventListener("events", ({ detail }) => {
+  const others = detail.events.some((event) => event.kind === "load_law" && event.who !== who.name);
+  if (others) setTimeout(() => tuning.read(), 500); // the service says so soon after the tick
 });
 
 const press = (id) => () => $(id).click();

@@ -3,8 +3,11 @@
 import { post } from "./api.js";
 import { $, complain } from "./dom.js";
 
-/** Resolves once there is a session: by the token of the address, the cookie of before, or a token that is typed. */
-export async function openSession(get) {
+/**
+ * What the loop is, once there is one and a session: by the token of the address, the cookie of before, or a token that
+ * is typed. `opened` is called as soon as there is a session, whether or not a service answers.
+ */
+export async function openSession(get, opened) {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
   if (location.hash) history.replaceState(null, "", location.pathname);
   if (token) await post("/session", { token }).catch(() => {});
@@ -12,8 +15,12 @@ export async function openSession(get) {
     try {
       return await get("/api/panel");
     } catch (error) {
-      if (error.status === 401) await askForToken();
-      else await new Promise((resolve) => setTimeout(resolve, 1000));
+      if (error.status === 401) {
+        await askForToken();
+        continue;
+      }
+      if (error.status === 503) opened();
+      await new Promise((resolve) => setTimeout(resolve, 1000));
     }
   }
 }

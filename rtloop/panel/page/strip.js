@@ -57,11 +57,11 @@ export class Strip {
 
   #fresh({ connected, fresh, age_s, silence_s }) {
     document.body.classList.toggle("stale", !fresh);
-    const old_s = age_s ?? (Number.isFinite(silence_s) ? silence_s : null);
+    const old_s = age_s ?? (!connected && Number.isFinite(silence_s) ? silence_s : null);
     const age = old_s == null ? "none yet" : `${fixed(old_s, old_s < 10 ? 1 : 0)} s old`;
     say($("age"), fresh ? "live" : age);
     const why = connected ? (this.#state?.error ?? "no new ticks") : "no connection to the panel's server";
-    const says = `${why[0].toUpperCase()}${why.slice(1)}; what is shown is ${age}`;
+    const says = `${why[0].toUpperCase()}${why.slice(1)}${old_s == null ? "" : `; what is shown is ${age}`}`;
     for (const veil of document.querySelectorAll(".veil")) if (!fresh) veil.dataset.says = says;
     const spoken = connected ? (fresh ? "" : "No new ticks: what is shown is old.") : "No connection: what is shown is old, and STOP may not get through. Use the emergency stop.";
     say($("said"), this.note && fresh ? this.note : spoken);

@@ -18,7 +18,7 @@ import json
 import struct
 import time
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import parse_qs
 
 import anyio.to_thread
@@ -28,6 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rtloop.panel.viewers import cdr
 from rtloop.panel.viewers.digest import Digest, Taken
+from rtloop.panel.viewers.subscriptions import Channel, Subscriptions
 from rtloop.panel.views.feed import Feed
 from rtloop.panel.web.live import TAKE_S
 
@@ -44,17 +45,6 @@ WARNING = 1
 def viewers_token(token: str) -> str:
     """What lets viewers in, made of the panel's token: who learns it from an address cannot drive."""
     return hmac.new(token.encode(), b"viewers", hashlib.sha256).hexdigest()[:32]
-
-
-class Channel(NamedTuple):
-    """As it is advertised."""
-
-    id: int
-    topic: str
-    schemaName: str
-    schema: str
-    encoding: str = "cdr"
-    schemaEncoding: str = "ros2msg"
 
 
 EVENTS = Channel(1, "/events", cdr.EVENT, cdr.event_schema())
@@ -103,8 +93,7 @@ class _Viewer:
         self._socket, self._feed, self._name = socket, feed, name
         self._digest = Digest()
         self._live: Channel | None = None
-        self._subscribed: dict[int, int] = {}
-        """Channel by subscription."""
+        self._subscriptions = Subscriptions()
         self._told, _ = feed.events.after(0)
         self._event_due_s = 0.0
         self._clock = asyncio.get_running_loop().time
@@ -129,35 +118,9 @@ class _Viewer:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
-            if fault := self._heard(message.get("text")):
+            if fault := self._subscriptions.heard(message.get("text")):
                 await self._say({"op": "status", "level": WARNING, "message": fault})
             await asyncio.sleep(1 / REQUESTS_PER_S)
-
-    def _heard(self, text: str | None) -> str | None:
-        """Do what a message asks for; what is wrong with it."""
-        try:
-            said = json.loads(text or "")
-            match said["op"]:
-                case "subscribe":
-                    return self._subscribe([(int(one["id"]), int(one["channelId"])) for one in said["subscriptions"]])
-                case "unsubscribe":
-                    for number in said["subscriptionIds"]:
-                        self._subscribed.pop(int(number), None)
-                    return None
-                case other:
-                    return f"op {str(other)[:40]!r}: viewers can subscribe and unsubscribe, and change nothing"
-        except (ValueError, TypeError, KeyError, RecursionError):
-            return "a message that is none of the protocol's"
-
-    def _subscribe(self, asked: list[tuple[int, int]]) -> str | None:
-        known = {channel.id for channel in (EVENTS, self._live) if channel is not None}
-        for number, channel in asked:
-            if channel not in known:
-                return f"channel {channel}: {', '.join(map(str, sorted(known)))} are advertised"
-            if number in self._subscribed or channel in self._subscribed.values() or not 0 <= number < 1 << 32:
-                return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
-            self._subscribed[number] = channel
-        return None
 
     async def _tell(self) -> None:
         due_s = self._clock()
@@ -192,15 +155,16 @@ class _Viewer:
         """The loop that runs has other signals than the one before."""
         before, self._live = self._live, live
         if before is not None:
-            self._subscribed = {number: at for number, at in self._subscribed.items() if at != before.id}
+            self._subscriptions.withdraw(before.id)
             await self._say({"op": "unadvertise", "channelIds": [before.id]})
         await self._advertise(live)
 
     async def _advertise(self, channel: Channel) -> None:
+        self._subscriptions.known.add(channel.id)
         await self._say({"op": "advertise", "channels": [channel._asdict()]})
 
     async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
-        for number in [number for number, at in self._subscribed.items() if at == channel.id]:
+        for number in self._subscriptions.of(channel.id):
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
             await asyncio.wait_for(self._socket.send_bytes(data), TAKE_S)
 

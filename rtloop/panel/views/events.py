@@ -15,7 +15,7 @@ from rtloop.recording.file.events import Event, event_of
 
 KEPT = 200
 ASK_S = 0.2
-"""For a name; ticks come meanwhile, and the ring holds ten seconds."""
+"""For a name; ticks come meanwhile, and the ring holds ten seconds: a silent service is not asked for the others."""
 
 
 class Events:
@@ -28,10 +28,17 @@ class Events:
         self._lock = threading.Lock()
 
     def take(self, messages: Any, loop: Description, run: int) -> None:
-        """Add records of MESSAGE, (n,), of the run that is read; who asked is asked of the service."""
+        """Add records of MESSAGE, (n,), of the run that is read; who asked is asked of the service while it answers."""
+        answers = True
         for message in messages[-KEPT:]:
+            name = None
+            if answers and int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR:
+                try:
+                    name = self._name(int(message["identity"]))
+                except RtloopError:
+                    answers = False
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
-            event = event_of(message, tuple(loop.axes), time_ns, name=self._name(message))
+            event = event_of(message, tuple(loop.axes), time_ns, name=name)
             event["what"]["text"] = words(event)
             with self._lock:
                 self._count += 1
@@ -42,13 +49,7 @@ class Events:
         with self._lock:
             return self._count, [event for at, event in self._kept if at > number]
 
-    def _name(self, message: Any) -> str | None:
-        """Of the operator; None where no name was given, or the service does not answer."""
-        if int(message["kind"]) >= Kind.REFUSED or int(message["origin"]) != Origin.OPERATOR:
-            return None
-        resource = f"/asked_by?identity={int(message['identity'])}"
-        try:
-            status, _, data = self._service.client.exchange("GET", resource, None, ASK_S)
-        except RtloopError:
-            return None
+    def _name(self, identity: int) -> str | None:
+        """Of the operator; None where no name was given. Raises UnavailableError, HostRefused."""
+        status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, ASK_S)
         return json.loads(data)["name"] if status == 200 else None

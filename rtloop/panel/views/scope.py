@@ -125,6 +125,7 @@ class Scope:
             {
                 **sweep._asdict(),
                 "cause": ROLL if self._trigger is None else sweep.cause,
+                "mode": self.wish.trigger.mode,
                 "number": self.number,
                 "complete": complete,
                 "rate_hz": self._rate_hz,

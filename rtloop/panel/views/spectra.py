@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rtloop.panel.spectrum import Spectrum
-from rtloop.panel.stretch import Stretch
+from rtloop.panel.stretch import Batch, Stretch
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.link import Description
 from rtloop.panel.views.wishes import SpectrumWish
@@ -17,6 +17,7 @@ class Analyser:
     def __init__(self, wish: SpectrumWish, loop: Description) -> None:
         self._wish, self._rate_hz = wish, loop.rate_hz
         self._spectrum = Spectrum(loop.rate_hz, loop.unit(wish.signal))
+        self._batch = Batch(loop.rate_hz)
         self._run = -1
 
     def rewished(self, wish: SpectrumWish, loop: Description) -> bool:
@@ -29,17 +30,19 @@ class Analyser:
 
     def reset(self) -> None:
         """Average anew."""
+        self._batch.take()
         self._spectrum.reset()
 
     def feed(self, stretch: Stretch) -> None:
-        """Average what came; another run begins anew."""
+        """Average what came, in the end; another run begins anew."""
         if stretch.run != self._run:
             self._run = stretch.run
             self.reset()
-        self._spectrum.feed(stretch[self._wish.signal], stretch.periods(self._rate_hz))
+        self._average(self._batch.add(stretch))
 
     def frame(self) -> bytes:
         """As it is now."""
+        self._average(self._batch.take())
         density, wish = self._spectrum.density(), self._wish
         averages = density.averages
         return pack(
@@ -56,3 +59,7 @@ class Analyser:
             },
             {"hz": density.hz, "amplitude": density.amplitude, "averages": averages},
         )
+
+    def _average(self, batch: Stretch | None) -> None:
+        if batch is not None:
+            self._spectrum.feed(batch[self._wish.signal], batch.periods(self._rate_hz))

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.panel.stretch import Stretch
+from rtloop.panel.stretch import Batch, Stretch
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.link import Description
 from rtloop.signals import COMMON, DEADLINE, EXEC, LATENESS, PERIODS_MISSED
@@ -42,9 +42,16 @@ class Timing:
     def __init__(self, loop: Description) -> None:
         self._period_us = 1e6 / loop.rate_hz
         self._seconds: deque[Second] = deque(maxlen=WINDOW_S)
+        self._batch = Batch(loop.rate_hz)
 
     def feed(self, stretch: Stretch) -> None:
-        """Count them, each in its second."""
+        """Count them, in the end."""
+        self._count(self._batch.add(stretch))
+
+    def _count(self, stretch: Stretch | None) -> None:
+        """Each in its second."""
+        if stretch is None:
+            return
         seconds = (stretch[_DEADLINE] // 1_000_000_000).astype(np.int64)
         ends = np.append(np.flatnonzero(np.diff(seconds)) + 1, seconds.size)
         first = 0
@@ -61,6 +68,7 @@ class Timing:
 
     def frame(self) -> bytes:
         """The last minute."""
+        self._count(self._batch.take())
         kept = [one for one in self._seconds if one.number > self._seconds[-1].number - WINDOW_S]
         late, executed = (sum((getattr(one, name) for one in kept), _none()) for name in ("late", "executed"))
         step = FINE_PER_DECADE // SHOWN_PER_DECADE
@@ -103,7 +111,7 @@ class Timing:
             and now_us
             and all_us
             and now_us > WORSE * all_us
-            and now_us > 0.05 * self._period_us
+            and now_us > MATTERS * self._period_us
         ):
             found.append(f"it gets worse: one tick in a hundred of the last {RECENT_S} s was {now_us:.0f} µs late")
         if found:

@@ -155,5 +155,6 @@ class Viewer:
         return pack("events", {"events": events}) if events else None
 
     def _refuse(self, name: str, error: str) -> None:
-        if len(self._refusals) < MOST_REFUSALS:
-            self._refusals.append(pack("refused", {"wish": name[:100], "error": error[:2000]}))
+        frame = pack("refused", {"wish": name[:100], "error": error[:2000]})
+        if len(self._refusals) < MOST_REFUSALS:  # the list as it is now: it is taken away by another thread
+            self._refusals.append(frame)

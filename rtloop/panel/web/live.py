@@ -33,7 +33,12 @@ class Stream(WebSocketsSansIOProtocol):
     async def run_asgi(self) -> None:
         """Serve it, then end it."""
         await super().run_asgi()
-        self.loop.call_later(CLOSE_S, self.transport.abort)
+        self.loop.call_later(CLOSE_S, self.cut)
+
+    def cut(self) -> None:
+        """Cut it off, unless it has gone by itself."""
+        if self in self.connections:
+            self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """End what is no handshake: nothing else would, before its client does."""

@@ -9,29 +9,27 @@ import tempfile
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 from urllib.parse import quote
 
 import anyio.to_thread
 from anyio import CapacityLimiter
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
-from rtloop.configuration.file import describe
 from rtloop.errors import RtloopError, UnavailableError
 from rtloop.panel.capture import Run, present_run
 from rtloop.panel.shelf.aside import Aside, Crowded
 from rtloop.panel.shelf.reference import Wanted, sweep
 from rtloop.panel.shelf.shelf import Shelf
 from rtloop.panel.views.link import Service
+from rtloop.panel.web.asked import LONGEST_S, CaptureBody, Span, checked
 from rtloop.panel.web.proxy import limited_body
-from rtloop.recording.file.ticks import LARGEST
 
 READING_AT_A_TIME = 2
 MOST_BODY_BYTES = 4096
-LONGEST_S, AHEAD_S = 600.0, 60.0
+AHEAD_S = 60.0
 BLOCK_BYTES = 1 << 16
 
 Handler = Callable[[Any, Request], Awaitable[Response]]
@@ -43,34 +41,6 @@ class Refused(Exception):
     def __init__(self, code: int, error: str) -> None:
         super().__init__(error)
         self.code = code
-
-
-class CaptureBody(BaseModel):
-    """Ticks `first` to before `end` of the run with a number, or the last `seconds`."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-    run: int | None = None
-    first: int | None = Field(default=None, ge=-LARGEST, le=LARGEST)
-    end: int | None = Field(default=None, ge=1, le=LARGEST)
-    seconds: float | None = Field(default=None, gt=0, le=LONGEST_S)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.seconds is None) != (self.first is not None and self.end is not None):
-            raise ValueError("one of `seconds`, and `first` with `end`, is needed")
-        if self.first is not None and self.end is not None and self.end <= self.first:
-            raise ValueError(f"end: {self.end}; more than first, {self.first}, is allowed")
-        return self
-
-
-class Span(BaseModel):
-    """Of a picture, in s since the start of the run."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-    from_s: float = Field(default=0.0, ge=0, le=1e9, alias="from")
-    until: float | None = Field(default=None, gt=0, le=1e9)
 
 
 def _answers(handler: Handler) -> Handler:
@@ -139,7 +109,7 @@ class Recordings:
     async def plot(self, request: Request) -> Response:
         """What `rtloop plot` draws; `from` and `until` in s."""
         path = await self._path(request)
-        asked = _checked(Span, dict(request.query_params))
+        asked = checked(Span, dict(request.query_params))
         span = [f"--{name}={value}" for name, value in asked.model_dump(by_alias=True, exclude_none=True).items()]
         with tempfile.TemporaryDirectory(prefix="rtloop-panel-") as folder:
             picture = Path(folder) / "plot.png"
@@ -150,7 +120,7 @@ class Recordings:
     async def sweep(self, request: Request) -> Response:
         """A stretch as the scope shows it."""
         path, asked = await self._path(request), dict(request.query_params)
-        wanted = _checked(Wanted, asked | {"signals": tuple(asked.get("signals", "").split(","))})
+        wanted = checked(Wanted, asked | {"signals": tuple(asked.get("signals", "").split(","))})
         return Response(await self._read(lambda: sweep(path, wanted)), media_type="application/octet-stream")
 
     @_answers
@@ -159,7 +129,7 @@ class Recordings:
         data = await limited_body(request, MOST_BODY_BYTES)
         if data is None:
             raise Refused(413, f"request body: more than {MOST_BODY_BYTES} bytes")
-        body = _checked(CaptureBody, data)
+        body = checked(CaptureBody, data)
         if body.run not in (None, self._run()):
             raise Refused(410, f"run {body.run}: the loop was started anew since; its recording is in the list")
         run = await self._read(lambda: present_run(self._service.client))
@@ -214,11 +184,3 @@ def _blocks(path: Path, size: int) -> Iterator[bytes]:
         while size > 0 and (block := file.read(min(size, BLOCK_BYTES))):
             size -= len(block)
             yield block
-
-
-def _checked(model: type[Any], given: Any) -> Any:
-    """What was asked for. Raises ValueError."""
-    try:
-        return model.model_validate_json(given) if isinstance(given, bytes) else model.model_validate(given)
-    except ValidationError as error:
-        raise ValueError("; ".join(describe(error, "", None))) from None

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from rtloop.service.client import Client
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
@@ -55,10 +56,10 @@ def launched() -> Iterator[Any]:
             browser.close()
 
 
-def panel_of(bench: Bench) -> tuple[str, subprocess.Popen[str]]:
-    """Start the panel of a service; its address, with the token, and its process."""
+def panel_of(bench: Bench, service: str | None = None) -> tuple[str, subprocess.Popen[str]]:
+    """Start the panel of a service, of the bench's own or of another name; its address and its process."""
     said = len(bench.log())
-    process = bench.rtloop("panel", bench.folder / "run" / f"{bench.config.stem}.sock", "--port", "0")
+    process = bench.rtloop("panel", bench.folder / "run" / f"{service or bench.config.stem}.sock", "--port", "0")
     found: list[str] = []
 
     def told() -> bool:
@@ -128,6 +129,15 @@ def started(page: Any, name: str = "ada") -> None:
     hold(page, "#go")
     said(page, "#state-word", "armed")
     hold(page, "#go")
+    said(page, "#state-word", "running")
+
+
+def running(page: Any, bench: Bench, name: str = "ada") -> None:
+    """Have it run, driven under a name that is the page's as well, without the hand at its buttons."""
+    page.fill("#who", name)
+    client = Client(bench.client.path, name)
+    for command in ("/arm", "/start"):
+        client.post(command)
     said(page, "#state-word", "running")
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import rtloop
+from rtloop.service.client import Client
 from tests.faults.bench import Bench
-from tests.panel.page.browser import held, hold, near, number, opened, panel_of, said, started, stopped
+from tests.panel.page.browser import held, hold, near, number, opened, panel_of, running, said, started, stopped
 
 
 def position(page: Any) -> float:
@@ -67,11 +68,9 @@ def test_whoever_arms_starts_sets_tunes_undoes_captures_and_stops_sees_all_of_it
     said(page, "#drives", "Nobody")
 
 
-def test_space_stops_whatever_has_the_focus(page: Any) -> None:
-    page.fill("#who", "ada")
-    page.keyboard.press("Escape")
+def test_space_stops_whatever_has_the_focus(page: Any, bench: Bench) -> None:
     for place in ("#setpoint", "#trigger-source button", "#waveform-repeat", "#stacked"):
-        started(page)
+        running(page, bench)
         if place == "#waveform-repeat":
             page.click("summary:has-text('Waveform')")
         page.focus(place)
@@ -84,9 +83,8 @@ def test_space_stops_whatever_has_the_focus(page: Any) -> None:
         assert page.evaluate("[document.activeElement.value, document.querySelector('#stacked').ariaPressed]") == before
         assert not page.is_checked("#waveform-repeat")
         page.keyboard.press("Escape")
+    running(page, bench)
     page.focus("#who")  # free text: a blank is a blank, and the button says what stops instead
-    started(page)
-    page.focus("#who")
     page.keyboard.press("End")
     page.keyboard.press("Space")
     assert page.input_value("#who") == "ada "
@@ -132,7 +130,7 @@ def test_the_keyboard_alone_drives(page: Any) -> None:
 def test_a_hold_that_is_too_short_does_nothing_and_no_name_drives(page: Any, bench: Bench) -> None:
     page.hover("#go")
     page.mouse.down()
-    page.wait_for_timeout(400)
+    page.wait_for_timeout(100)
     page.mouse.up()
     page.wait_for_timeout(900)
     assert bench.status()["state"] == "stopped"
@@ -143,8 +141,8 @@ def test_a_hold_that_is_too_short_does_nothing_and_no_name_drives(page: Any, ben
     assert not bench.status()["armed"]
 
 
-def test_what_the_service_refuses_is_said_beside_the_field(page: Any) -> None:
-    started(page)
+def test_what_the_service_refuses_is_said_beside_the_field(page: Any, bench: Bench) -> None:
+    running(page, bench)
     for text, words in (("twelve", "no number"), ("1.2.3", "no number"), ("1e300", "")):
         page.fill("#setpoint", text)
         page.keyboard.press("Enter")
@@ -156,14 +154,17 @@ def test_what_the_service_refuses_is_said_beside_the_field(page: Any) -> None:
     stopped(page)
 
 
-def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, address: str) -> None:
-    started(page)
+def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, address: str, bench: Bench) -> None:
+    running(page, bench)
     other = opened(browser, address)
     other.fill("#who", "bob")
     said(other, "#drives", "ada drives")
     other.fill("#setpoint", "3")
     other.keyboard.press("Enter")
     said(other, "#setpoint-error", "ada has driven since")
+    Client(bench.client.path, "ada").post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})
+    said(other, "#tune-now", r"0\.012")
+    Client(bench.client.path, "ada").post("/undo", {"axis": "x"})
     other.keyboard.press("Space")
     said(page, "#state-word", "stopped")
     said(page, "#events", "bob")
@@ -183,6 +184,17 @@ def test_a_lost_connection_greys_what_is_shown_and_a_stop_that_got_nowhere_says_
     page.keyboard.press("Space")
     said(page, "#alarm", "STOP did not get through.*emergency stop")
     page.context.close()
+
+
+def test_a_page_that_is_there_before_its_service_says_what_it_waits_for(browser: Any, bench: Bench) -> None:
+    address, process = panel_of(bench, "none")
+    page = browser.new_context().new_page()
+    page.goto(address)
+    said(page, "#state-word", "unreachable")
+    said(page, "#said", "No new ticks")
+    assert page.get_attribute("#scope-plot .veil", "data-says").endswith("No such file or directory")
+    page.context.close()
+    process.kill()
 
 
 def test_the_modules_read_numbers_as_people_type_them(page: Any) -> None:

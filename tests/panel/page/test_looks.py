@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from tests.panel.page.browser import AXE, opened, said, started, stopped
+from tests.faults.bench import Bench
+from tests.panel.page.browser import AXE, opened, running, said, stopped
 
+MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings")
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
 
 
+@pytest.fixture(scope="module")
+def shown(browser: Any, address: str) -> Iterator[Any]:
+    """One page for all that is only looked at: windows and themes change under it, as they do for people."""
+    page = opened(browser, address)
+    yield page
+    assert not page.faults
+    page.context.close()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_violation_in_any_view(browser: Any, address: str, scheme: str) -> None:
+def test_axe_finds_no_violation_in_any_view(shown: Any, scheme: str) -> None:
     if not AXE.exists():
         pytest.skip(f"{AXE} is not there: make browser")
-    page = opened(browser, address, scheme=scheme)
+    page = shown
+    page.emulate_media(color_scheme=scheme)
+    page.wait_for_selector(f"html[data-theme={scheme}]", state="attached")
     page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
     check = "async (tags) => (await axe.run({runOnly: {type: 'tag', values: tags}})).violations"
     for view in (*VIEWS, "help"):
@@ -24,22 +38,23 @@ def test_axe_finds_no_violation_in_any_view(browser: Any, address: str, scheme: 
         page.keyboard.press(str(VIEWS.index(view) + 1) if view in VIEWS else "?")
         if view == "scope":
             page.keyboard.press("m")
-        page.wait_for_timeout(300)
+        drawn(page)
         found = page.evaluate(check, RULES)
         assert [(view, one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
-    assert not page.faults
-    page.context.close()
+    page.keyboard.press("Escape")
+    page.keyboard.press("1")
+    page.keyboard.press("m")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(320, "light"), (400, "dark"), (1400, "light"), (2560, "dark")])
-def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(
-    browser: Any, address: str, width: int, scheme: str
-) -> None:
-    page = opened(browser, address, width, 900, scheme)
-    assert page.get_attribute("html", "data-theme") == scheme
+def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(shown: Any, width: int, scheme: str) -> None:
+    page = shown
+    page.set_viewport_size({"width": width, "height": 900})
+    page.emulate_media(color_scheme=scheme)
+    page.wait_for_selector(f"html[data-theme={scheme}]", state="attached")
     for place, view in enumerate(VIEWS, start=1):
         page.keyboard.press(str(place))
-        page.wait_for_timeout(100)
+        drawn(page)
         assert page.is_visible(f"#{view}")
         assert page.is_visible("#scope") or width < 1900, "a large screen keeps the scope"
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), view
@@ -55,11 +70,19 @@ def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(
             assert seen, (view, scrolled)
     page.click("#theme")
     assert page.get_attribute("html", "data-theme") != scheme
-    page.context.close()
+    page.click("#theme")
+    assert page.get_attribute("html", "data-theme") == scheme
 
 
-def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any) -> None:
-    started(page)
+def test_with_reduced_motion_it_works_as_well(shown: Any) -> None:
+    shown.emulate_media(reduced_motion="reduce")
+    assert shown.evaluate(f"{MOVING}.length") == 0
+    said(shown, "#position-x", r"\d")
+    shown.emulate_media(reduced_motion="no-preference")
+
+
+def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any, bench: Bench) -> None:
+    running(page, bench)
     page.fill("#setpoint", "-2.5")
     page.keyboard.press("Enter")
     said(page, "#traces tbody tr:nth-of-type(2)", r"−2\.500.*−2\.500")
@@ -71,10 +94,6 @@ def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any) -> None:
     stopped(page)
 
 
-def test_with_reduced_motion_it_works_as_well(browser: Any, address: str) -> None:
-    page = opened(browser, address)
-    page.emulate_media(reduced_motion="reduce")
-    moving = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
-    assert page.evaluate(f"{moving}.length") == 0
-    said(page, "#position-x", r"\d")
-    page.context.close()
+def drawn(page: Any) -> None:
+    """Wait until what was asked for is on the screen: in the second frame from now."""
+    page.evaluate("() => new Promise((seen) => requestAnimationFrame(() => requestAnimationFrame(seen)))")

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import opened, said, started
+from tests.panel.page.browser import opened, running, said
 
 ATTACKS = """async (panel) => {
   const tried = {};
@@ -62,7 +62,7 @@ def elsewhere() -> Iterator[str]:
 
 
 def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench, address: str, elsewhere: str) -> None:
-    started(page)
+    running(page, bench)
     page.fill("#setpoint", "12.5")
     page.keyboard.press("Enter")
     said(page, "#digits", "12.500")

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 import anyio
 import pytest
+from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket
+from websockets.sync.client import connect
 
 from rtloop.panel.views.feed import Feed
 from rtloop.panel.views.link import Service
 from rtloop.panel.views.state import State
 from rtloop.panel.web import live
-from rtloop.panel.web.live import Live
+from rtloop.panel.web.live import Live, Stream
+from tests.panel.served import Served
 
 
 class Client:
@@ -58,3 +63,32 @@ def test_it_is_dropped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, goes: bo
     assert (client.taken, len(made)) == (3, 4)
     assert served._streams == 0
     assert feed._viewers == []
+
+
+def test_one_that_has_gone_is_not_cut_off(monkeypatch: pytest.MonkeyPatch):
+    """It took what was left for it after it was closed, and the connection ended by itself."""
+    tried: Queue[Exception | None] = Queue()
+
+    class Cut(Stream):
+        """As soon as it has gone."""
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            self.loop.call_soon(self.again)
+
+        def again(self) -> None:
+            try:
+                tried.put(self.cut())
+            except AttributeError as error:
+                tried.put(error)
+
+    async def much(socket: WebSocket) -> None:
+        await socket.accept()
+        await socket.send_bytes(bytes(1 << 24))
+
+    monkeypatch.setattr(live, "CLOSE_S", 60.0)
+    served = Served([WebSocketRoute("/", much)], ws=Cut, ws_per_message_deflate=False)
+    with connect(f"ws://127.0.0.1:{served.port}/", max_size=None, close_timeout=0.1) as client:
+        assert len(client.recv()) == 1 << 24
+        assert tried.get(timeout=60) is None
+    served.close()

@@ -82,8 +82,9 @@ export class Drive {
     }
   }
 
-  #show({ state, mode, lock }) {
+  #show({ state, mode, lock, unix_s }) {
     const [word, next] = NEXT[state] ?? [state === "running" ? "Running" : "Start", null];
+    if (next !== this.#next) this.go.end(); // armed by somebody else meanwhile: who holds "Arm" does not start
     this.#next = next;
     $("go").disabled = !next;
     say($("go-word"), word);
@@ -91,7 +92,7 @@ export class Drive {
     if (mode) this.#mode.value = mode;
     this.#mode.disabled = !["armed", "running"].includes(state);
     if (!lock) return say($("drives"), "Nobody drives. The first command takes the lock; stop works for everybody.");
-    const left_s = Math.max(0, Math.round(lock.until_unix_s - Date.now() / 1000));
+    const left_s = Math.max(0, Math.round(lock.until_unix_s - unix_s));
     const mine = lock.name === who.name;
     say($("drives"), `${mine ? "You drive" : `${lock.name} drives`}; free ${left_s > 0 ? `after ${left_s} s of silence` : "now"}.`);
   }

@@ -6,14 +6,18 @@ import { counted } from "../numbers.js";
 const MOST = 200;
 
 export function showEvents(live) {
+  const seen = new Set();
   live.addEventListener("events", ({ detail }) => {
     const list = $("events");
     for (const event of detail.events) {
-      if ([...list.children].some((item) => item.title === JSON.stringify(event))) continue; // said again after a break
+      const said = JSON.stringify(event);
+      if (seen.has(said)) continue; // said again after a break
+      seen.add(said);
+      if (seen.size > 2 * MOST) seen.delete(seen.values().next().value);
       const { tick, kind, who, axis, what } = event;
       const tripped = kind === "tripped";
       const text = [axis, String(kind).replaceAll("_", " "), what?.text].filter(Boolean).join(" · ");
-      list.prepend(make("li", { class: tripped && "trip", title: JSON.stringify(event) }, make("span", {}, counted(tick)), make("span", {}, who ?? ""), text));
+      list.prepend(make("li", { class: tripped && "trip", title: text }, make("span", {}, counted(tick)), make("span", {}, who ?? ""), text));
     }
     while (list.children.length > MOST) list.lastElementChild.remove();
   });

@@ -38,6 +38,8 @@ export class Reference {
   #typed = {};
   #unit = "µm";
   #now = {};
+  #tick = -1;
+  #asked = {};
   #mode = null;
 
   constructor(live, panel, drive, changed) {
@@ -70,6 +72,7 @@ export class Reference {
     live.addEventListener("state", ({ detail }) => {
       if (!Number.isFinite(this.#now[this.axis]?.reference_um) && detail.axes) $("setpoint").value = $("setpoint-slider").value = (detail.axes[this.axis]?.reference_um ?? 0).toFixed(2);
       this.#now = detail.axes ?? this.#now;
+      this.#tick = detail.tick ?? -1;
       if (detail.mode === this.#mode) return;
       this.#mode = detail.mode;
       this.#limit();
@@ -84,12 +87,14 @@ export class Reference {
   async set(value) {
     $("setpoint").value = String(value);
     $("setpoint-slider").value = String(value);
-    await this.#drive.driving("setpoint", { axis: this.axis, value }, $("setpoint-error"));
+    const asked = (this.#asked = { axis: this.axis, value, tick: Infinity });
+    asked.tick = (await this.#drive.driving("setpoint", { axis: this.axis, value }, $("setpoint-error")))?.tick ?? -1;
   }
 
-  /** From the reference as it is now, by the chosen distance. */
+  /** From the reference as it is now, or was last asked for and is not seen yet, by the chosen distance. */
   jog(sign) {
-    const from = this.#now[this.axis]?.reference_um;
+    const { axis, value, tick } = this.#asked;
+    const from = axis === this.axis && tick > this.#tick ? value : this.#now[this.axis]?.reference_um;
     if (!Number.isFinite(from)) return complain($("setpoint-error"), "jog: there is no reference yet to go on from");
     return this.set(Number((from + sign * this.#jog.value).toFixed(6)));
   }

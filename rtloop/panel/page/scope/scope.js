@@ -1,28 +1,30 @@
 // The scope: what is asked of the server, the sweeps that came, and how they are shown.
 
-import { get } from "../api.js";
-import { $, calmly, complain, make, say } from "../dom.js";
-import { counted, duration, fromField, significant } from "../numbers.js";
+import { $, calmly, say } from "../dom.js";
 import { DASHES, palette } from "../palette.js";
 import { Picker } from "../picker.js";
+import { Figures } from "./figures.js";
 import { Lanes } from "./lanes.js";
 import { Markers } from "./markers.js";
+import { showScales } from "./scales.js";
 import { remember, remembered } from "./settings.js";
-import { isDecimated, Table } from "./table.js";
 import { Trigger } from "./trigger.js";
 
 const MOST_TRACES = 8;
 const OVERLAYS = [0, 1, 3, 7, 15, 31];
+
 export class Scope {
   #live;
   #panel;
   #view;
   #lanes = new Lanes($("scope-plot"));
-  #table = new Table();
+  #figures = new Figures();
   #older = [];
   #reference = null;
-  #exact = null;
   #drawing = false;
+  /** Whether a single sweep is still to come. */
+  #armed = true;
+  #silence = null;
   #markers;
   #add;
   #overlays;
@@ -33,7 +35,10 @@ export class Scope {
     this.#live = live;
     this.#panel = panel;
     this.#view = remembered(panel);
-    this.trigger = new Trigger(this.#view, panel.columns, panel.longest_s, () => this.#asked());
+    this.trigger = new Trigger(this.#view, panel.columns, panel.longest_s, () => {
+      this.#armed = true;
+      this.#asked();
+    });
     this.#add = new Picker($("add-trace"), (name) => this.#traces([...this.#view.signals, name]));
     this.#markers = new Markers(this.#lanes, () => this.#later(), (level) => this.trigger.setLevel(level));
     this.#overlays = new Picker($("overlay"), (count) => this.#keep({ overlay: count }));
@@ -45,13 +50,17 @@ export class Scope {
     });
     $("autoscale").addEventListener("click", () => {
       this.#keep({ autoscale: !this.#view.autoscale });
-      this.#lanes.limits.clear();
+      if (this.#view.autoscale) this.#lanes.limits.clear(); // else those in force stay
       this.arrange();
     });
     $("cursors").addEventListener("click", () => this.#markers.toggle());
     $("hold").addEventListener("click", () => this.toggleHold());
     $("force").addEventListener("click", () => live.once({ force: true }));
-    $("arm-single").addEventListener("click", () => live.once({ arm: true }));
+    $("arm-single").addEventListener("click", () => {
+      this.#armed = true;
+      live.once({ arm: true });
+      this.#waits();
+    });
     $("no-comparison").addEventListener("click", () => this.compare(null));
     new ResizeObserver(calmly(300, () => this.#ask())).observe($("scope-plot"));
     live.addEventListener("sweep", ({ detail }) => this.#take(detail));
@@ -88,7 +97,6 @@ export class Scope {
     this.held = !this.held;
     $("hold").setAttribute("aria-pressed", String(this.held));
     this.#live.wish({ hold: this.held });
-    this.#measureSoon();
   }
 
   /** Lay out plots and tables anew, as after a change of the theme. */
@@ -98,13 +106,14 @@ export class Scope {
     this.#lanes.arrange(this.traces, this.#view.stacked);
     $("stacked").setAttribute("aria-pressed", String(this.#view.stacked));
     $("autoscale").setAttribute("aria-pressed", String(this.#view.autoscale));
-    this.#table.arrange(this.traces, (gone) => this.#traces(this.#view.signals.filter((name) => name !== gone)));
+    this.#figures.arrange(this.traces, (gone) => this.#traces(this.#view.signals.filter((name) => name !== gone)));
     const free = this.#panel.columns.filter(({ name }) => !this.#view.signals.includes(name));
     this.#add.options = [{ value: "", text: "a trace…" }, ...free.map(({ name, unit }) => ({ value: name, text: unit === "1" ? name : `${name}, ${unit}` }))];
     this.#add.value = "";
     this.#add.disabled = this.#view.signals.length >= MOST_TRACES;
-    this.#arrangeScales();
     this.#markers.arrange(this.#view, this.#span());
+    this.#show();
+    showScales(this.#lanes, this.#view.autoscale, () => this.#later());
   }
 
   #keep(changes) {
@@ -139,18 +148,17 @@ export class Scope {
     const words = { trigger: "triggered", forced: "forced", auto: "auto" };
     say($("trigger-state"), this.#view.trigger.mode === "roll" ? "rolling" : words[sweep.cause] ?? "triggered");
     $("trigger-state").classList.toggle("lit", sweep.cause === "trigger");
-    this.#waiting();
+    if (sweep.mode === "single" && sweep.complete) this.#armed = false; // one of the mode before may still be under way
+    clearTimeout(this.#silence);
+    this.#silence = setTimeout(() => this.#waits(), 600 + 2000 * this.#view.seconds);
     this.#later();
   }
 
-  /** Nothing has come for longer than two screens: a trigger is waited for. */
-  #waiting = calmly(0, () => {
-    clearTimeout(this.waitingTimer);
-    this.waitingTimer = setTimeout(() => {
-      say($("trigger-state"), this.held ? "held" : this.#view.trigger.mode === "single" ? "done" : "waiting");
-      $("trigger-state").classList.remove("lit");
-    }, 600 + 2000 * this.#view.seconds);
-  });
+  /** Nothing has come for longer than two screens. */
+  #waits() {
+    say($("trigger-state"), this.held ? "held" : this.#view.trigger.mode === "single" && !this.#armed ? "done" : "waiting");
+    $("trigger-state").classList.remove("lit");
+  }
 
   #span() {
     const { seconds, trigger } = this.#view;
@@ -178,68 +186,10 @@ export class Scope {
     ];
     this.#lanes.show(sweeps, this.#span(), this.#view.autoscale);
     this.#markers.place();
-    this.#number();
-  }
-
-  #number = calmly(200, () => {
-    const window = this.#window();
-    this.#table.show(this.sweep, window, this.#exact?.of === this.#stretch() ? this.#exact.figures : null);
-    const { trigger, uncertain_ticks, rate_hz, number } = this.sweep;
-    say($("sweep-says"), `${number ? `sweep ${counted(number)} ` : ""}at tick ${counted(trigger)}${uncertain_ticks ? `, or up to ${uncertain_ticks} before` : ""}; ${duration(this.#perPoint() / rate_hz, 3)} a point`);
-    this.#measureSoon();
-  });
-
-  #perPoint() {
-    const { offset } = this.sweep.arrays;
-    return offset.length > 1 ? (offset[offset.length - 1] - offset[0]) / (offset.length - 1) : 1;
+    this.#figures.show(this.sweep, this.#view.signals, this.#window());
   }
 
   #window() {
     return this.#markers.times ? [...this.#markers.times].sort((a, b) => a - b) : this.#span();
-  }
-
-  #stretch() {
-    const [from_s, to_s] = this.#window();
-    const { run, trigger, rate_hz, first, end } = this.sweep;
-    const tick = (time_s) => Math.min(Math.max(trigger + Math.round(time_s * rate_hz), first, 0), end);
-    return `run=${run}&first=${tick(from_s)}&end=${Math.max(tick(to_s) + 1, tick(from_s) + 1)}&signals=${this.#view.signals}`;
-  }
-
-  /** Figures of all ticks come from the server: an envelope tells rms and σ only about. */
-  #measureSoon = calmly(400, async () => {
-    if (!this.sweep || !isDecimated(this.sweep) || this.#exact?.none) return;
-    const of = this.#stretch();
-    if (of === this.#exact?.of) return;
-    try {
-      this.#exact = { of, figures: await get(`/api/measure?${of}`) };
-      if (of === this.#stretch()) this.#table.show(this.sweep, this.#window(), this.#exact.figures);
-    } catch (error) {
-      this.#exact = error.status === 404 ? { none: true } : null;
-    }
-  });
-
-  #arrangeScales() {
-    const fields = this.#view.autoscale ? [] : this.#lanes.lanes.flatMap((lane) => lane.units.map((unit) => this.#scaleField(lane, unit)));
-    $("scales").replaceChildren(...fields);
-  }
-
-  #scaleField(lane, unit) {
-    const id = `${lane.id}/${unit}`;
-    const name = lane.id === "all" ? unit : lane.id;
-    const [low, high] = this.#lanes.limits.get(id) ?? [-1, 1];
-    const fields = [low, high].map((value, place) => make("input", { value: significant(value, 4).replace("−", "-"), size: 6, "aria-label": `${name}: ${place ? "highest" : "lowest"}` }));
-    const read = () => {
-      try {
-        const [lowest, highest] = fields.map(fromField);
-        if (lowest >= highest) throw new Error(`${name}: from ${lowest} to ${highest}; the lower end comes first`);
-        this.#lanes.setLimits(id, lowest, highest);
-        complain($("trigger-error"), null);
-        this.#later();
-      } catch (error) {
-        complain($("trigger-error"), error);
-      }
-    };
-    for (const field of fields) field.addEventListener("change", read);
-    return make("span", { class: "field" }, make("span", {}, name), fields[0], "…", fields[1]);
   }
 }

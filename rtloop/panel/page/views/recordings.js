@@ -1,7 +1,7 @@
 // The recordings that there are: what is in one, its plot, the file itself, a stretch of it behind the scope.
 
 import { get, getArrays } from "../api.js";
-import { $, complain, make } from "../dom.js";
+import { $, complain, make, say } from "../dom.js";
 import { bytes, counted, duration, fromField } from "../numbers.js";
 
 const address = (file, what = "") => `/api/recordings/${encodeURIComponent(file)}${what}`;
@@ -18,6 +18,8 @@ export class Recordings {
   canvases = [];
 
   async open() {
+    $("reread").setAttribute("aria-busy", "true");
+    say($("reread"), "Reading…");
     try {
       const list = await get("/api/recordings");
       list.sort((a, b) => b.created_unix_s - a.created_unix_s);
@@ -26,6 +28,8 @@ export class Recordings {
     } catch (error) {
       complain($("recordings-error"), error);
     }
+    $("reread").removeAttribute("aria-busy");
+    say($("reread"), "Read again");
   }
 
   close() {}
@@ -40,7 +44,7 @@ export class Recordings {
       make("th", { scope: "row" }, file),
       make("td", {}, made), make("td", {}, duration_s == null ? "—" : duration(duration_s, 3)), make("td", {}, bytes(size)),
       make("td", {}, trips == null ? "—" : String(trips)),
-      make("td", {}, [captured ? "captured" : "", around ? "around events" : "", complete ? "" : "growing"].filter(Boolean).join(", ")),
+      make("td", {}, [captured && "captured", around && "around events", file.endsWith(".part") ? "not finished" : complete === false && "incomplete"].filter(Boolean).join(", ")),
       make("td", {}, make("span", { class: "bar" },
         act("Info", () => this.#info(file)),
         act("Plot", () => this.#plot(file)),

@@ -77,7 +77,7 @@ export class Views {
       ? [{ text: part, colour: palette().traces[0], dash: DASHES[0] }]
       : [...$("traces").tBodies[0].rows].map((row, place) => ({ text: described(row), colour: palette().traces[place], dash: DASHES[place] }));
     const scope = $("scope").hidden ? null : this.#scope;
-    return { canvases: plots.filter((canvas) => canvas.width), lines: [...(scope ? [`scope: ${duration(scope.view.seconds, 2)} a screen. ${$("measured").textContent}`] : []), ...lines], traces, scope };
+    return { canvases: plots.filter((canvas) => canvas.width), lines: [...(scope ? [`scope: ${duration(scope.view.seconds, 2)} a screen. ${$("measured").textContent}`] : []), ...lines], traces, scope, seconds: view?.seconds };
   }
 }
 

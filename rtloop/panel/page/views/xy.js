@@ -32,6 +32,10 @@ export class Xy {
     live.addEventListener("xy", ({ detail }) => this.#take(detail));
   }
 
+  get seconds() {
+    return this.#seconds.value;
+  }
+
   get canvases() {
     return this.#chart ? [this.#chart.plot.ctx.canvas] : [];
   }

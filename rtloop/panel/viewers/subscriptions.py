@@ -1,0 +1,61 @@
+"""What a viewer of the Foxglove protocol has subscribed to, by what it says; it can say nothing else."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+
+class Channel(NamedTuple):
+    """As it is advertised."""
+
+    id: int
+    topic: str
+    schemaName: str
+    schema: str
+    encoding: str = "cdr"
+    schemaEncoding: str = "ros2msg"
+
+
+class Subscriptions:
+    """Of one viewer, to the channels that are advertised to it, `known`."""
+
+    def __init__(self) -> None:
+        self.known: set[int] = set()
+        self._channels: dict[int, int] = {}
+        """By the number of the subscription."""
+
+    def of(self, channel: int) -> list[int]:
+        """The numbers of the subscriptions to a channel."""
+        return [number for number, at in self._channels.items() if at == channel]
+
+    def withdraw(self, channel: int) -> None:
+        """It is advertised no longer."""
+        self.known.remove(channel)
+        for number in self.of(channel):
+            del self._channels[number]
+
+    def heard(self, text: str | None) -> str | None:
+        """Do what a message asks for; what is wrong with it."""
+        try:
+            said = json.loads(text or "")
+            match said["op"]:
+                case "subscribe":
+                    return self._subscribe([(int(one["id"]), int(one["channelId"])) for one in said["subscriptions"]])
+                case "unsubscribe":
+                    for number in said["subscriptionIds"]:
+                        self._channels.pop(int(number), None)
+                    return None
+                case other:
+                    return f"op {str(other)[:40]!r}: viewers can subscribe and unsubscribe, and change nothing"
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return "a message that is none of the protocol's"
+
+    def _subscribe(self, asked: list[tuple[int, int]]) -> str | None:
+        for number, channel in asked:
+            if channel not in self.known:
+                return f"channel {channel}: {', '.join(map(str, sorted(self.known)))} are advertised"
+            if number in self._channels or channel in self._channels.values() or not 0 <= number < 1 << 32:
+                return f"subscription {number}: one a channel is allowed, with a number below 2**32 of its own"
+            self._channels[number] = channel
+        return None

@@ -1,0 +1,48 @@
+"""What may be asked for of recordings, each request bounded."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rtloop.configuration.file import describe
+from rtloop.recording.file.ticks import LARGEST
+
+LONGEST_S = 600.0
+
+
+class CaptureBody(BaseModel):
+    """Ticks `first` to before `end` of the run with a number, or the last `seconds`."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    run: int | None = None
+    first: int | None = Field(default=None, ge=-LARGEST, le=LARGEST)
+    end: int | None = Field(default=None, ge=1, le=LARGEST)
+    seconds: float | None = Field(default=None, gt=0, le=LONGEST_S)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.seconds is None) != (self.first is not None and self.end is not None):
+            raise ValueError("one of `seconds`, and `first` with `end`, is needed")
+        if self.first is not None and self.end is not None and self.end <= self.first:
+            raise ValueError(f"end: {self.end}; more than first, {self.first}, is allowed")
+        return self
+
+
+class Span(BaseModel):
+    """Of a picture, in s since the start of the run."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    from_s: float = Field(default=0.0, ge=0, le=1e9, alias="from")
+    until: float | None = Field(default=None, gt=0, le=1e9)
+
+
+def checked(model: type[Any], given: Any) -> Any:
+    """What was asked for. Raises ValueError."""
+    try:
+        return model.model_validate_json(given) if isinstance(given, bytes) else model.model_validate(given)
+    except ValidationError as error:
+        raise ValueError("; ".join(describe(error, "", None))) from None

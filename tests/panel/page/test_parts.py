@@ -1,0 +1,110 @@
+"""Parts of the page in a browser without a panel: what they make of what the server would say, word by word."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtloop.panel.web.application import PAGE
+from tests.panel.page.browser import PATIENCE_S, launched
+
+SET_UP = """async () => {
+  const [{Scope}, {Reference}, {Drive}, {showEvents}, {themes}] = await Promise.all(
+    ["scope/scope", "desk/reference", "desk/drive", "desk/events", "palette"].map((name) => import(`/page/${name}.js`)),
+  );
+  const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
+  const columns = [["x_position_um", "µm"], ["x_reference_um", "µm"], ["x_drive_v", "V"]];
+  const panel = {axes: ["x"], longest_s: 60, rate_hz: 1000, columns: columns.map(([name, unit]) => ({name, unit}))};
+  const arrays = {offset: Float32Array.from({length: 200}, (_, tick) => tick - 40)};
+  for (const [name] of columns) {
+    arrays[`${name}:low`] = arrays[`${name}:high`] = arrays.offset.map((tick) => 12 + Math.sin(tick / 9));
+  }
+  themes(document.getElementById("theme"), () => {});
+  window.tell = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
+  window.sweep = (more) => tell("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
+    uncertain_ticks: 0, number: 3, complete: true, rate_hz: 1000, arrays, ...more});
+  window.state = (more) => tell("state", {state: "stopped", mode: "off", tick: 7, unix_s: 1000, axes: {},
+    lock: {name: "ada", until_unix_s: 1042}, ...more});
+  window.asked = [];
+  const answering = {driving: async (_, {value}) => (asked.push(value), {tick: 100})};
+  window.scope = new Scope(live, panel);
+  window.drive = new Drive(live, {tell() {}});
+  window.reference = new Reference(live, panel, answering, () => {});
+  showEvents(live);
+}"""
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """The page's elements and its parts, with nobody behind them."""
+    folder: Path = tmp_path_factory.mktemp("parts")
+    (folder / "page").symlink_to(PAGE)
+    scriptless = (PAGE / "index.html").read_text(encoding="utf-8").replace('src="/page/main.js"', "")
+    (folder / "index.html").write_text(scriptless, encoding="utf-8")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with launched() as browser:
+        page = browser.new_page()
+        page.set_default_timeout(1000 * PATIENCE_S)
+        page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
+        page.evaluate(SET_UP)
+        yield page
+    server.shutdown()
+    server.server_close()
+
+
+def says(parts: Any, selector: str, text: str) -> None:
+    parts.wait_for_function("([at, text]) => document.querySelector(at).textContent === text", arg=[selector, text])
+
+
+def test_whoever_holds_arm_does_not_start_what_somebody_else_armed(parts: Any) -> None:
+    held = "document.getElementById('go').classList.contains('holding')"
+    parts.evaluate("state()")
+    assert parts.evaluate(f"drive.go.begin(), {held}")
+    assert not parts.evaluate(f"state({{state: 'armed'}}), {held}")
+
+
+def test_the_lock_is_told_by_the_clock_of_the_host(parts: Any) -> None:
+    parts.evaluate("state()")
+    says(parts, "#drives", "ada drives; free after 42 s of silence.")
+
+
+def test_jogs_go_on_from_what_was_asked_for_until_it_is_seen(parts: Any) -> None:
+    jog = "(async () => { await reference.jog(1) })()"
+    parts.evaluate("state({axes: {x: {reference_um: 5}}})")
+    for _ in range(3):
+        parts.evaluate(jog)
+    parts.evaluate("state({tick: 200, axes: {x: {reference_um: 2}}})")
+    parts.evaluate(jog)
+    assert parts.evaluate("asked") == [6, 7, 8, 3]
+
+
+def test_an_event_that_is_told_again_is_shown_once(parts: Any) -> None:
+    event = "{tick: 5, kind: 'set_mode', who: 'ada', axis: null, what: {text: 'off'}}"
+    for _ in range(2):
+        parts.evaluate(f"tell('events', {{events: [{event}]}})")
+    assert parts.locator("#events li").all_inner_texts() == ["5\nada\nset mode · off"]
+
+
+def test_the_scale_that_is_held_is_the_one_that_was_in_force(parts: Any) -> None:
+    parts.evaluate("sweep()")
+    parts.wait_for_function("document.querySelector('#sweep-says').textContent")
+    parts.click("#autoscale")
+    low, high = (float(field.input_value()) for field in parts.locator("#scales input").all()[:2])
+    assert 10 < low < 11 < 13 < high < 14
+
+
+def test_single_waits_until_its_own_sweep_has_come(parts: Any) -> None:
+    parts.click("#trigger-mode [value=single]")
+    parts.evaluate("sweep({trigger: 41})")  # of the mode before, still under way
+    says(parts, "#trigger-state", "waiting")
+    parts.evaluate("sweep({mode: 'single', trigger: 42})")
+    says(parts, "#trigger-state", "done")
+    parts.click("#arm-single")
+    says(parts, "#trigger-state", "waiting")
