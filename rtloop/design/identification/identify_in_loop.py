@@ -14,17 +14,18 @@ import numpy as np
 from rtloop.design.identification.dynamics_fit import Candidate, DynamicsFit, Mode, modes_of, transfer_of
 from rtloop.design.identification.identify_delay import MOST_TICKS, delayed
 from rtloop.design.identification.identify_dynamics import Criterion, identify_dynamics
-from rtloop.design.identification.instrumental import Estimate, Instrumented, left_by, whitened, whitening_of
+from rtloop.design.identification.instrumental import Instrumented, left_by, whitened, whitening_of
 from rtloop.design.identification.markov import ARX_ORDER
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.design.identification.nested_models import Judged, Search, late, preferred
+from rtloop.design.identification.nested_models import Final, Judged, Search, late, preferred
 from rtloop.design.identification.outside import LoopExcitation, from_outside, from_rest
 from rtloop.design.identification.prediction_error import LARGEST_ORDER, Excitation
 from rtloop.design.identification.residuals import residual_tests
-from rtloop.hil.modal import Real
 
 METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER
+PATIENCE = 2
+"""Modes in a row that do not pay, after which no more are tried."""
 LARGEST_SPREAD = 0.1
 """A frequency with a larger standard deviation, relative to itself, is none that was found."""
 
@@ -64,35 +65,55 @@ def identify_in_loop(
     driven, answer = from_outside(run), from_outside(replace(run, input=run.position_um))
     data = Instrumented(run, driven)
     search = Search(data, whitening_of(run.position_um - answer))
-    most, exactly = order or largest_order, order is not None
-    found = search.grown(None, delay_ticks or 0, most, exactly=exactly)
-    if order is not None:
-        found = [one for one in found if one.model.order == order]
+    found, as_good = _searched(search, order, largest_order, delay_ticks)
+    chosen = _final(search, found, as_good)
+    if chosen is None:
+        raise UnsuitableData(
+            f"{run.name}: no stable model of order {order or f'1 to {largest_order}'} explains it; another order, or "
+            "more excitation from outside, is needed"
+        )
+    delay_ticks = chosen.judged.delay_ticks
+    later = [delayed(one, delay_ticks) for one in validation]
+    settled = [one for one in (*found, *as_good) if one.delay_ticks == delay_ticks and one.estimate.settled]
+    tried = {one.model.order: one for one in settled}
+    candidates = tuple(_candidate(tried[key], later) for key in sorted(tried))
+    return _described(run.name, chosen, late(data, delay_ticks), candidates)
+
+
+def _final(search: Search, found: list[Judged], as_good: list[Judged]) -> Final | None:
+    """The best of those that are as good as any; where the whole recording settles none of them, the next best."""
+    finals = [final for one in as_good if (final := search.final(one))]
+    if finals:
+        return min(finals, key=lambda one: one.judged.total)
+    others = sorted((one for one in found if one.estimate.settled), key=lambda one: one.rms_um)
+    return next((final for one in others if (final := search.final(one))), None)
+
+
+def _searched(
+    search: Search, order: int | None, largest_order: int, delay_ticks: int | None
+) -> tuple[list[Judged], list[Judged]]:
+    """All models that were tried, and those of the fewest poles that are as good as any; none where none is stable."""
+    most, patience = order or largest_order, None if order else PATIENCE
+    found = search.grown(None, delay_ticks or 0, most, patience)
+    found = [one for one in found if order in (None, one.model.order)]
     if not found:
-        raise UnsuitableData(f"{run.name}: no stable model explains it; another order, or more excitation, is needed")
+        return [], []
     if delay_ticks is None:
         found = _with_delays(search, found)
-    chosen = preferred(found)
-    if order is None and chosen.delay_ticks:
-        found = search.grown(chosen, chosen.delay_ticks, most, exactly=False)
-        chosen = preferred(found)
-    if order is None:
-        chosen = search.pruned(chosen)
-    estimate, whitening = search.final(chosen)
-    if estimate is None:
-        raise UnsuitableData(
-            f"{run.name}: no stable model of order {chosen.model.order} explains it; another order, or more excitation "
-            "from outside, is needed"
-        )
-    tried = {one.model.order: one for one in (*found, chosen) if one.delay_ticks == chosen.delay_ticks}
-    later = [delayed(one, chosen.delay_ticks) for one in validation]
-    candidates = tuple(_candidate(tried[key], later) for key in sorted(tried))
-    return _described(run.name, estimate, late(data, chosen.delay_ticks), whitening, candidates, chosen.delay_ticks)
+    as_good = preferred(found)
+    if order is not None:
+        return found, as_good
+    if as_good[0].delay_ticks and delay_ticks is None:
+        found += search.grown(as_good[0], as_good[0].delay_ticks, most, 1)
+        as_good = preferred(found)
+    as_good = [search.pruned(one) for one in as_good]
+    fewest = min(one.model.order for one in as_good)
+    return found, [one for one in as_good if one.model.order == fewest]
 
 
 def _with_delays(search: Search, found: list[Judged]) -> list[Judged]:
     """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
-    largest = preferred(found).model.order
+    largest = preferred(found)[0].model.order
     everything, row = list(found), [one for one in found if one.model.order <= largest]
     for _ in range(MOST_TICKS):
         pairs = [(one, later) for one in row if (later := search.later(one))]
@@ -126,19 +147,12 @@ def _candidate(judged: Judged, validation: Sequence[Excitation]) -> Candidate:
     )
 
 
-def _described(
-    name: str,
-    estimate: Estimate,
-    data: Instrumented,
-    whitening: Real,
-    candidates: tuple[Candidate, ...],
-    delay_ticks: int,
-) -> DynamicsFit:
-    model = estimate.model
-    modes = modes_of(model, estimate.covariance, noise=False)
+def _described(name: str, chosen: Final, data: Instrumented, candidates: tuple[Candidate, ...]) -> DynamicsFit:
+    model = chosen.estimate.model
+    modes = modes_of(model, chosen.estimate.covariance, noise=False)
     _require_known(name, modes)
     left = left_by(model, data.run)
-    errors = whitened(left, whitening)
+    errors = whitened(left, chosen.whitening)
     return DynamicsFit(
         transfer_of(model),
         model.static_gain,
@@ -148,7 +162,7 @@ def _described(
         residual_tests(data.driven[ARX_ORDER:], errors, ARX_ORDER),
         candidates,
         model,
-        delay_ticks,
+        chosen.judged.delay_ticks,
         METHOD,
     )
 
@@ -158,5 +172,5 @@ def _require_known(name: str, modes: tuple[Mode, ...]) -> None:
     if best.frequency_std_hz > LARGEST_SPREAD * best.frequency_hz:
         raise UnsuitableData(
             f"{name}: too little excitation from outside: the mode known best is at {best.frequency_hz:.4g} ± "
-            f"{best.frequency_std_hz:.2g} Hz; a reference that moves further, or over all frequencies of interest, is needed"
+            f"{best.frequency_std_hz:.2g} Hz; a reference that moves further, or over more frequencies, is needed"
         )

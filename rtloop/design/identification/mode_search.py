@@ -21,7 +21,7 @@ HIGHEST = 0.9
 """Of half the sampling rate."""
 RESOLUTION_HZ = 0.25
 """Lines of long recordings are summed over so much."""
-LEAST_PERIODS = 2
+LEAST_PERIODS = 5
 """Of the slowest mode, within the recording."""
 PARAMETERS = {True: 4, False: 2}
 

@@ -1,13 +1,14 @@
 """Models of growing order from a closed loop, the order and the delay by what predicts the part held out.
 
 Every second block of the recording is held out. There a model is judged by its prediction errors A_n (x − G u − x₀),
-with one A_n for all models. Of two models the smaller is taken unless the larger one's squared errors are less by two
+with one A_n for all models. Of two models the smaller is taken unless the larger one's squared errors are less by CLEAR
 standard errors of their difference (Diebold & Mariano 1995).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +28,9 @@ from rtloop.design.identification.mode_search import Spectra
 from rtloop.hil.modal import Complex, Real
 
 BLOCK = 256
-CLEAR = 2.0
+REWHITENED = 3
+CLEAR = 2.5
 """Standard errors."""
-IN_VAIN = 2
-"""Modes in a row that do not pay, after which no more are tried."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,14 @@ class Judged:
         return float(more.mean()) > CLEAR * float(more.std()) / np.sqrt(more.size)
 
 
+class Final(NamedTuple):
+    """The estimate, the whitening A_n (ARX_ORDER + 1,) that it was made with, and how it is judged beside others."""
+
+    estimate: Estimate
+    whitening: Real
+    judged: Judged
+
+
 class Search:
     """Over models of one recording; `whitening` is the noise's, as far as it is known before there is a model."""
 
@@ -66,13 +74,13 @@ class Search:
         blocks = np.arange(ARX_ORDER, data.run.input.size) // BLOCK
         self._kept: npt.NDArray[np.bool_] = blocks % 2 == 0
 
-    def grown(self, start: Judged | None, delay_ticks: int, most: int, *, exactly: bool) -> list[Judged]:
-        """From `start`, or from nothing, by a mode more each, up to `most` poles; until it no longer pays, unless it
-        shall be `exactly` so many."""
+    def grown(self, start: Judged | None, delay_ticks: int, most: int, in_vain: int | None = None) -> list[Judged]:
+        """From `start`, or from nothing, by a mode more each, up to `most` poles, or until `in_vain` in a row do not
+        pay."""
         data = late(self._data, delay_ticks)
         found = [start] if start else []
         model = start.model if start else _nothing(data.run.period_s)
-        while model.order < most and not (not exactly and len(found) > IN_VAIN and _in_vain(found)):
+        while model.order < most and not (in_vain and len(found) > in_vain and _in_vain(found, in_vain)):
             rate = self._next(model, data, pair_allowed=most - model.order > 1)
             if (judged := self._judged(with_mode(model, rate), delay_ticks, fresh=True)) is None:
                 break
@@ -96,17 +104,16 @@ class Search:
         best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
         return judged if best is None or best.worse_than(judged) else self.pruned(best)
 
-    def final(self, judged: Judged) -> tuple[Estimate | None, Real]:
-        """By the whole recording, with A_n of what the model leaves, and that A_n; None where nothing settles."""
+    def final(self, judged: Judged) -> Final | None:
+        """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
         data, estimate = late(self._data, judged.delay_ticks), judged.estimate
-        whitening = self._judging
-        for _ in range(3):
+        for _ in range(REWHITENED):
             whitening = whitening_of(left_by(estimate.model, data.run))
             better = estimated(estimate.model, data, whitening)
             if better is None or not better.settled:
-                return None, whitening
+                return None
             estimate = better
-        return estimate, whitening
+        return Final(estimate, whitening, self._scored(estimate, judged.delay_ticks))
 
     def _next(self, model: Innovations, data: Instrumented, *, pair_allowed: bool) -> complex:
         left, driven = (whitened(one, self._whitening) for one in (left_by(model, data.run), data.driven))
@@ -125,12 +132,14 @@ class Search:
         return Judged(estimate, delay_ticks, errors[~self._kept] ** 2, float(np.sum(errors**2)))
 
 
-def preferred(found: list[Judged]) -> Judged:
-    """Of those that settled, where any did, that of the fewest poles which is not worse than the best; of equally many,
-    that which fits all of the recording best."""
+def preferred(found: list[Judged]) -> list[Judged]:
+    """Of those that settled, where any did, those of the fewest poles which are not worse than the best; first that
+    which fits all of the recording best."""
     among = [one for one in found if one.estimate.settled] or found
     best = min(among, key=lambda one: one.rms_um)
-    return min((one for one in among if not one.worse_than(best)), key=lambda one: (one.model.order, one.total))
+    as_good = [one for one in among if not one.worse_than(best)]
+    fewest = min(one.model.order for one in as_good)
+    return sorted((one for one in as_good if one.model.order == fewest), key=lambda one: one.total)
 
 
 def late(data: Instrumented, ticks: int) -> Instrumented:
@@ -143,9 +152,9 @@ def with_mode(model: Innovations, rate: complex) -> Innovations:
     return _with(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
 
 
-def _in_vain(found: list[Judged]) -> bool:
-    best = min(found[:-IN_VAIN], key=lambda one: one.rms_um)
-    return not any(best.worse_than(one) for one in found[-IN_VAIN:])
+def _in_vain(found: list[Judged], last: int) -> bool:
+    best = min(found[:-last], key=lambda one: one.rms_um)
+    return not any(best.worse_than(one) for one in found[-last:])
 
 
 def _without(model: Innovations, mode: int) -> Innovations:
