@@ -164,8 +164,8 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     assert "instrumental variables" in (tmp_path / "model.toml").read_text()
     opened = command("identify", "dynamics", path, "--loop", "open", "--order", "2", "--delay", "1")
     assert "instrumental variables" not in opened.output
-    at_rest = text.replace(CHIRP, 'kind = "sine"\namplitude = 1.0\nfrequency_hz = 20.0')
-    limited = record(tmp_path / "limited.mcap", at_rest.replace("command_um = 42.0", "command_um = 0.5"), 4000)[0]
+    at_rest = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
+    limited = record(tmp_path / "limited.mcap", at_rest.replace("command_um = 42.0", "command_um = 2.0"), 4000)[0]
     for says, *arguments in (
         ("the command was limited at tick", limited, "--input", "command"),
         ("it holds no x_wobble", path, "--outside", "x_wobble"),
