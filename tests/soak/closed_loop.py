@@ -23,7 +23,7 @@ import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -103,9 +103,11 @@ def draw(seed: int) -> tuple[str, dict[str, Found | None]]:
         for one in (closed, opened)
     )
     found = {method: naive(loop, inside, method) for method in ("direct", "output error")}
-    for method, run, known in (
-        ("closed", inside, {}), ("open", alone, {"order": 4, "delay_ticks": loop.delay_ticks})
-    ):  # fmt: skip
+    runs: tuple[tuple[str, LoopExcitation, dict[str, Any]], ...] = (
+        ("closed", inside, {}),
+        ("open", alone, {"order": 4, "delay_ticks": loop.delay_ticks}),
+    )
+    for method, run, known in runs:
         try:
             fit = identify_in_loop(run, **known)
         except UnsuitableData as refusal:

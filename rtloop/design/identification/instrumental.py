@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import lstsq, solve
+from scipy.linalg import solve
 from scipy.signal import lfilter
 
 from rtloop.design.identification.innovations import Innovations
@@ -75,7 +75,7 @@ def left_by(model: Innovations, run: Excitation) -> Real:
     """x − G u − x₀ (samples,): noise, where the model is right. x₀, and an offset, are those that leave least."""
     left = run.position_um - model.output(run.input)
     ringing = _ringing(model, left.size)
-    return left - lstsq(ringing.T, left, check_finite=False)[0] @ ringing
+    return left - np.linalg.lstsq(ringing.T, left, rcond=None)[0] @ ringing
 
 
 def whitening_of(noise: Real) -> Real:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.fft import next_fast_len, rfft
 
 from rtloop.hil.modal import Complex, Real
 
@@ -30,11 +29,11 @@ class Spectra:
     """Of what is left (samples,) and of the input (samples,), whitened alike."""
 
     def __init__(self, left: Real, driven: Real, period_s: float) -> None:
-        size = next_fast_len(2 * left.size, real=True)
-        spectrum = rfft(driven, size)
+        size = 1 << (2 * left.size - 1).bit_length()
+        spectrum = np.fft.rfft(driven, size)
         together = max(1, int(RESOLUTION_HZ * size * period_s))
         self._power = _blocks(np.abs(spectrum) ** 2, together)
-        self._cross = _blocks(np.conj(spectrum) * rfft(left, size), together)
+        self._cross = _blocks(np.conj(spectrum) * np.fft.rfft(left, size), together)
         middles = together * np.arange(self._power.size) + (together - 1) / 2
         self._back: Complex = np.exp(-2j * np.pi * middles / size)
         self._period_s = period_s
@@ -45,7 +44,7 @@ class Spectra:
         """The rate s of the best mode; a pair's with positive imaginary part where one is allowed and worth it."""
         top = HIGHEST * np.pi / self._period_s
         rates = np.geomspace(self._slowest, top, FREQUENCIES)
-        real_gain, real = self._best(-rates + 0j)
+        real_gain, real = self._best((-rates).astype(complex))
         if not pair_allowed:
             return real
         pair_gain, pair = self._best(_pairs(rates, DAMPINGS))

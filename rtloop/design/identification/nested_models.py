@@ -106,7 +106,7 @@ class Search:
 
     def final(self, judged: Judged) -> Final | None:
         """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
-        data, estimate = late(self._data, judged.delay_ticks), judged.estimate
+        data, estimate, whitening = late(self._data, judged.delay_ticks), judged.estimate, self._judging
         for _ in range(REWHITENED):
             whitening = whitening_of(left_by(estimate.model, data.run))
             better = estimated(estimate.model, data, whitening)

@@ -60,4 +60,4 @@ def _stable(polynomial: Real) -> Real:
     sizes = np.abs(roots)
     if np.all(sizes < 1):
         return polynomial
-    return np.poly(np.where(sizes > LARGEST_IMAGE, roots * LARGEST_IMAGE / sizes, roots)).real
+    return np.asarray(np.poly(np.where(sizes > LARGEST_IMAGE, roots * LARGEST_IMAGE / sizes, roots)).real, dtype=float)

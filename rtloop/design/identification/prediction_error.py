@@ -109,10 +109,8 @@ def descended(model: Innovations, run: Excitation, *, noise: bool, kept: Kept = 
 
     settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
     with np.errstate(over="ignore", invalid="ignore"):
-        found = least_squares(  # pyright: ignore[reportCallIssue]
-            lambda values: errors(values)[kept], model.pack(noise=noise), lambda values: jacobian(values)[kept],
-            **settings,
-        )  # fmt: skip
+        of_kept: Any = lambda values: jacobian(values)[kept]
+        found = least_squares(lambda values: errors(values)[kept], model.pack(noise=noise), of_kept, **settings)
     return model.unpack(found.x, noise=noise)
 
 
