@@ -7,6 +7,7 @@ delay, an integrator that damps the first of them, a reference that moves, and n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import signal
@@ -37,16 +38,14 @@ class TrueLoop:
     def in_loop(self, reference: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
         """v and x, from rest, filtered by the loop's own transfer functions."""
         (b, a), (q, p) = self.plant, self.controller
-        command = signal.lfilter(np.convolve(q, a), self.closed, reference - noise)
-        position = signal.lfilter(np.convolve(b, q), self.closed, reference) + signal.lfilter(
-            np.convolve(a, p), self.closed, noise
-        )
+        command = filtered(np.convolve(q, a), self.closed, reference - noise)
+        position = filtered(np.convolve(b, q), self.closed, reference) + filtered(np.convolve(a, p), self.closed, noise)
         return {"reference_um": reference, "command_um": command, "position_um": position}
 
     def open(self, command: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
         """The same plant without a loop."""
         b, a = self.plant
-        return {"reference_um": command, "command_um": command, "position_um": signal.lfilter(b, a, command) + noise}
+        return {"reference_um": command, "command_um": command, "position_um": filtered(b, a, command) + noise}
 
 
 def plant_of(modes: tuple[tuple[float, float, float], ...], delay_ticks: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,9 +53,15 @@ def plant_of(modes: tuple[tuple[float, float, float], ...], delay_ticks: int) ->
     top, bottom = np.zeros(1), np.ones(1)
     for hz, damping, share in modes:
         omega = 2 * np.pi * hz
-        b, a, _ = signal.cont2discrete(([share * omega**2], [1, 2 * damping * omega, omega**2]), PERIOD_S, "zoh")
+        held: Any = signal.cont2discrete(([share * omega**2], [1, 2 * damping * omega, omega**2]), PERIOD_S, "zoh")
+        b, a = held[0], held[1]
         top, bottom = added(np.convolve(top, a), np.convolve(b.ravel(), bottom)), np.convolve(bottom, a)
     return np.concatenate([np.zeros(delay_ticks), top]), bottom
+
+
+def filtered(b: Any, a: Any, signal_: np.ndarray) -> np.ndarray:
+    """B/A applied, from rest."""
+    return np.asarray(signal.lfilter(b, a, signal_))
 
 
 def added(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -96,8 +101,8 @@ def damping_controller(loop: TrueLoop, gain: float, ki_per_s: float) -> tuple[np
 def coloured(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
     """Broad noise near `near_hz`, drift, and 10 nm of a sensor: a tenth of the power is drift."""
     omega = 2 * np.pi * near_hz * PERIOD_S
-    shaken = signal.lfilter([1.0], np.poly(np.exp(omega * np.roots([1, 0.1, 1]))).real, random.normal(size=samples))
-    drift = signal.lfilter([1.0], [1.0, -0.9995], random.normal(size=samples))
+    shaken = filtered([1.0], np.poly(np.exp(omega * np.roots([1, 0.1, 1]))).real, random.normal(size=samples))
+    drift = filtered([1.0], [1.0, -0.9995], random.normal(size=samples))
     return rms_um * (0.95 * shaken / shaken.std() + 0.3 * drift / drift.std()) + random.normal(0, 0.010, samples)
 
 
