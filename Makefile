@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-preisach soak-afm soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-preisach soak-afm soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -121,6 +121,10 @@ flagship: $(READY)
 # A service measures its own loop on rigs of known transfer function: about six minutes.
 soak-response: $(READY)
 	$(BIN)/python -m tests.soak.response
+
+# Dynamics from DRAWS (50) closed loops with coloured noise, and from five on the simulated rig: about ten minutes.
+soak-closed-loop: $(READY)
+	$(BIN)/python -m tests.soak.closed_loop --draws $(or $(DRAWS),50)
 
 # A service whose resonance has moved measures it, makes its taps anew, and steps and scans: four minutes.
 soak-retune: $(READY)

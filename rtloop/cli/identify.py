@@ -104,7 +104,22 @@ def hysteresis(
 @click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
 @click.option("--largest-order", default=14, show_default=True, type=click.IntRange(1, 20))
 @click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Samples of delay [0 to 5, found].")
-@click.option("--criterion", default="aic", show_default=True, type=click.Choice(["aic", "held-out", "validation"]))
+@click.option(
+    "--criterion", type=click.Choice(["aic", "held-out", "validation"]),
+    help="What chooses the order [aic; held-out in a closed loop, where nothing else does].",
+)  # fmt: skip
+@click.option(
+    "--loop",
+    "state",
+    default="auto",
+    show_default=True,
+    type=click.Choice(["auto", "open", "closed"]),
+    help="Was the loop closed? auto goes by the recorded mode; a recording without one was open.",
+)
+@click.option(
+    "--outside", multiple=True, metavar="SIGNAL",
+    help="Recorded signal that moved the closed loop, owing nothing to its noise [the axis's reference and feed].",
+)  # fmt: skip
 @click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine: measured frequency response.")
 @OUT
 @PLOT
@@ -113,10 +128,10 @@ def hysteresis(
 def dynamics(
     runs: tuple[Path, ...], axis: str | None, hysteresis: Path | None, how: Literal["hysteresis", "command", "drive"],
     order: int | None, largest_order: int, delay_ticks: int | None,
-    criterion: Literal["aic", "held-out", "validation"], compare: Path | None, out: Path | None, plot: Path | None,
-    as_json: bool,
+    criterion: Literal["aic", "held-out", "validation"] | None, state: Literal["auto", "open", "closed"],
+    outside: tuple[str, ...], compare: Path | None, out: Path | None, plot: Path | None, as_json: bool,
 ) -> int:  # fmt: skip
-    """D(s) from a step, or another excitation, from rest.
+    """D(s) from a step, or another excitation, from rest; or from a closed loop whose reference moves.
 
     It is identified from the first RUN; further RUNs validate it.
     """
@@ -124,8 +139,8 @@ def dynamics(
     from rtloop.terminal.identification import print_dynamics
 
     report = dynamics_report(
-        runs, axis=axis, how=how, hysteresis=hysteresis, order=order, largest_order=largest_order,
-        delay_ticks=delay_ticks, criterion=criterion, compare=compare, out=out, plot=plot,
+        runs, axis=axis, how=how, hysteresis=hysteresis, state=state, outside=outside, order=order,
+        largest_order=largest_order, delay_ticks=delay_ticks, criterion=criterion, compare=compare, out=out, plot=plot,
     )  # fmt: skip
     _show(report, as_json, print_dynamics)
     return 0

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from rtloop.configuration.file import load as load_configuration
-from rtloop.design.identification.frequency_response import Agreement, FrequencyResponse, agreement, frequency_response
+from rtloop.design.identification.dynamics_fit import DynamicsFit
+from rtloop.design.identification.frequency_response import agreement, measured_response
 from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_of,
@@ -21,7 +22,7 @@ from rtloop.design.identification.identified import (
     write_new,
 )
 from rtloop.design.identification.identify_delay import delayed
-from rtloop.design.identification.identify_dynamics import Criterion, DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identification.identify_dynamics import Criterion
 from rtloop.design.identification.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.identify_hysteresis import (
     HysteresisFit,
@@ -31,9 +32,11 @@ from rtloop.design.identification.identify_hysteresis import (
     identify_hysteresis,
     unexplained_um,
 )
+from rtloop.design.identification.identify_in_loop import identified_dynamics
 from rtloop.design.identification.judgement import Judgement, judged_from_rest
 from rtloop.design.identification.measured import Measured, UnsuitableData, measured
-from rtloop.design.identification.prediction_error import LARGEST_ORDER
+from rtloop.design.identification.prediction_error import LARGEST_ORDER, Excitation
+from rtloop.design.identification.recorded_loop import RecordedLoop, State, recorded_loop
 from rtloop.errors import ConfigError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import compensated, residual_operator
@@ -128,8 +131,11 @@ def _held_out(rows: Sequence[dict[str, Any]], more: dict[str, Any]) -> list[str]
     return lines
 
 
-def excitation(run: Measured, how: Input, feedforward: PlayModel | None) -> Excitation:
-    """The input to D and its output. `feedforward` is the actuator's model, needed for "hysteresis"."""
+def excitation(run: Measured, how: Input, feedforward: PlayModel | None, loop: RecordedLoop | None) -> Excitation:
+    """The input to D and its output. `feedforward` is the actuator's model, needed for "hysteresis".
+
+    Of a `loop` that was closed, the stretch and what moved it.
+    """
     if not run.even:
         raise UnsuitableData(
             f"{run.name}: ticks are missing or late by a period; dynamics need a record at equal intervals: record "
@@ -137,10 +143,17 @@ def excitation(run: Measured, how: Input, feedforward: PlayModel | None) -> Exci
         )
     if how == "hysteresis":
         assert feedforward is not None
-        return Excitation(run.name, model_output(feedforward, run.drive_v), run.position_um, run.period_s)
-    if how == "command" and np.isnan(run.command_um).all():
-        raise UnsuitableData(f"{run.name}: it has no recorded command; --input drive or hysteresis is possible")
-    return Excitation(run.name, run.drive_v if how == "drive" else run.command_um, run.position_um, run.period_s)
+        whole = Excitation(run.name, model_output(feedforward, run.drive_v), run.position_um, run.period_s)
+    else:
+        if how == "command" and np.isnan(run.command_um).all():
+            raise UnsuitableData(f"{run.name}: it has no recorded command; --input drive or hysteresis is possible")
+        given = run.drive_v if how == "drive" else run.command_um
+        whole = Excitation(run.name, given, run.position_um, run.period_s)
+    if loop is None:
+        return whole
+    if how == "command":
+        loop.require_commands_obeyed(run.name)
+    return loop.excitation(whole)
 
 
 def dynamics_report(
@@ -149,26 +162,30 @@ def dynamics_report(
     axis: str | None = None,
     how: Input = "hysteresis",
     hysteresis: Path | None = None,
+    state: State = "auto",
+    outside: Sequence[str] = (),
     order: int | None = None,
     largest_order: int = LARGEST_ORDER,
     delay_ticks: int | None = None,
-    criterion: Criterion = "aic",
+    criterion: Criterion | None = None,
     compare: Path | None = None,
     out: Path | None = None,
     plot: Path | None = None,
 ) -> dict[str, Any]:
     """Identify from the first recording, judge with the others, write what was asked for. Raises RtloopError."""
     runs = [measured(path, axis) for path in paths]
+    loops = [recorded_loop(path, axis, state, outside) for path in paths]
     actuator = _actuator(runs[0], hysteresis, axis) if how == "hysteresis" else None
-    inputs = [excitation(run, how, actuator) for run in runs]
+    inputs = [excitation(run, how, actuator, loop) for run, loop in zip(runs, loops, strict=True)]
     try:
-        fit = identify_dynamics(inputs[0], order, largest_order, criterion, inputs[1:], delay_ticks)
+        fit = identified_dynamics(inputs[0], order, largest_order, criterion, inputs[1:], delay_ticks)
     except ValueError as fault:
         raise ConfigError("identify dynamics", [str(fault)]) from None
     found, compared = None, None
     if compare is not None:
-        other = excitation(measured(compare, axis), how, actuator)
-        found, compared = _compared(fit, delayed(other, fit.delay_ticks))
+        loop = recorded_loop(compare, axis, state, outside)
+        found = measured_response(delayed(excitation(measured(compare, axis), how, actuator, loop), fit.delay_ticks))
+        compared = agreement(fit.model, found)
     if out is not None:
         write_new(out, _sections(fit, runs[0], how, actuator))
     if plot is not None:
@@ -178,6 +195,7 @@ def dynamics_report(
     tests = {"white": fit.tests.white, "independent": fit.tests.independent}
     return plain(
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs], "input": how}
+        | {"loop": loops[0] and {"from_tick": loops[0].start, "to_tick": loops[0].end, "outside": loops[0].names}}
         | {key: value for key, value in fields_of(fit).items() if key != "model"}
         | {"order": fit.model.order, "tests": fields_of(fit.tests) | tests}
         | {"frequency_response": compared, "output": out, "plot": plot}
@@ -238,11 +256,6 @@ def _actuator(run: Measured, hysteresis: Path | None, axis: str | None) -> PlayM
     if hysteresis is not None:
         return read_feedforward(hysteresis, axis).actuator()
     return feedforward_of(run.configuration, f"{run.name}: configuration", axis).actuator()
-
-
-def _compared(fit: DynamicsFit, run: Excitation) -> tuple[FrequencyResponse, Agreement]:
-    found = frequency_response(run.input, run.position_um - run.position_um[0], run.period_s)
-    return found, agreement(fit.model, found)
 
 
 def _sections(fit: DynamicsFit, run: Measured, how: Input, actuator: PlayModel | None) -> str:

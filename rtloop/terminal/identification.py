@@ -60,8 +60,11 @@ def _known(from_s: float | None) -> str:
 
 
 def print_dynamics(report: dict[str, Any]) -> None:
-    """Orders tried, modes with their uncertainty, what the residuals and a measured response say."""
+    """Method, orders tried, modes with their uncertainty, what the residuals and a measured response say."""
     out = console()
+    loop = report["loop"]
+    ticks = f"; ticks {loop['from_tick']} to {loop['to_tick']}, moved by {', '.join(loop['outside'])}" if loop else ""
+    out.print(f"{report['method']}, input: {report['input']}{ticks}", markup=False)
     shown = table("order", "error µm rms", "AIC", "validation µm rms")
     for one in report["candidates"]:
         name = f"{one['order']}" + (" ←" if one["order"] == report["order"] else "")

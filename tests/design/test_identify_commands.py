@@ -24,6 +24,47 @@ from tests.service.test_run import ROOT, run
 
 DEPLOY = ROOT / "deploy"
 
+CHIRP = """kind = "chirp"
+amplitude = 2.0
+start_hz = 5.0
+end_hz = 2000.0
+duration_s = 1.0
+offset = 0.0
+logarithmic = true"""
+LOOP = """[loop]
+rate_hz = 10000
+[driver]
+kind = "sim"
+seed = 5
+latency_ticks = 1
+[driver.channels.x]
+input = "adc0"
+output = "dac0"
+um_per_v = 10.0
+[driver.plant.hysteresis]
+truth = "custom"
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[driver.plant.sensor]
+noise_um = 0.01
+[driver.plant.dynamics]
+form = "factors"
+gain = {c!r}
+denominator = [[1.0, {b!r}, {c!r}]]
+[[axis]]
+name = "x"
+[axis.feedforward]
+thresholds_v = [0.0]
+weights_um_per_v = [4.3]
+[axis.limits]
+command_um = {limit}
+[axis.controller]
+kind = "pid"
+ki_per_s = 15.0
+[axis.reference]
+{reference}
+"""
+
 
 def command(*arguments: str | Path) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
@@ -107,6 +148,30 @@ def test_the_dynamics_of_a_recorded_step(folder: Path, step: Path, section: Path
     assert "[axis.feedforward]" in text
     assert re.search(r"SHA-256 [0-9a-f]{16}", text)
     assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
+    """The recorded mode tells; a reference at rest is refused; so is a command that was limited, as the input."""
+    omega = 2 * np.pi * 320.0
+    text = LOOP.format(b=2 * 0.01 * omega, c=omega**2, reference=CHIRP, limit=42.0)
+    path = record(tmp_path / "chirp.mcap", text, 10_000)[0]
+    found = report("identify", "dynamics", path, "--order", "2", "--delay", "1", "--out", tmp_path / "model.toml")
+    (mode,) = found["modes"]
+    assert mode["frequency_hz"] == pytest.approx(320.0, rel=0.002)
+    assert mode["damping"] == pytest.approx(0.01, rel=0.1)
+    assert found["loop"] == {"from_tick": 0, "to_tick": 10_000, "outside": ["x_reference_um", "x_feed_um"]}
+    assert "instrumental variables" in found["method"]
+    assert "instrumental variables" in (tmp_path / "model.toml").read_text()
+    opened = command("identify", "dynamics", path, "--loop", "open", "--order", "2", "--delay", "1")
+    assert "instrumental variables" not in opened.output
+    at_rest = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
+    limited = record(tmp_path / "limited.mcap", at_rest.replace("command_um = 42.0", "command_um = 2.0"), 4000)[0]
+    for says, *arguments in (
+        ("the command was limited at tick", limited, "--input", "command"),
+        ("it holds no x_wobble", path, "--outside", "x_wobble"),
+    ):
+        result = command("identify", "dynamics", *arguments)
+        assert (result.exit_code, says in result.stderr) == (1, True), result.output
 
 
 def test_what_the_compensation_in_use_leaves(section: Path) -> None:

@@ -1,6 +1,9 @@
 """A frequency response measured from a recorded chirp or multisine, with coherence, beside a model's.
 
     H₁ = S_ux / S_uu,     γ² = |S_ux|² / (S_uu S_xx)          Welch 1967; Bendat & Piersol 2010, chapter 6
+    H = S_wx / S_wu,      γ² = |S_wx|² / (S_ww S_xx)          in closed loop: Wellstead 1981
+
+w is what moved a closed loop from outside, or follows from that alone: S_ux would hold the noise that C(z) brings back.
 
 Where the coherence is low, noise or nonlinearity is measured and not the plant; such frequencies are left out.
 """
@@ -15,6 +18,8 @@ from scipy.signal import csd, welch
 
 from rtloop.design.identification.innovations import Innovations
 from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.outside import LoopExcitation, from_outside, from_rest
+from rtloop.design.identification.prediction_error import Excitation
 from rtloop.hil.modal import Complex, Real
 
 LEAST_COHERENCE = 0.95
@@ -49,9 +54,12 @@ class Agreement:
     model_peak_hz: float
 
 
-def frequency_response(u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S) -> FrequencyResponse:
+def frequency_response(
+    u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S, instrument: Real | None = None
+) -> FrequencyResponse:
     """Of input `u` and output `x`, each (samples,), by Welch's method with Hann windows that overlap by three quarters.
 
+    `instrument` (samples,) is w, by default `u`.
     Raises UnsuitableData for a recording shorter than two segments.
     """
     samples = round(segment_s / period_s)
@@ -60,11 +68,18 @@ def frequency_response(u: Real, x: Real, period_s: float, segment_s: float = SEG
             f"{u.size * period_s:g} s; a frequency response needs at least {2 * segment_s:g} s of excitation"
         )
     settings = {"fs": 1 / period_s, "nperseg": samples, "noverlap": 3 * samples // 4}
-    hz, cross = csd(u, x, **settings)
-    inputs, outputs = welch(u, **settings)[1], welch(x, **settings)[1]
-    inside = (hz > 0) & (inputs > 1e-12 * inputs.max())
+    by = u if instrument is None else instrument
+    hz, cross = csd(by, x, **settings)
+    moved, inputs, outputs = csd(by, u, **settings)[1], welch(by, **settings)[1], welch(x, **settings)[1]
+    inside = (hz > 0) & (inputs > 1e-12 * inputs.max()) & (np.abs(moved) > 0)
     coherence = np.abs(cross[inside]) ** 2 / (inputs[inside] * np.maximum(outputs[inside], 1e-300))
-    return FrequencyResponse(hz[inside], np.asarray(cross[inside] / inputs[inside], dtype=complex), coherence)
+    return FrequencyResponse(hz[inside], np.asarray(cross[inside] / moved[inside], dtype=complex), coherence)
+
+
+def measured_response(run: Excitation) -> FrequencyResponse:
+    """Of a recording, by what follows from outside where its loop was closed. Raises UnsuitableData."""
+    instrument = from_outside(from_rest(run)) if isinstance(run, LoopExcitation) else None
+    return frequency_response(run.input, run.position_um - run.position_um[0], run.period_s, instrument=instrument)
 
 
 def agreement(model: Innovations, found: FrequencyResponse) -> Agreement:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from rtloop import __version__
 from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
-from rtloop.design.identification.identify_dynamics import DynamicsFit
+from rtloop.design.identification.dynamics_fit import DynamicsFit
 from rtloop.design.identification.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
@@ -60,8 +60,8 @@ def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
     modes = (f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})" for mode in fit.modes)
     return [
         f"Dynamics, identified by rtloop {__version__} from {sources([run])}, input: {how}",
-        f"ARMAX of order {fit.model.order} at {1 / run.period_s:g} Hz: prediction error {fit.rms_error_um:.3g} µm rms, "
-        f"fit {fit.fit_percent:.2f} %",
+        f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "
+        f"{fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
         "modes: " + ", ".join(modes) + f"; behind {fit.delay_ticks} samples of delay",
         f"normalised to D(0) = 1; its static gain of {fit.static_gain:.6g} is in the hysteresis",
     ]

@@ -1,7 +1,6 @@
 """Linear dynamics D(s) from recorded input and output: ARMAX by prediction errors, normalised to D(0) = 1.
 
     minimise Σ ε_k²     over the modes of G and H (`innovations`; Ljung 1999, sections 7.2 and 10.2)
-    s = log(z)/T,   r_s = r_z s/(z − 1)          inverse of the zero-order hold, exact for each mode
 
 A first guess of each order comes from the modes of a long ARX model. Only the product of hysteresis gain and D(0) can
 be told from a recording: G(1) is divided out and reported as `static_gain`, which belongs to the hysteresis.
@@ -12,14 +11,14 @@ Poles beyond half the sampling rate cannot be seen: each appears, if at all, at 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from rtloop.design.identification.dynamics_fit import Candidate, DynamicsFit, modes_of, transfer_of
 from rtloop.design.identification.identify_delay import delayed, first_part, held_out_from, identified_delay
 from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.inverse_hold import held_from
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.identification.prediction_error import (
     LARGEST_ORDER,
@@ -30,56 +29,13 @@ from rtloop.design.identification.prediction_error import (
     refined,
     rms_error,
 )
-from rtloop.design.identification.residuals import ResidualTests, residual_tests
-from rtloop.hil.modal import Complex, Real
-from rtloop.linear.realisation import system_of
-from rtloop.linear.transfer import Transfer
-from rtloop.linear.zeros import zeros_and_gain
+from rtloop.design.identification.residuals import residual_tests
+from rtloop.hil.modal import Real
 
 Criterion = Literal["aic", "held-out", "validation"]
-FASTEST = 14.0
-"""e^−14 is less than a millionth: a mode that is left with that by the next tick is over there."""
+METHOD = "prediction errors (ARMAX), open loop"
 LEAST_EXCITED = 4
 """Poles that the input must be able to tell apart where the order is searched for."""
-
-
-@dataclass(frozen=True)
-class Mode:
-    """A pole with its standard deviations from the covariance of the estimate."""
-
-    frequency_hz: float
-    frequency_std_hz: float
-    damping: float
-    damping_std: float
-    static_share: float
-    """|r/s| of the mode (both of a pair), relative to D(0)."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One order: rms one-step-ahead error (of the part held out, where one is), Akaike's criterion ln(V) + 2 d/N, and
-    fit to other runs (NaN: none)."""
-
-    order: int
-    rms_error_um: float
-    aic: float
-    validation_rms_um: float
-
-
-@dataclass(frozen=True)
-class DynamicsFit:
-    """D(s), D(0) = 1, with `static_gain` in position per input, and what speaks for and against it."""
-
-    transfer: Transfer
-    static_gain: float
-    modes: tuple[Mode, ...]
-    rms_error_um: float
-    fit_percent: float
-    tests: ResidualTests
-    candidates: tuple[Candidate, ...]
-    model: Innovations
-    delay_ticks: int
-    """Samples between input and position beyond the one that a held output takes; `model` comes behind them."""
 
 
 def identify_dynamics(
@@ -151,56 +107,25 @@ def _chosen(candidates: Sequence[Candidate], score: Callable[[Candidate], float]
 def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int) -> DynamicsFit:
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
-    gain = model.static_gain
-    discrete = model.discrete()
-    rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
-    rates, residues = _within_reach(rates, discrete.residues / gain, model.period_s)
-    modal = held_from(rates, residues, discrete.direct, model.period_s)
-    zeros, leading = zeros_and_gain(system_of(modal))
-    transfer = Transfer.from_zpk(zeros, rates, leading)
-    transfer = Transfer.from_zpk(zeros, rates, leading / transfer.dc_gain)
     left = run.position_um - model.output(run.input)
     return DynamicsFit(
-        transfer,
-        gain,
-        _modes(model, run, errors),
+        transfer_of(model),
+        model.static_gain,
+        modes_of(model, _covariance(model, run, errors), noise=True),
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(left) / np.std(run.position_um))),
         residual_tests(run.input, errors, model.pack(noise=True).size),
         candidates,
         model,
         delay_ticks,
+        METHOD,
     )
 
 
-def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
-    """Rates (n,) and residues (m, n) with what died away within a tick dying away FASTEST times in it, D(0) kept.
-
-    A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
-    """
-    reach: Complex = rates.copy()
-    reach.real = np.maximum(rates.real, -FASTEST / period_s)
-    static = np.expm1(reach * period_s) / np.expm1(rates * period_s)
-    return reach, residues * static
-
-
-def _modes(model: Innovations, run: Excitation, errors: Real) -> tuple[Mode, ...]:
-    """Poles with their standard deviations: σ²(ΨΨᵀ)⁻¹ (Ljung 1999, section 9.4), for |s| and −Re s/|s|."""
+def _covariance(model: Innovations, run: Excitation, errors: Real) -> Real:
+    """Of `model.pack(noise=True)`: σ²(ΨΨᵀ)⁻¹ (Ljung 1999, section 9.4)."""
     rows = model.sensitivities(run.input, errors, noise=True)
     scale = np.linalg.norm(rows, axis=1)
     scale[scale == 0] = 1.0
     inverse = np.linalg.pinv((rows / scale[:, None]).T, rcond=1e-12)
-    covariance = (inverse @ inverse.T) * np.mean(errors**2) / np.outer(scale, scale)
-    found, i = [], 0
-    for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
-        size, width = abs(rate), 2 if rate.imag != 0 else 1
-        part = covariance[i : i + width, i : i + width]
-        by_size = np.array([rate.real, rate.imag][:width]) / size
-        by_damping = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
-        share = width * abs(residue / (1 - image) / model.static_gain)
-        deviations = [float(np.sqrt(max(d @ part @ d, 0.0))) for d in (by_size, by_damping)]
-        found.append(
-            Mode(size / (2 * np.pi), deviations[0] / (2 * np.pi), -rate.real / size, deviations[1], float(share))
-        )
-        i += 3 * width
-    return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
+    return (inverse @ inverse.T) * np.mean(errors**2) / np.outer(scale, scale)

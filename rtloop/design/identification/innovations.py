@@ -62,9 +62,9 @@ class Innovations:
         """Roots of C (n,): the poles of H⁻¹, which must lie inside the unit circle."""
         blocks, columns, rows = np.zeros((self.order, self.order)), np.zeros(self.order), np.zeros(self.order)
         i = 0
-        for image, gain in zip(self.images, self.noise_gains, strict=True):
+        for rate, image, gain in zip(self.rates, self.images, self.noise_gains, strict=True):
             blocks[i, i], columns[i], rows[i] = image.real, gain.real, 1.0
-            if image.imag:
+            if rate.imag:
                 blocks[i : i + 2, i : i + 2] = [[image.real, -image.imag], [image.imag, image.real]]
                 columns[i + 1], rows[i] = gain.imag, 2.0
                 i += 1
@@ -87,7 +87,8 @@ class Innovations:
 
     def sensitivities(self, u: Real, errors: Real, *, noise: bool) -> Real:
         """dε by each unknown, (unknowns, samples), in the order of `pack`."""
-        through_input, through_noise = _modes(self, u), _modes(self, errors)
+        through_input = _modes(self, u)
+        through_noise = _modes(self, errors) if noise else through_input
         rows: list[Real] = []
         for i, image in enumerate(self.images):
             moved = self.residues[i] * _mode(image, through_input[i])

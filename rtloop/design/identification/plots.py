@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.design.identification.dynamics_fit import DynamicsFit
 from rtloop.design.identification.frequency_response import FrequencyResponse
-from rtloop.design.identification.identify_dynamics import DynamicsFit, Excitation
 from rtloop.design.identification.identify_hysteresis import HysteresisFit
+from rtloop.design.identification.instrumental import left_by
 from rtloop.design.identification.judgement import Judgement
+from rtloop.design.identification.outside import LoopExcitation
+from rtloop.design.identification.prediction_error import Excitation
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import Residual, compensated
@@ -51,7 +54,9 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     count = min(run.input.size, POINTS)
     time_s = np.arange(count) * run.period_s
     time.plot(time_s, run.position_um[:count], color="tab:blue", linewidth=2, label="measured")
-    time.plot(time_s, (fit.model.output(run.input) + offset)[:count], color="0.15", linewidth=0.8, label="model")
+    left = left_by(fit.model, run) if isinstance(run, LoopExcitation) else None
+    modelled = fit.model.output(run.input) + offset if left is None else run.position_um - left
+    time.plot(time_s, modelled[:count], color="0.15", linewidth=0.8, label="model")
     label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
     if measured is not None:
         kept = measured.trusted

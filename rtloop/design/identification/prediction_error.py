@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from rtloop.design.identification.innovations import Innovations
@@ -26,6 +27,8 @@ noise."""
 ENOUGH_POLES = 9
 """An input that can tell so many apart has no gap in its spectrum, and can tell more."""
 EVALUATIONS = 20
+Kept = slice | npt.NDArray[np.bool_]
+ALL = slice(None)
 USELESS, STEEPEST = 1e6, 1e30
 """Stand in for errors and slopes of trial models that blow up."""
 
@@ -86,11 +89,13 @@ def _grown(model: Innovations) -> Innovations:
 def refined(model: Innovations, run: Excitation) -> Innovations | None:
     """The nearest least sum of squared prediction errors: first without noise model, then with; None if unstable."""
     for noise in (False, True):
-        model = _descended(model, run, noise=noise)
-    return model if np.all(model.rates.real < 0) and _has_counterpart(model) else None
+        model = descended(model, run, noise=noise)
+    return model if np.all(model.rates.real < 0) and has_counterpart(model) else None
 
 
-def _descended(model: Innovations, run: Excitation, *, noise: bool) -> Innovations:
+def descended(model: Innovations, run: Excitation, *, noise: bool, kept: Kept = ALL) -> Innovations:
+    """Downhill from `model` to the least sum of squared errors of the samples `kept`, with or without noise model."""
+
     def errors(values: Real) -> Real:
         tried = model.unpack(values, noise=noise)
         if np.any(tried.rates.real >= 0) or (found := tried.errors(run.input, run.position_um)) is None:
@@ -104,11 +109,12 @@ def _descended(model: Innovations, run: Excitation, *, noise: bool) -> Innovatio
 
     settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
     with np.errstate(over="ignore", invalid="ignore"):
-        found = least_squares(errors, model.pack(noise=noise), jacobian, **settings)  # pyright: ignore[reportArgumentType]
+        of_kept: Any = lambda values: jacobian(values)[kept]
+        found = least_squares(lambda values: errors(values)[kept], model.pack(noise=noise), of_kept, **settings)
     return model.unpack(found.x, noise=noise)
 
 
-def _has_counterpart(model: Innovations) -> bool:
+def has_counterpart(model: Innovations) -> bool:
     """Rates stay below half the sampling rate, so that log(z) finds them again."""
     return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
 

@@ -1,0 +1,100 @@
+"""What an identification of linear dynamics says: D(s) with D(0) = 1, its modes and how well each is known.
+
+s = log(z)/T,   r_s = r_z s/(z − 1)          inverse of the zero-order hold, exact for each mode
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.inverse_hold import held_from
+from rtloop.design.identification.residuals import ResidualTests
+from rtloop.hil.modal import Complex, Real
+from rtloop.linear.realisation import system_of
+from rtloop.linear.transfer import Transfer
+from rtloop.linear.zeros import zeros_and_gain
+
+FASTEST = 14.0
+"""e^−14 is less than a millionth: a mode that is left with that by the next tick is over there."""
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A pole with its standard deviations from the covariance of the estimate."""
+
+    frequency_hz: float
+    frequency_std_hz: float
+    damping: float
+    damping_std: float
+    static_share: float
+    """|r/s| of the mode (both of a pair), relative to D(0)."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One order: rms one-step-ahead error (of the part held out, where one is), Akaike's criterion ln(V) + 2 d/N, and
+    fit to other runs (NaN: none)."""
+
+    order: int
+    rms_error_um: float
+    aic: float
+    validation_rms_um: float
+
+
+@dataclass(frozen=True)
+class DynamicsFit:
+    """D(s), D(0) = 1, with `static_gain` in position per input, and what speaks for and against it."""
+
+    transfer: Transfer
+    static_gain: float
+    modes: tuple[Mode, ...]
+    rms_error_um: float
+    fit_percent: float
+    tests: ResidualTests
+    candidates: tuple[Candidate, ...]
+    model: Innovations
+    delay_ticks: int
+    """Samples between input and position beyond the one that a held output takes; `model` comes behind them."""
+    method: str
+
+
+def transfer_of(model: Innovations) -> Transfer:
+    """D(s) of a sampled model, with D(0) = 1."""
+    discrete = model.discrete()
+    rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
+    rates, residues = _within_reach(rates, discrete.residues / model.static_gain, model.period_s)
+    modal = held_from(rates, residues, discrete.direct, model.period_s)
+    zeros, leading = zeros_and_gain(system_of(modal))
+    transfer = Transfer.from_zpk(zeros, rates, leading)
+    return Transfer.from_zpk(zeros, rates, leading / transfer.dc_gain)
+
+
+def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
+    """Poles with their standard deviations, for |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`."""
+    found, i = [], 0
+    for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
+        size, width = abs(rate), 2 if rate.imag != 0 else 1
+        part = covariance[i : i + width, i : i + width]
+        by_size = np.array([rate.real, rate.imag][:width]) / size
+        by_damping = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
+        share = width * abs(residue / (1 - image) / model.static_gain)
+        deviations = [float(np.sqrt(max(d @ part @ d, 0.0))) for d in (by_size, by_damping)]
+        found.append(
+            Mode(size / (2 * np.pi), deviations[0] / (2 * np.pi), -rate.real / size, deviations[1], float(share))
+        )
+        i += (3 if noise else 2) * width
+    return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
+
+
+def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
+    """Rates (n,) and residues (m, n) with what died away within a tick dying away FASTEST times in it, D(0) kept.
+
+    A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
+    """
+    reach: Complex = rates.copy()
+    reach.real = np.maximum(rates.real, -FASTEST / period_s)
+    static = np.expm1(reach * period_s) / np.expm1(rates * period_s)
+    return reach, residues * static

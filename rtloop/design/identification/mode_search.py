@@ -1,0 +1,88 @@
+"""The one mode more that explains most of what a model leaves: a search over frequencies and dampings.
+
+    e = (b₁ z⁻¹ + b₂ z⁻²)/(1 − 2 Re λ z⁻¹ + |λ|² z⁻²) û        pair,     e = b z⁻¹/(1 − λ z⁻¹) û        real pole
+
+For each λ of a grid the residues are least squares in closed form over the spectra of e and û, both whitened; around
+the best the grid is made finer twice (a matching pursuit, Mallat & Zhang 1993).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rtloop.hil.modal import Complex, Real
+
+DAMPINGS = np.array([0.01, 0.05, 0.25, 0.8])
+FREQUENCIES, ZOOMED, ZOOMS = 90, 9, 2
+HIGHEST = 0.9
+"""Of half the sampling rate."""
+RESOLUTION_HZ = 0.25
+"""Lines of long recordings are summed over so much."""
+LEAST_PERIODS = 5
+"""Of the slowest mode, within the recording."""
+PARAMETERS = {True: 4, False: 2}
+
+
+class Spectra:
+    """Of what is left (samples,) and of the input (samples,), whitened alike."""
+
+    def __init__(self, left: Real, driven: Real, period_s: float) -> None:
+        size = 1 << (2 * left.size - 1).bit_length()
+        spectrum = np.fft.rfft(driven, size)
+        together = max(1, int(RESOLUTION_HZ * size * period_s))
+        self._power = _blocks(np.abs(spectrum) ** 2, together)
+        self._cross = _blocks(np.conj(spectrum) * np.fft.rfft(left, size), together)
+        middles = together * np.arange(self._power.size) + (together - 1) / 2
+        self._back: Complex = np.exp(-2j * np.pi * middles / size)
+        self._period_s = period_s
+        self._variance = float(np.sum(left**2)) * size / 2 / left.size
+        self._slowest = 2 * np.pi * LEAST_PERIODS / (left.size * period_s)
+
+    def mode(self, *, pair_allowed: bool) -> complex:
+        """The rate s of the best mode; a pair's with positive imaginary part where one is allowed and worth it."""
+        top = HIGHEST * np.pi / self._period_s
+        rates = np.geomspace(self._slowest, top, FREQUENCIES)
+        real_gain, real = self._best((-rates).astype(complex))
+        if not pair_allowed:
+            return real
+        pair_gain, pair = self._best(_pairs(rates, DAMPINGS))
+        step = (top / self._slowest) ** (1 / (FREQUENCIES - 1))
+        for _ in range(ZOOMS):
+            near = abs(pair) * np.geomspace(1 / step, step, ZOOMED)
+            dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
+            pair_gain, pair = max(
+                (pair_gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda c: c[0]
+            )
+            step **= 2 / (ZOOMED - 1)
+        worth = {True: pair_gain, False: real_gain}
+        return pair if self._worth(worth, pair=True) >= self._worth(worth, pair=False) else real
+
+    def _worth(self, gains: dict[bool, float], *, pair: bool) -> float:
+        return gains[pair] - 2 * PARAMETERS[pair] * self._variance
+
+    def _best(self, rates: Complex) -> tuple[float, complex]:
+        return max(((self._explained(rate), complex(rate)) for rate in rates), key=lambda found: found[0])
+
+    def _explained(self, rate: complex) -> float:
+        """Energy of e that the best residues of this mode explain."""
+        image = np.exp(rate * self._period_s)
+        if rate.imag == 0:
+            below = self._back / (1 - image.real * self._back)
+            return float((np.conj(below) @ self._cross).real ** 2 / ((np.abs(below) ** 2) @ self._power))
+        below = 1 / (1 - 2 * image.real * self._back + abs(image) ** 2 * self._back**2)
+        weight = np.abs(below) ** 2 * self._power
+        across = np.conj(below * self._back) * self._cross
+        own, shared = weight.sum(), weight @ self._back.real
+        sides = np.array([across.sum().real, (across @ np.conj(self._back)).real])
+        return float(sides @ np.linalg.solve([[own * (1 + 1e-12), shared], [shared, own * (1 + 1e-12)]], sides))
+
+
+def _pairs(sizes: Real, dampings: Real) -> Complex:
+    return np.outer(sizes, -dampings + 1j * np.sqrt(1 - dampings**2)).ravel()
+
+
+def _blocks(lines: Any, together: int) -> Any:
+    """Sums of so many lines in turn."""
+    return np.add.reduceat(lines, np.arange(0, lines.size, together))

@@ -1,0 +1,170 @@
+"""Models of growing order from a closed loop, the order and the delay by what predicts the part held out.
+
+Every second block of the recording is held out. There a model is judged by its prediction errors A_n (x − G u − x₀),
+with one A_n for all models. Of two models the smaller is taken unless the larger one's squared errors are less by CLEAR
+standard errors of their difference (Diebold & Mariano 1995).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rtloop.design.identification.identify_delay import delayed
+from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.instrumental import (
+    Estimate,
+    Instrumented,
+    estimated,
+    left_by,
+    whitened,
+    whitening_of,
+)
+from rtloop.design.identification.markov import ARX_ORDER, with_residues
+from rtloop.design.identification.mode_search import Spectra
+from rtloop.hil.modal import Complex, Real
+
+BLOCK = 256
+REWHITENED = 3
+CLEAR = 2.5
+"""Standard errors."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An estimate behind `delay_ticks`, its squared prediction errors where they are held out, and their whole sum."""
+
+    estimate: Estimate
+    delay_ticks: int
+    squares: Real
+    total: float
+
+    @property
+    def model(self) -> Innovations:
+        """G."""
+        return self.estimate.model
+
+    @property
+    def rms_um(self) -> float:
+        """Of the part held out."""
+        return float(np.sqrt(np.mean(self.squares)))
+
+    def worse_than(self, other: Judged) -> bool:
+        """By more than chance."""
+        more = self.squares - other.squares
+        return float(more.mean()) > CLEAR * float(more.std()) / np.sqrt(more.size)
+
+
+class Final(NamedTuple):
+    """The estimate, the whitening A_n (ARX_ORDER + 1,) that it was made with, and how it is judged beside others."""
+
+    estimate: Estimate
+    whitening: Real
+    judged: Judged
+
+
+class Search:
+    """Over models of one recording; `whitening` is the noise's, as far as it is known before there is a model."""
+
+    def __init__(self, data: Instrumented, whitening: Real) -> None:
+        self._data, self._whitening, self._judging = data, whitening, whitening
+        blocks = np.arange(ARX_ORDER, data.run.input.size) // BLOCK
+        self._kept: npt.NDArray[np.bool_] = blocks % 2 == 0
+
+    def grown(self, start: Judged | None, delay_ticks: int, most: int, in_vain: int | None = None) -> list[Judged]:
+        """From `start`, or from nothing, by a mode more each, up to `most` poles, or until `in_vain` in a row do not
+        pay."""
+        data = late(self._data, delay_ticks)
+        found = [start] if start else []
+        model = start.model if start else _nothing(data.run.period_s)
+        while model.order < most and not (in_vain and len(found) > in_vain and _in_vain(found, in_vain)):
+            rate = self._next(model, data, pair_allowed=most - model.order > 1)
+            if (judged := self._judged(with_mode(model, rate), delay_ticks, fresh=True)) is None:
+                break
+            found.append(judged)
+            model = judged.model
+        if found:
+            best = min(found, key=lambda one: one.rms_um)
+            self._judging = whitening_of(left_by(best.model, data.run))
+        return [self._scored(one.estimate, delay_ticks) for one in found]
+
+    def later(self, judged: Judged) -> Judged | None:
+        """The same modes behind one sample of delay more: each begins a sample earlier behind it."""
+        model = judged.model
+        start = replace(model, residues=model.residues * model.images)
+        return self._judged(start, judged.delay_ticks + 1)
+
+    def pruned(self, judged: Judged) -> Judged:
+        """Without the modes that do not pay."""
+        modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
+        fewer = [self._judged(_without(judged.model, i), judged.delay_ticks) for i in modes]
+        best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
+        return judged if best is None or best.worse_than(judged) else self.pruned(best)
+
+    def final(self, judged: Judged) -> Final | None:
+        """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
+        data, estimate, whitening = late(self._data, judged.delay_ticks), judged.estimate, self._judging
+        for _ in range(REWHITENED):
+            whitening = whitening_of(left_by(estimate.model, data.run))
+            better = estimated(estimate.model, data, whitening)
+            if better is None or not better.settled:
+                return None
+            estimate = better
+        return Final(estimate, whitening, self._scored(estimate, judged.delay_ticks))
+
+    def _next(self, model: Innovations, data: Instrumented, *, pair_allowed: bool) -> complex:
+        left, driven = (whitened(one, self._whitening) for one in (left_by(model, data.run), data.driven))
+        left[~self._kept] = 0.0
+        return Spectra(left, driven, data.run.period_s).mode(pair_allowed=pair_allowed)
+
+    def _judged(self, start: Innovations, delay_ticks: int, *, fresh: bool = False) -> Judged | None:
+        data, whitening = late(self._data, delay_ticks), self._judging
+        if fresh:
+            start = with_residues(start, *(whitened(one, whitening) for one in (data.driven, data.run.position_um)))
+        estimate = estimated(start, data, whitening, self._kept)
+        return self._scored(estimate, delay_ticks) if estimate else None
+
+    def _scored(self, estimate: Estimate, delay_ticks: int) -> Judged:
+        errors = whitened(left_by(estimate.model, late(self._data, delay_ticks).run), self._judging)
+        return Judged(estimate, delay_ticks, errors[~self._kept] ** 2, float(np.sum(errors**2)))
+
+
+def preferred(found: list[Judged]) -> list[Judged]:
+    """Of those that settled, where any did, those of the fewest poles which are not worse than the best; first that
+    which fits all of the recording best."""
+    among = [one for one in found if one.estimate.settled] or found
+    best = min(among, key=lambda one: one.rms_um)
+    as_good = [one for one in among if not one.worse_than(best)]
+    fewest = min(one.model.order for one in as_good)
+    return sorted((one for one in as_good if one.model.order == fewest), key=lambda one: one.total)
+
+
+def late(data: Instrumented, ticks: int) -> Instrumented:
+    """The recording with its input `ticks` samples later; at rest before it."""
+    return Instrumented(delayed(data.run, ticks), delayed(replace(data.run, input=data.driven), ticks).input)
+
+
+def with_mode(model: Innovations, rate: complex) -> Innovations:
+    """One mode more, of residue 0."""
+    return _with(model, np.append(model.rates, rate), np.append(model.residues, 0.0))
+
+
+def _in_vain(found: list[Judged], last: int) -> bool:
+    best = min(found[:-last], key=lambda one: one.rms_um)
+    return not any(best.worse_than(one) for one in found[-last:])
+
+
+def _without(model: Innovations, mode: int) -> Innovations:
+    return _with(model, np.delete(model.rates, mode), np.delete(model.residues, mode))
+
+
+def _with(model: Innovations, rates: Complex, residues: Complex) -> Innovations:
+    return Innovations(model.period_s, rates.astype(complex), residues.astype(complex), np.zeros(rates.size, complex))
+
+
+def _nothing(period_s: float) -> Innovations:
+    empty = np.zeros(0, dtype=complex)
+    return Innovations(period_s, empty, empty, empty)

@@ -1,0 +1,63 @@
+"""What moves a closed loop from outside, and the part of the plant's input that follows from it.
+
+    u_k = Σ a_i u_k−i + Σ c_i r_k−i,     û = A⁻¹ C r          ARX by least squares, then simulated without its noise
+
+In a closed loop the input holds the noise of the past: C(z) puts it there. What is left in û owes nothing to the noise,
+because nobody who moved the reference knew it. û need not be the whole truth about u: as an instrument any function of
+the reference serves without bias, a poor one with more variance (Söderström & Stoica 1983, chapter 4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve
+from scipy.signal import lfilter
+
+from rtloop.design.identification.markov import ARX_ORDER, lagged
+from rtloop.design.identification.prediction_error import Excitation
+from rtloop.hil.modal import Real
+
+RIDGE = 1e-12
+"""Of the regressors' mean square: references that move little leave directions open."""
+LARGEST_IMAGE = 0.9999
+
+
+@dataclass(frozen=True)
+class LoopExcitation(Excitation):
+    """Input and position in a closed loop, not from rest, and `outside` (k, samples): what moves it from outside."""
+
+    outside: Real
+
+
+def from_rest(run: LoopExcitation) -> LoopExcitation:
+    """With every signal beginning at 0."""
+    return replace(
+        run,
+        input=run.input - run.input[0],
+        position_um=run.position_um - run.position_um[0],
+        outside=run.outside - run.outside[:, :1],
+    )
+
+
+def from_outside(run: LoopExcitation) -> Real:
+    """û (samples,) of a recording whose signals begin at 0."""
+    moved = [one for one in run.outside if np.ptp(one) > 0]
+    regressors = np.vstack([lagged((run.input,), ARX_ORDER), moved, lagged(moved, ARX_ORDER)])
+    scale = np.sqrt(np.mean(regressors**2, axis=1)) + 1e-300
+    regressors /= scale[:, None]
+    normal = regressors @ regressors.T
+    normal[np.diag_indices_from(normal)] += RIDGE * run.input.size
+    found = solve(normal, regressors @ run.input, assume_a="pos") / scale
+    driven = found[ARX_ORDER:] @ (regressors[ARX_ORDER:] * scale[ARX_ORDER:, None])
+    return np.asarray(lfilter([1.0], _stable(np.concatenate([[1.0], -found[:ARX_ORDER]])), driven), dtype=float)
+
+
+def _stable(polynomial: Real) -> Real:
+    """With the roots that do not decay drawn back into the unit circle."""
+    roots = np.roots(polynomial)
+    sizes = np.abs(roots)
+    if np.all(sizes < 1):
+        return polynomial
+    return np.asarray(np.poly(np.where(sizes > LARGEST_IMAGE, roots * LARGEST_IMAGE / sizes, roots)).real, dtype=float)

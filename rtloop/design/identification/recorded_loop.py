@@ -1,0 +1,89 @@
+"""Whether a recording is of a loop that was closed, and what moved it from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rtloop.design.identification.measured import UnsuitableData, axis_of
+from rtloop.design.identification.outside import LoopExcitation
+from rtloop.design.identification.prediction_error import Excitation
+from rtloop.hil.modal import Real
+from rtloop.recording.load import Recording, load
+from rtloop.signals import Flag, Mode
+
+State = Literal["auto", "open", "closed"]
+KNOWN = ("reference_um", "feed_um")
+NOT_AS_COMMANDED = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED | Flag.RAMPING
+
+
+@dataclass(frozen=True)
+class RecordedLoop:
+    """The longest stretch in closed loop: ticks `start` … `end`; `outside` (k, all ticks), and what it is named.
+
+    In an imported recording all of them are those of the drive, one later than those of the position.
+    """
+
+    start: int
+    end: int
+    names: tuple[str, ...]
+    outside: Real
+    limited: int | None
+    """First tick of it that did not get what the command asked for."""
+
+    def excitation(self, whole: Excitation) -> LoopExcitation:
+        """The stretch of a recording, with what moved it."""
+        ticks = slice(self.start, self.end)
+        return LoopExcitation(
+            whole.name, whole.input[ticks], whole.position_um[ticks], whole.period_s, self.outside[:, ticks]
+        )
+
+    def require_commands_obeyed(self, name: str) -> None:
+        """Raise UnsuitableData where the recorded command is not what the plant was given."""
+        if self.limited is not None:
+            raise UnsuitableData(
+                f"{name}: the command was limited at tick {self.limited}, and is not what the plant was given: "
+                "--input drive, or hysteresis, takes what was"
+            )
+
+
+def recorded_loop(
+    path: Path, axis: str | None = None, state: State = "auto", names: Sequence[str] = ()
+) -> RecordedLoop | None:
+    """None of a loop that was open: what `state` says, or else the recorded mode; without one it was open.
+
+    `names` are the signals that moved it from outside, by default the axis's reference and feed. Raises
+    RecordingError, UnsuitableData.
+    """
+    recording = load(path)
+    closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)
+    if state == "open" or (state == "auto" and not np.any(closed)):
+        return None
+    known = tuple(names) or tuple(f"{axis_of(recording, axis, path)}_{name}" for name in KNOWN)
+    held = tuple(name for name in known if name in recording)
+    if not held or (names and len(held) < len(known)):
+        missing = ", ".join(name for name in known if name not in recording)
+        raise UnsuitableData(
+            f"{path}: no excitation from outside: it holds no {missing}; --outside names signals that moved the loop"
+        )
+    skipped = int("imported" in recording.header)
+    outside, closed = np.array(recording.read(*held))[:, skipped:], closed[skipped:]
+    start, end = _longest(closed) if np.any(closed) else (0, outside.shape[1])
+    return RecordedLoop(start, end, held, outside, _first_limited(recording, start, end))
+
+
+def _first_limited(recording: Recording, start: int, end: int) -> int | None:
+    if "flags" not in recording:
+        return None
+    limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(NOT_AS_COMMANDED))
+    return start + int(limited[0]) if limited.size else None
+
+
+def _longest(closed: Real) -> tuple[int, int]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
+    start, end = edges[np.argmax(np.diff(edges, axis=1))]
+    return int(start), int(end)

@@ -1,0 +1,86 @@
+"""Dynamics from closed loops with noise that comes back, against the poles that scipy simulates; what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtloop.design.identification.identify_in_loop import identified_dynamics, identify_in_loop
+from rtloop.design.identification.measured import UnsuitableData
+from rtloop.design.identification.outside import LoopExcitation, from_outside
+from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
+
+SAMPLES = 12_000
+HZ, DAMPING = 600.0, 0.01
+ONE_MODE = ((HZ, DAMPING, 1.0),)
+
+
+def one_mode() -> TrueLoop:
+    """A loop that damps its only mode, behind one sample of delay."""
+    plain = TrueLoop(ONE_MODE, 1, (np.ones(1), np.ones(1)))
+    return TrueLoop(ONE_MODE, 1, damping_controller(plain, 3.0, 20.0))
+
+
+def inside(loop: TrueLoop, reference: np.ndarray, noise: np.ndarray, start: int = 0) -> LoopExcitation:
+    """What is recorded of it, from tick `start` on."""
+    found = {name: one[start:] for name, one in loop.in_loop(reference, noise).items()}
+    return LoopExcitation(
+        "drawn", found["command_um"], found["position_um"], PERIOD_S, found["reference_um"][np.newaxis]
+    )
+
+
+def test_order_delay_and_modes_of_a_drawn_loop_are_found() -> None:
+    random = np.random.default_rng(5)
+    loop = drawn_loop(random)
+    noise = coloured(random, SAMPLES, loop.modes[0][0], 0.05)
+    fit = identified_dynamics(inside(loop, motion("sweep", random, SAMPLES, 6.0), noise), largest_order=6)
+    assert (fit.model.order, fit.delay_ticks) == (4, loop.delay_ticks)
+    assert fit.method.startswith("refined instrumental variables")
+    for mode, (hz, damping, _) in zip(fit.modes, loop.modes, strict=True):
+        assert mode.frequency_hz == pytest.approx(hz, rel=0.002)
+        assert mode.damping == pytest.approx(damping, rel=0.1)
+        assert abs(mode.frequency_hz - hz) < 4 * mode.frequency_std_hz
+        assert abs(mode.damping - damping) < 4 * mode.damping_std
+    assert fit.static_gain == pytest.approx(1.0, abs=0.02)
+    assert fit.transfer.dc_gain == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_loop_that_moved_before_the_recording_began_is_as_good() -> None:
+    loop, random = one_mode(), np.random.default_rng(4)
+    reference = 7.0 + motion("steps", random, 9000, 10.0)
+    run = inside(loop, reference, coloured(random, 9000, 640.0, 0.02), start=1037)
+    (mode,) = identify_in_loop(run, order=2, delay_ticks=1).modes
+    assert abs(mode.frequency_hz - HZ) < 4 * mode.frequency_std_hz
+    assert mode.frequency_hz == pytest.approx(HZ, rel=0.002)
+    assert mode.damping == pytest.approx(DAMPING, rel=0.1)
+
+
+def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
+    loop, random = one_mode(), np.random.default_rng(6)
+    reference = motion("multisine", random, SAMPLES, 3.0)
+    noise = coloured(random, SAMPLES, 640.0, 0.1)
+    run = inside(loop, reference, noise)
+    clean = loop.in_loop(reference, np.zeros(SAMPLES))["command_um"]
+    driven = from_outside(run)
+    assert np.corrcoef(driven, clean)[0, 1] > 0.98
+    assert np.corrcoef(run.input, clean)[0, 1] < 0.9
+
+
+@pytest.mark.parametrize(
+    ("reference", "samples", "says"),
+    [
+        (np.zeros, 4000, "no excitation from outside: the reference stands still"),
+        (np.ones, 1500, "too short: 1500 ticks in closed loop"),
+        (lambda n: 0.3 * np.sin(2 * np.pi * 1.0 * PERIOD_S * np.arange(n)), 4000, "excitation from outside"),
+    ],
+)
+def test_what_is_not_enough_is_refused(reference, samples: int, says: str) -> None:
+    noise = coloured(np.random.default_rng(8), samples, 640.0, 0.05)
+    with pytest.raises(UnsuitableData, match=says):
+        identify_in_loop(inside(one_mode(), reference(samples), noise))
+
+
+def test_a_closed_loops_order_is_chosen_on_what_is_held_out_alone() -> None:
+    run = inside(one_mode(), np.zeros(4000), np.zeros(4000))
+    with pytest.raises(ValueError, match="criterion 'aic'"):
+        identified_dynamics(run, criterion="aic")
