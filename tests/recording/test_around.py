@@ -13,12 +13,14 @@ from mcap_protobuf.decoder import DecoderFactory
 from rtloop.recording.capture.conditions import Conditions, comparison_of, unknown_signal
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file import layout
 from rtloop.recording.file.overview import uncovered
 from rtloop.recording.file.recover import recover
 from rtloop.recording.load import Recording, load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.bands import read_bands
 from rtloop.recording.views.summary import summarise
+from tests.recording import rewriting
 from tests.recording.around import SECOND, STEP, TICKS, TRIP, Selected, around, kept_seconds, recorded_whole
 
 ON = ("trip", "abs(x_drive_v) >= 6.5")
@@ -202,6 +204,22 @@ def test_the_end_of_a_loop_that_failed_is_kept(tmp_path: Path):
     recording = load(tmp_path / "run.mcap")
     assert recording["tick"][-1] == 12 * SECOND + 76
     assert seconds_of(recording)[-3:] == [10, 11, 12]
+
+
+def test_it_is_read_as_a_file_of_ones_own(selected: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(layout, "Rewritten", None)
+    assert replay(load(selected)).identical
+
+
+def test_another_tool_may_write_it_anew(selected: Path, tmp_path: Path):
+    anew, own = (
+        load(rewriting.write(tmp_path / "anew.mcap", rewriting.messages(selected), chunk_size=20_000)),
+        load(selected),
+    )
+    assert (anew.skipped, len(anew)) == (own.skipped, len(own))
+    np.testing.assert_array_equal(anew.overview["x_drive_v"].most, own.overview["x_drive_v"].most)
+    report = replay(anew)
+    assert (report.identical, report.gaps) == (True, [])
 
 
 def test_a_damaged_overview_is_a_loss_and_said(selected: Path, tmp_path: Path):

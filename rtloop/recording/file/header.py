@@ -21,6 +21,9 @@ from rtloop.recording.file.checked import Malformed, header_from, require_column
 from rtloop.recording.file.container import DamagedChunk, pack_records, split_records
 from rtloop.recording.file.contents import split_messages
 
+EVERY = [(one.id, one.topic) for one in format.channels()]
+OWN_CHANNELS = (EVERY, [*EVERY, (format.OVERVIEW, format.OVERVIEW_TOPIC)])
+"""Of a recording of every tick, and of one around events."""
 OF_A_RUN = ("created_unix_ns", "name", "columns")
 """What is the same in the headers of all files of a run."""
 
@@ -38,7 +41,7 @@ def own_header(content: bytes) -> bytes:
         ]
     except (struct.error, ValueError, McapError):
         raise DamagedChunk("its channels cannot be read") from None
-    if [(one.id, one.topic) for one in found] != [(one.id, one.topic) for one in format.channels()]:
+    if [(one.id, one.topic) for one in found] not in OWN_CHANNELS:
         raise DamagedChunk("its channels are not those of a recording")
     return messages[0].payload
 
