@@ -9,8 +9,23 @@ from typing import Any, Literal
 import numpy as np
 
 from rtloop.configuration.file import load as load_configuration
-from rtloop.design.identification.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.identify_delay import delayed
+from rtloop.design.identification.dynamics.identify_dynamics import Criterion
+from rtloop.design.identification.dynamics.identify_in_loop import identified_dynamics
+from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
+from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, recorded_loop
 from rtloop.design.identification.frequency_response import agreement, measured_response
+from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
+from rtloop.design.identification.hysteresis.identify_hysteresis import (
+    HysteresisFit,
+    Placement,
+    Weights,
+    begins_at_rest,
+    identify_hysteresis,
+    unexplained_um,
+)
+from rtloop.design.identification.hysteresis.judgement import Judgement, judged_from_rest
 from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_of,
@@ -21,22 +36,7 @@ from rtloop.design.identification.identified import (
     with_gain,
     write_new,
 )
-from rtloop.design.identification.identify_delay import delayed
-from rtloop.design.identification.identify_dynamics import Criterion
-from rtloop.design.identification.identify_from_parts import PartsFit, identify_from_parts
-from rtloop.design.identification.identify_hysteresis import (
-    HysteresisFit,
-    Placement,
-    Weights,
-    begins_at_rest,
-    identify_hysteresis,
-    unexplained_um,
-)
-from rtloop.design.identification.identify_in_loop import identified_dynamics
-from rtloop.design.identification.judgement import Judgement, judged_from_rest
 from rtloop.design.identification.measured import Measured, UnsuitableData, measured
-from rtloop.design.identification.prediction_error import LARGEST_ORDER, Excitation
-from rtloop.design.identification.recorded_loop import RecordedLoop, State, recorded_loop
 from rtloop.errors import ConfigError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import compensated, residual_operator

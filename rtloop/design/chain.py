@@ -19,6 +19,8 @@ import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import ModelOptions
+from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
 from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_section,
@@ -26,8 +28,6 @@ from rtloop.design.identification.identified import (
     model_values,
     with_gain,
 )
-from rtloop.design.identification.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
-from rtloop.design.identification.identify_hysteresis import HysteresisFit, identify_hysteresis
 from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
 from rtloop.design.synthesis.section import controller_section
 from rtloop.design.synthesis.specification import DesignOptions

@@ -20,9 +20,9 @@ from typing import IO, Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, RtloopError
-from rtloop.interchange.groups import BYTES_AT_MOST, rows_of
+from rtloop.interchange.formats.groups import BYTES_AT_MOST, rows_of
+from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.reading import read_here
-from rtloop.interchange.table import Table, UnreadableData
 
 MEMORY_BYTES = 6 * BYTES_AT_MOST
 """Of address space: libraries, what is read, and the copies that are made on the way."""

@@ -18,10 +18,10 @@ import numpy as np
 from rtloop import __version__
 from rtloop.hil.modal import Real
 from rtloop.interchange.aside import read_table
-from rtloop.interchange.groups import rows_of
+from rtloop.interchange.formats.groups import rows_of
+from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import Column, axes_of, bare, column_of, find_column, own_name, signal_name, unit_in
 from rtloop.interchange.sampling import OWN, Sampling, came_from_a_recording, sampling, time_column
-from rtloop.interchange.table import Table, UnreadableData
 from rtloop.interchange.wanted import NAME, Wanted
 from rtloop.recording.file import format
 from rtloop.recording.file.contents import Message

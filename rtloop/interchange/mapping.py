@@ -17,7 +17,7 @@ from typing import NamedTuple
 from unicodedata import normalize
 
 from rtloop.hil.modal import Real
-from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scaled
 from rtloop.recording.load import unit_of
 from rtloop.signals import COMMON, DRIVE, PER_AXIS

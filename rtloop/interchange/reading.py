@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rtloop.interchange.from_csv import read_csv
-from rtloop.interchange.from_hdf5 import read_hdf5
-from rtloop.interchange.from_mat import HDF5_AT, HDF5_MAGIC, read_mat
-from rtloop.interchange.from_npz import read_npz
-from rtloop.interchange.from_parquet import read_parquet
-from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.formats.from_csv import read_csv
+from rtloop.interchange.formats.from_hdf5 import read_hdf5
+from rtloop.interchange.formats.from_mat import HDF5_AT, HDF5_MAGIC, read_mat
+from rtloop.interchange.formats.from_npz import read_npz
+from rtloop.interchange.formats.from_parquet import read_parquet
+from rtloop.interchange.formats.table import Table, UnreadableData
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
@@ -27,7 +27,7 @@ def read_here(path: Path, group: str | None = None) -> Table:
     except OSError as error:
         raise UnreadableData(f"{path}: {error.strerror}") from None
     if head.startswith(MCAP_MAGIC):
-        from rtloop.interchange.from_mcap import read_mcap
+        from rtloop.interchange.formats.from_mcap import read_mcap
 
         return read_mcap(path, group)
     if head.startswith(b"MATLAB") or path.suffix.lower() == ".mat":

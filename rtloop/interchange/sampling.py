@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.interchange.groups import TIMES, rows_of
+from rtloop.interchange.formats.groups import TIMES, rows_of
+from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import bare, column_of, unit_in
-from rtloop.interchange.table import Table, UnreadableData
 from rtloop.interchange.units import UnknownUnit, factor_between, scaled
 from rtloop.recording.file.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 from rtloop.recording.file.ticks import LARGEST

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.design.identification.identify_dynamics import DynamicsFit, identify_dynamics
-from rtloop.design.identification.identify_hysteresis import HysteresisFit, identify_hysteresis
+from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, identify_dynamics
+from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
 from rtloop.design.identification.measured import Measured
-from rtloop.design.identification.prediction_error import Excitation
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.options import (
     ConverterOptions,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rtloop.design.identification.identify_dynamics import identify_dynamics
-from rtloop.design.identification.prediction_error import Excitation
+from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
+from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import build_rig
 from tests.design.rigs import _record

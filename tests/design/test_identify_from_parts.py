@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.design.identification.identify_from_parts import identify_from_parts
+from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.hysteresis.unknown_memory import known_from, known_stroke_v, missing_stroke
 from tests.design.other_truths import (

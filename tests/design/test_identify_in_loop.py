@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtloop.design.identification.identify_in_loop import identified_dynamics, identify_in_loop
+from rtloop.design.identification.dynamics.identify_in_loop import identified_dynamics, identify_in_loop
+from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.design.identification.outside import LoopExcitation, from_outside
 from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
 
 SAMPLES = 12_000

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.interchange.from_csv import read_csv
-from rtloop.interchange.table import UnreadableData
+from rtloop.interchange.formats.from_csv import read_csv
+from rtloop.interchange.formats.table import UnreadableData
 
 TIME = np.arange(300) * 1e-4
 VOLTS = np.sin(2 * np.pi * 50 * TIME)

@@ -18,8 +18,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from rtloop.interchange.from_mcap import read_mcap
-from rtloop.interchange.table import UnreadableData
+from rtloop.interchange.formats.from_mcap import read_mcap
+from rtloop.interchange.formats.table import UnreadableData
 
 START_NS, STEP_NS, ROWS = 1_700_000_000_000_000_123, 99_999, 400
 TRUTH = np.random.default_rng(5).standard_normal((ROWS, 3))

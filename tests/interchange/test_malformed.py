@@ -12,9 +12,10 @@ import pytest
 import scipy.io
 from scipy.io import savemat
 
-from rtloop.interchange import aside, from_mat
+from rtloop.interchange import aside
+from rtloop.interchange.formats import from_mat
+from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.reading import read_here
-from rtloop.interchange.table import UnreadableData
 
 HUGE = 2 << 30
 MEMORY_MIB = 400

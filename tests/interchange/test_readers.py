@@ -11,8 +11,8 @@ import pandas
 import pytest
 from scipy.io import savemat
 
+from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.reading import read_here
-from rtloop.interchange.table import Table, UnreadableData
 from tests.interchange.controldesk import write_controldesk
 
 TIME = np.arange(500) * 1e-4

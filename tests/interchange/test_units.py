@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rtloop.errors import ConfigError
+from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import axes_of, column_of, own_name, signal_name
-from rtloop.interchange.table import Table, UnreadableData
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit
 from rtloop.interchange.wanted import Wanted, mapping_beside, read_mapping, wanted_by
 

@@ -160,7 +160,7 @@ ORDERS: dict[str, Callable[[list[Said]], list[Said]]] = {
 @pytest.mark.parametrize("how", ORDERS)
 def test_in_whatever_order(run: Run, tmp_path: Path, how: str, chunk_size: int, monkeypatch: pytest.MonkeyPatch):
     if chunk_size < 1 << 20 and how != "anyhow":  # each chunk is taken by itself; but for that it needs its order
-        monkeypatch.setattr("rtloop.recording.foreign.stretches.STRETCH_BYTES", 1)
+        monkeypatch.setattr("rtloop.recording.file.foreign.stretches.STRETCH_BYTES", 1)
     path = write(tmp_path / "anew.mcap", ORDERS[how](run.said), chunk_size=chunk_size)
     require_same(path, run)
     found = [cut(one, 500, 800, tmp_path / f"{i}.mcap") for i, one in enumerate((run.path, path))]
@@ -175,7 +175,7 @@ def test_in_whatever_order(run: Run, tmp_path: Path, how: str, chunk_size: int, 
 def test_ticks_in_no_order_are_refused_with_what_puts_them_in_order(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("rtloop.recording.foreign.stretches.STRETCH_BYTES", 1)
+    monkeypatch.setattr("rtloop.recording.file.foreign.stretches.STRETCH_BYTES", 1)
     path = write(tmp_path / "anew.mcap", ORDERS["anyhow"](run.said), chunk_size=20_000)
     with pytest.raises(RecordingError, match=r"in no order.*`mcap sort`"):
         load(path)
@@ -465,7 +465,7 @@ def test_two_gigabytes_of_nothing(run: Run, tmp_path: Path, opcode: int, said: l
 
 def test_runs_of_equal_messages_are_split_where_they_differ():
     """The one place that looks at many messages at once, against a reader that takes one after the other."""
-    from rtloop.recording.foreign.stretches import Topics, runs
+    from rtloop.recording.file.foreign.stretches import Topics, runs
 
     random = Rng(3)
     topics = Topics()

@@ -28,14 +28,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.commands.identify import dynamics_report
-from rtloop.design.identification.dynamics_fit import Mode
-from rtloop.design.identification.identify_delay import delayed
-from rtloop.design.identification.identify_in_loop import identify_in_loop
-from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.markov import with_residues
+from rtloop.design.identification.dynamics.dynamics_fit import Mode
+from rtloop.design.identification.dynamics.identify_delay import delayed
+from rtloop.design.identification.dynamics.identify_in_loop import identify_in_loop
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.markov import with_residues
+from rtloop.design.identification.dynamics.outside import LoopExcitation
+from rtloop.design.identification.dynamics.prediction_error import Excitation, descended, refined
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.design.identification.outside import LoopExcitation
-from rtloop.design.identification.prediction_error import Excitation, descended, refined
 from tests.design.coloured_loops import MOTIONS, PERIOD_S, TrueLoop, coloured, drawn_loop, motion
 from tests.design.measured_loops import TrueLoop as ClosedLoop
 from tests.recording.real_loop import record

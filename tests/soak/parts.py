@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.design.identification.identify_from_parts import PartsFit, identify_from_parts
+from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-from rtloop.design.identification.identify_from_parts import identify_from_parts
+from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from tests.design.other_truths import preisach
 from tests.design.test_identify_from_parts import recorded
 

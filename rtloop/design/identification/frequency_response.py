@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import csd, welch
 
-from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
+from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.design.identification.outside import LoopExcitation, from_outside, from_rest
-from rtloop.design.identification.prediction_error import Excitation
 from rtloop.hil.modal import Complex, Real
 
 LEAST_COHERENCE = 0.95

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from rtloop import __version__
 from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
-from rtloop.design.identification.dynamics_fit import DynamicsFit
-from rtloop.design.identification.identify_hysteresis import HysteresisFit
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
 from rtloop.errors import ConfigError, OutputError

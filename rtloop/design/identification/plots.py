@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.design.identification.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.instrumental import left_by
+from rtloop.design.identification.dynamics.outside import LoopExcitation
+from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
-from rtloop.design.identification.identify_hysteresis import HysteresisFit
-from rtloop.design.identification.instrumental import left_by
-from rtloop.design.identification.judgement import Judgement
-from rtloop.design.identification.outside import LoopExcitation
-from rtloop.design.identification.prediction_error import Excitation
+from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
+from rtloop.design.identification.hysteresis.judgement import Judgement
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import Residual, compensated

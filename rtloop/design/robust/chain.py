@@ -20,7 +20,7 @@ from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
 from rtloop.design.chain import Stage, text_with
-from rtloop.design.identification.identify_hysteresis import unexplained_um
+from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
 from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.robust.search import Progress, Robust, robust_controller

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtloop.design.identification.markov import ARX_ORDER, lagged
-from rtloop.design.identification.prediction_error import WORTH, Excitation, model_at_gap
+from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
+from rtloop.design.identification.dynamics.prediction_error import WORTH, Excitation, model_at_gap
 from rtloop.hil.modal import Real
 
 MOST_TICKS = 5

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.identify_delay import delayed
-from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.instrumental import (
+from rtloop.design.identification.dynamics.identify_delay import delayed
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.instrumental import (
     Estimate,
     Instrumented,
     estimated,
@@ -23,8 +23,8 @@ from rtloop.design.identification.instrumental import (
     whitened,
     whitening_of,
 )
-from rtloop.design.identification.markov import ARX_ORDER, with_residues
-from rtloop.design.identification.mode_search import Spectra
+from rtloop.design.identification.dynamics.markov import ARX_ORDER, with_residues
+from rtloop.design.identification.dynamics.mode_search import Spectra
 from rtloop.hil.modal import Complex, Real
 
 BLOCK = 256

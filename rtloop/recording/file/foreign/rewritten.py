@@ -24,10 +24,10 @@ from rtloop.recording.file.checked import final_event
 from rtloop.recording.file.chunks import Entry, Source
 from rtloop.recording.file.container import DamagedChunk, pack_message
 from rtloop.recording.file.contents import Message
+from rtloop.recording.file.foreign.fields import Undecodable, encoding
+from rtloop.recording.file.foreign.stretches import Run, Stretch, Topics, contents, halves, runs, stretches
+from rtloop.recording.file.foreign.ticks import TickDecoder
 from rtloop.recording.file.header import absent, merged_header
-from rtloop.recording.foreign.fields import Undecodable, encoding
-from rtloop.recording.foreign.stretches import Run, Stretch, Topics, contents, halves, runs, stretches
-from rtloop.recording.foreign.ticks import TickDecoder
 
 NUMBERS = {channel.topic: channel.id for channel in format.channels()} | {format.OVERVIEW_TOPIC: format.OVERVIEW}
 SLOW = (format.EVENTS, format.LAW, format.OVERVIEW)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.interchange.groups import Found
-from rtloop.interchange.table import UnreadableData
+from rtloop.interchange.formats.groups import Found
+from rtloop.interchange.formats.table import UnreadableData
 
 DEEPEST = 32
 OBJECTS_AT_MOST = 100_000

@@ -16,11 +16,10 @@ from typing import Literal
 
 import numpy as np
 
-from rtloop.design.identification.dynamics_fit import Candidate, DynamicsFit, modes_of, transfer_of
-from rtloop.design.identification.identify_delay import delayed, first_part, held_out_from, identified_delay
-from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.measured import UnsuitableData
-from rtloop.design.identification.prediction_error import (
+from rtloop.design.identification.dynamics.dynamics_fit import Candidate, DynamicsFit, modes_of, transfer_of
+from rtloop.design.identification.dynamics.identify_delay import delayed, first_part, held_out_from, identified_delay
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.prediction_error import (
     LARGEST_ORDER,
     WORTH,
     Excitation,
@@ -29,7 +28,8 @@ from rtloop.design.identification.prediction_error import (
     refined,
     rms_error,
 )
-from rtloop.design.identification.residuals import residual_tests
+from rtloop.design.identification.dynamics.residuals import residual_tests
+from rtloop.design.identification.measured import UnsuitableData
 from rtloop.hil.modal import Real
 
 Criterion = Literal["aic", "held-out", "validation"]

@@ -9,10 +9,10 @@ import numpy as np
 
 from rtloop.recording.file import format
 from rtloop.recording.file.container import MESSAGE_HEAD, DamagedChunk
+from rtloop.recording.file.foreign.container import LARGEST_BYTES
+from rtloop.recording.file.foreign.fields import Fields, Undecodable, decoder, message_class
+from rtloop.recording.file.foreign.stretches import Run, Topics
 from rtloop.recording.file.ticks import LARGEST_NS
-from rtloop.recording.foreign.container import LARGEST_BYTES
-from rtloop.recording.foreign.fields import Fields, Undecodable, decoder, message_class
-from rtloop.recording.foreign.stretches import Run, Topics
 from rtloop.signals import DEADLINE, TICK
 
 Rows = np.ndarray[Any, Any]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.interchange.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
-from rtloop.interchange.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
-from rtloop.interchange.table import ROWS_AT_MOST, Table, UnreadableData
+from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
+from rtloop.interchange.formats.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
+from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
 
 ROWS_AT_ONCE = 1 << 16
 SIGNS = {None: "blanks", "\t": "tabs"}

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import hankel
 from scipy.signal import lfilter
 
-from rtloop.design.identification.innovations import Innovations
+from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.hil.modal import Complex, Real
 
 ARX_ORDER = 40

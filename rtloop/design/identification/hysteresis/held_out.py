@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.memory_fit import Common, Limits, Own, Stretch, errors, fit_memory
+from rtloop.design.identification.hysteresis.memory_fit import Common, Limits, Own, Stretch, errors, fit_memory
 from rtloop.hil.modal import Real
 
 PIECES, FOLDS = 40, 10

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.inverse_hold import held_from
-from rtloop.design.identification.residuals import ResidualTests
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.inverse_hold import held_from
+from rtloop.design.identification.dynamics.residuals import ResidualTests
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import system_of
 from rtloop.linear.transfer import Transfer

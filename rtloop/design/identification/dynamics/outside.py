@@ -15,8 +15,8 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.signal import lfilter
 
-from rtloop.design.identification.markov import ARX_ORDER, lagged
-from rtloop.design.identification.prediction_error import Excitation
+from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
+from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.hil.modal import Real
 
 RIDGE = 1e-12

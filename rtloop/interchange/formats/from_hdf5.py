@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rtloop.interchange.groups import Found, one_of
-from rtloop.interchange.hdf5 import collect
-from rtloop.interchange.table import Table
+from rtloop.interchange.formats.groups import Found, one_of
+from rtloop.interchange.formats.hdf5 import collect
+from rtloop.interchange.formats.table import Table
 
 
 def read_hdf5(path: Path, group: str | None = None) -> Table:

@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from rtloop.design.identification.hysteresis.memory_fit import Stretch
 from rtloop.design.identification.measured import Measured
-from rtloop.design.identification.memory_fit import Stretch
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
 

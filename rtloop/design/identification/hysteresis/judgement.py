@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.held_out import fitted, held_out, judged, nearest, own_of
-from rtloop.design.identification.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
+from rtloop.design.identification.hysteresis.held_out import fitted, held_out, judged, nearest, own_of
+from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
+from rtloop.design.identification.hysteresis.memory_fit import Common, Limits, Own, Stretch, errors, output
+from rtloop.design.identification.hysteresis.stretches import Kept, Term, kept, stretch
 from rtloop.design.identification.measured import Measured
-from rtloop.design.identification.memory_fit import Common, Limits, Own, Stretch, errors, output
-from rtloop.design.identification.stretches import Kept, Term, kept, stretch
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.unknown_memory import known_from, settled_memory
 

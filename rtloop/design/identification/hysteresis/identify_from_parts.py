@@ -14,17 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.held_out import held_out
-from rtloop.design.identification.identify_hysteresis import (
+from rtloop.design.identification.hysteresis.held_out import held_out
+from rtloop.design.identification.hysteresis.identify_hysteresis import (
     HysteresisFit,
     Placed,
     Placement,
     Weights,
     placed_thresholds,
 )
-from rtloop.design.identification.judgement import Judgement, Trial, Work, judgements_of, prepared, prepared_work
+from rtloop.design.identification.hysteresis.judgement import (
+    Judgement,
+    Trial,
+    Work,
+    judgements_of,
+    prepared,
+    prepared_work,
+)
+from rtloop.design.identification.hysteresis.stretches import Term
 from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
-from rtloop.design.identification.stretches import Term
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output, turning_points

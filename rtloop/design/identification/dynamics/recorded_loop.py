@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from rtloop.design.identification.dynamics.outside import LoopExcitation
+from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.measured import UnsuitableData, axis_of
-from rtloop.design.identification.outside import LoopExcitation
-from rtloop.design.identification.prediction_error import Excitation
 from rtloop.hil.modal import Real
 from rtloop.recording.load import Recording, load
 from rtloop.signals import Flag, Mode

@@ -11,16 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtloop.design.identification.dynamics_fit import Candidate, DynamicsFit, Mode, modes_of, transfer_of
-from rtloop.design.identification.identify_delay import MOST_TICKS, delayed
-from rtloop.design.identification.identify_dynamics import Criterion, identify_dynamics
-from rtloop.design.identification.instrumental import Instrumented, left_by, whitened, whitening_of
-from rtloop.design.identification.markov import ARX_ORDER
+from rtloop.design.identification.dynamics.dynamics_fit import Candidate, DynamicsFit, Mode, modes_of, transfer_of
+from rtloop.design.identification.dynamics.identify_delay import MOST_TICKS, delayed
+from rtloop.design.identification.dynamics.identify_dynamics import Criterion, identify_dynamics
+from rtloop.design.identification.dynamics.instrumental import Instrumented, left_by, whitened, whitening_of
+from rtloop.design.identification.dynamics.markov import ARX_ORDER
+from rtloop.design.identification.dynamics.nested_models import Final, Judged, Search, late, preferred
+from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
+from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
+from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.design.identification.nested_models import Final, Judged, Search, late, preferred
-from rtloop.design.identification.outside import LoopExcitation, from_outside, from_rest
-from rtloop.design.identification.prediction_error import LARGEST_ORDER, Excitation
-from rtloop.design.identification.residuals import residual_tests
 
 METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER

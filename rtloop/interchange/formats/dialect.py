@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtloop.interchange.table import UnreadableData
+from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.units import is_unit
 
 SAMPLE_BYTES = 1 << 16

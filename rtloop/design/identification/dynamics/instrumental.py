@@ -21,9 +21,9 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.signal import lfilter
 
-from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.markov import ARX_ORDER, lagged
-from rtloop.design.identification.prediction_error import ALL, Excitation, Kept, descended, has_counterpart
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
+from rtloop.design.identification.dynamics.prediction_error import ALL, Excitation, Kept, descended, has_counterpart
 from rtloop.hil.modal import Real
 
 STEPS, HALVINGS = 40, 12

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.interchange.groups import Found, one_of
-from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.formats.groups import Found, one_of
+from rtloop.interchange.formats.table import Table, UnreadableData
 
 
 def read_parquet(path: Path) -> Table:

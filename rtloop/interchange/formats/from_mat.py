@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.interchange.groups import BYTES_AT_MOST, Found, one_of, unique
-from rtloop.interchange.hdf5 import matlab_variables
-from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.formats.groups import BYTES_AT_MOST, Found, one_of, unique
+from rtloop.interchange.formats.hdf5 import matlab_variables
+from rtloop.interchange.formats.table import Table, UnreadableData
 
 HEADER_BYTES = 128
 MATRIX, COMPRESSED = 14, 15

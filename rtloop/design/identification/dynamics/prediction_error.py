@@ -13,8 +13,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from rtloop.design.identification.innovations import Innovations
-from rtloop.design.identification.markov import CLEAR, HANKEL_ROWS, LIKELY, Guesses, impulse_response, with_residues
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.markov import (
+    CLEAR,
+    HANKEL_ROWS,
+    LIKELY,
+    Guesses,
+    impulse_response,
+    with_residues,
+)
 from rtloop.design.identification.measured import noise_of
 from rtloop.hil.modal import Real
 

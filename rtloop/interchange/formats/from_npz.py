@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rtloop.interchange.groups import Found, one_of
-from rtloop.interchange.table import Table, UnreadableData
+from rtloop.interchange.formats.groups import Found, one_of
+from rtloop.interchange.formats.table import Table, UnreadableData
 
 WORKBOOK = "xl/workbook.xml"
 

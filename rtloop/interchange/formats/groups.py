@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.interchange.table import ROWS_AT_MOST, Table, UnreadableData
+from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
 from rtloop.values import counted
 
 BYTES_AT_MOST = 1 << 30
