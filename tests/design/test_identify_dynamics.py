@@ -194,3 +194,9 @@ def test_validation_without_a_recording_to_validate_on_is_a_contradiction() -> N
     run = Excitation("made", step_drive(), step_drive(), FAST_S)
     with pytest.raises(ValueError, match="criterion 'validation': another recording is needed"):
         identify_dynamics(run, criterion="validation")
+
+
+def test_a_model_of_no_numbers_predicts_nothing() -> None:
+    """A descent may try one; it is told that this leads nowhere."""
+    model = Innovations(1e-4, np.array([-100.0 + 0j]), np.array([1.0 + 0j]), np.array([np.inf + 0j]), 0.0)
+    assert model.errors(np.ones(10), np.ones(10)) is None

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from rtloop.cli import main
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from rtloop.design.identification.dynamics.identify_dynamics import _within_reach
+from rtloop.design.identification.dynamics.dynamics_fit import _within_reach
 from rtloop.design.robust import certificate
 from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions

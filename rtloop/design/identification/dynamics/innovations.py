@@ -79,7 +79,9 @@ class Innovations:
         return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
-        """ε (samples,); None where the predictor is unstable."""
+        """ε (samples,); None where the predictor is unstable, or numbers are none."""
+        if not np.all(np.isfinite([*self.images, *self.noise_gains])):
+            return None
         poles = self.predictor_poles()
         if np.any(np.abs(poles) >= 1):
             return None
