@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from scipy.io import loadmat, savemat
 
-from rtloop.cli import main
 from rtloop.interchange import aside
 from rtloop.interchange.reading import read_here
 from rtloop.recording.load import load
+from tests.asked import answer, run
 from tests.interchange.controldesk import read_v5, write_controldesk
 
 DOCUMENT = Path(__file__).parents[2] / "docs/data.md"
@@ -30,18 +27,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("rtloop.commands.importing.read_table", read_here)
     return tmp_path
-
-
-def run(*arguments: Any) -> Result:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
-
-
-def answer(*arguments: Any, code: int = 0) -> dict[str, Any]:
-    result = run(*arguments, "--json")
-    assert result.exit_code == code, result.output
-    return json.loads(result.stdout)
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from mcap.reader import make_reader
 
 from rtloop.cli import main
 from rtloop.recording.load import load
+from tests.asked import answer, run
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import PAPER, changed, record, scheduled
 from tests.recording.tamper import rewrite
@@ -31,18 +31,6 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return record(tmp_path_factory.mktemp("parts") / "run.mcap", PAPER, TICKS, rotate_s=1.0)
-
-
-def run(*arguments: Any) -> Result:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
-
-
-def answer(*arguments: Any, code: int = 0) -> dict[str, Any]:
-    result = run(*arguments, "--json")
-    assert result.exit_code == code, result.output
-    return json.loads(result.stdout)
 
 
 @pytest.mark.parametrize("command", ["info", "replay", "plot", "recover", "export"])
