@@ -50,7 +50,7 @@ def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_chec
         beside = os.path.relpath(path.resolve(), out.resolve().parent)
         whole = controller_configuration(found, design, path.name, text, axis, beside)
         prepare(parse(whole, out.stem, out.resolve().parent, str(out)))
-        _write(out, whole.encode())
+        write_over(out, whole.encode())
     if as_json:
         click.echo(json.dumps(_as_dict(found, other, out)))
         return 0
@@ -186,11 +186,12 @@ def _write_report(folder: Path, name: str, judged: Judged, report: dict[str, Any
         **{f"{axis}-{label}.png": png for axis, files in drawn.items() for label, png in files.items()},
     }
     for file, content in contents.items():
-        _write(folder / file, content)
+        write_over(folder / file, content)
     return [folder / file for file in contents]
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_over(path: Path, content: bytes) -> None:
+    """Write a file, over one that is there. Raises OutputError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from rtloop.commands.design import write_over
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.configuration.text_files import read_text
@@ -18,7 +19,7 @@ from rtloop.design.robust.shape import Shaped, shaped
 from rtloop.design.robust.subject import subject_in
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
-from rtloop.errors import ConfigError, NoDesign, OutputError
+from rtloop.errors import ConfigError, NoDesign
 from rtloop.terminal.robust import print_robust, print_shaped
 
 
@@ -76,7 +77,7 @@ def shape_configuration(
     if plot is not None:
         from rtloop.design.robust.plots import picture
 
-        _write(plot, picture(found, subject, f"{configuration.name}, axis {axis}"))
+        write_over(plot, picture(found, subject, f"{configuration.name}, axis {axis}"))
         files.append(plot)
     if as_json:
         click.echo(json.dumps(_shaped_as_dict(found, files)))
@@ -128,12 +129,4 @@ def _shaped_as_dict(found: Shaped, files: list[Path]) -> dict[str, Any]:
 def _write_configuration(out: Path, text: str) -> None:
     """Checked as `check` does, then written."""
     prepare(parse(text, out.stem, out.resolve().parent, str(out)))
-    _write(out, text.encode())
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    except OSError as error:
-        raise OutputError(f"{path}: {error.strerror}") from None
+    write_over(out, text.encode())
