@@ -38,8 +38,9 @@ from rtloop.service.measuring.quality import Quality
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
+from rtloop.supervision.hardware import Hardware, keep
 from rtloop.supervision.naming import recording_path
-from rtloop.supervision.paths import block_path
+from rtloop.supervision.paths import block_path, hardware_path
 from rtloop.supervision.recording_state import Gaps
 from rtloop.supervision.supervisor import START_TIMEOUT_S, Processes, RunResult, Supervisor
 
@@ -191,8 +192,9 @@ class Service:
 
     def _episode(self, resting: bool) -> RunResult:
         """One loop from its start to its end; `resting` starts with the outputs off and without a schedule."""
-        with Processes(block_path(self.configuration)) as processes:
+        with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
+            keep(hardware_path(self.configuration.name), Hardware.of(prepared.plan))
             options = self.configuration.service
             # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
             # schedule alone must have its first tick

@@ -49,7 +49,7 @@ def running_configuration(service: Service) -> dict[str, Any]:
         "name": configuration.name,
         "rate_hz": plan.pacing.rate_hz,
         "columns": [described(name)._asdict() for name in plan.columns],
-        "block": str(block_path(configuration).resolve()),
+        "block": str(block_path(configuration.name).resolve()),
         "recordings": str(Path(configuration.recording.folder).resolve()),
     }
 

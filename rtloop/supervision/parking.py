@@ -17,8 +17,9 @@ from rtloop.drivers.base import Driver
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
-from rtloop.errors import UnavailableError
-from rtloop.supervision.paths import block_path, open_block
+from rtloop.errors import RtloopError, UnavailableError
+from rtloop.supervision.hardware import Hardware, noted
+from rtloop.supervision.paths import block_path, hardware_path, open_block
 
 POLL_S = 0.005
 KILL_S = 5.0
@@ -29,18 +30,30 @@ MARGIN_S = 2.0
 def park_configuration(config: Path) -> str:
     """Park the outputs of a configuration in place of a service that died; what was done, in words.
 
-    A loop that outlived its service is given the time to ramp down by itself, and killed if it does not. Raises
-    ConfigError, DriverError, UnavailableError while the service is alive.
+    A loop that outlived its service is given the time to ramp down by itself, and killed if it does not. What counts is
+    the hardware that the service ran with; if the configuration names another by now, that is parked as well. Raises
+    ConfigError where no service has run yet, DriverError, UnavailableError while the service is alive.
     """
-    configuration = load(config)
-    plan = prepare(configuration).plan
-    with _last_block(block_path(configuration)) as block:
+    name, unread = config.stem, ""
+    last, configured = noted(hardware_path(name)), None
+    try:
+        configured = Hardware.of(prepare(load(config)).plan)
+    except (DriverError, RtloopError) as error:
+        if last is None:
+            raise
+        unread = f", as it last ran; the configuration is of no use:\n{error}"
+    from_v: list[float] = []
+    with _last_block(block_path(name)) as block:
         noted_v = None
+        driven = last or configured
+        assert driven is not None
         if block is not None:
-            _await_end(block, plan.pacing.heartbeat_timeout_s, plan.trip_slew_v_per_s)
-            noted_v = block["last_drive_v"] if len(block["last_drive_v"]) == len(plan.axes) else None
-        from_v = park(plan.driver(), plan.trip_slew_v_per_s, noted_v)
-    return f"{configuration.name}: parked from {', '.join(f'{value:.3f} V' for value in from_v)}"
+            _await_end(block, driven.heartbeat_timeout_s, driven.trip_slew_v_per_s)
+            noted_v = block["last_drive_v"] if len(block["last_drive_v"]) == len(driven.wiring) else None
+        from_v += park(driven.driver(), driven.trip_slew_v_per_s, noted_v)
+    if last is not None and configured is not None and not configured.drives_like(last):
+        from_v += park(configured.driver(), configured.trip_slew_v_per_s)
+    return f"{name}: parked from {', '.join(f'{value:.3f} V' for value in from_v)}{unread}"
 
 
 @contextmanager

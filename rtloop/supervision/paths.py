@@ -43,9 +43,14 @@ def socket_path(configuration: Configuration) -> Path:
     return Path(configuration.service.socket or runtime_folder() / f"{configuration.name}.sock")
 
 
-def block_path(configuration: Configuration) -> Path:
-    """Where the shared block of a service lies, for `rtloop park`."""
-    return runtime_folder() / f"{configuration.name}.block"
+def block_path(name: str) -> Path:
+    """Where the shared block of the service of a configuration lies, for `rtloop park`."""
+    return runtime_folder() / f"{name}.block"
+
+
+def hardware_path(name: str) -> Path:
+    """Where the hardware of that service is noted."""
+    return runtime_folder() / f"{name}.hardware"
 
 
 def new_block(path: Path) -> int:

@@ -36,8 +36,9 @@ TAPS = (128, 3, 64, 1, 17, 5)
 
 
 def parked_again(bench: Bench) -> Measured:
-    """The service and its loop die at once; three times whoever comes parks."""
-    service, loop = bench.pid("service"), bench.pid("rt")
+    """The service and its loop die at once; three times whoever comes parks, by a file that is being edited."""
+    service, loop, text = bench.pid("service"), bench.pid("rt"), bench.config.read_text()
+    bench.config.write_text(text[: len(text) // 2] + "[[axis")
     bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
     assert bench.service is not None
     bench.service.wait()
@@ -47,6 +48,7 @@ def parked_again(bench: Bench) -> Measured:
     for _ in range(2):
         assert bench.rtloop("park", bench.config).wait(60.0) == 0
     assert bench.seen().moved_ns == moved_ns, "the output moved again"
+    bench.config.write_text(text)
     bench.start_service()
     bench.await_drive()
     return Measured(took_ms)

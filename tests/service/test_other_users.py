@@ -59,7 +59,7 @@ def bound(config: Path) -> Callable[[], Any]:
 
 def blocked(config: Path) -> Callable[[], Any]:
     def make() -> int:
-        path = block_path(load(config))
+        path = block_path(config.stem)
         os.close(new_block(path))
         return stat.S_IMODE(path.stat().st_mode)
 

@@ -15,13 +15,20 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Channel, Facts
 from rtloop.drivers.python import PythonDriver
 from rtloop.engine.memory import SharedBlock, Sizes, Word
-from rtloop.errors import UnavailableError
+from rtloop.errors import ConfigError, HostRefused, UnavailableError
 from rtloop.supervision import parking
+from rtloop.supervision.hardware import Hardware as Noted
+from rtloop.supervision.hardware import keep, noted
+from rtloop.supervision.paths import hardware_path
+from tests.faults.bench import Bench
 from tests.one_axis import one_axis, wired
 
+WITHOUT_RESTART = ("[recording]", "[service]\nrestarts = 0\n[recording]")
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
 CLAIM = """
 import sys
@@ -214,7 +221,8 @@ def parked(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir(mode=0o700)
 
     def start(card: type[Card]) -> tuple[Hardware, Callable[[], str]]:
-        for module in ("rtloop.configuration.file", "rtloop.configuration.prepare", "rtloop.engine.plan"):
+        users = "configuration.file", "configuration.prepare", "engine.plan", "supervision.hardware"
+        for module in (f"rtloop.{user}" for user in users):
             monkeypatch.setattr(f"{module}.driver_class", lambda kind: card)
         (tmp_path / "run" / "lab.block").unlink(missing_ok=True)
         fd = os.open(tmp_path / "run" / "lab.block", os.O_RDWR | os.O_CREAT, 0o600)
@@ -257,6 +265,61 @@ def test_a_card_that_parks_itself_is_not_driven_back(parked):
     hardware, park = parked(OwnWatchdog)
     park()
     assert set(hardware.written) == {0.0}
+
+
+def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, tmp_path):
+    hardware, park = parked(ReadableCard)
+    text = (tmp_path / "lab.toml").read_text()
+    keep(hardware_path("lab"), Noted.of(prepare(load(tmp_path / "lab.toml")).plan))
+    (tmp_path / "lab.toml").write_text(text.replace("[driver]", "[drive"))
+    assert "6.500 V" in park()
+    assert "as it last ran" in park()
+    np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
+    assert hardware.written[-1] == 0.0
+    hardware_path("lab").unlink()
+    with pytest.raises(ConfigError):
+        park()
+
+
+def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
+    _, park = parked(ReadableCard)
+    config = tmp_path / "lab.toml"
+    keep(hardware_path("lab"), Noted.of(prepare(load(config)).plan))
+    assert park().count(" V") == 1
+    config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
+    assert park().count(" V") == 2
+
+
+@pytest.mark.parametrize("damage", ["whole", "half", "another's"])
+def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
+    _, park = parked(ReadableCard)
+    hardware = Noted.of(prepare(load(tmp_path / "lab.toml")).plan)
+    path = hardware_path("lab")
+    keep(path, hardware)
+    assert path.stat().st_mode & 0o777 == 0o600
+    if damage == "half":
+        path.write_bytes(path.read_bytes()[:-9])
+    if damage == "another's":
+        path.chmod(0o666)
+        with pytest.raises(HostRefused, match="others may write"):
+            park()
+        return
+    assert noted(path) == (hardware if damage == "whole" else None)
+    park()
+
+
+def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
+    """The service and its loop are killed; the board, a process of its own, saw what became of the output."""
+    with Bench(tmp_path, WITHOUT_RESTART) as bench:
+        bench.await_drive()
+        bench.config.write_text("[[axis")
+        for role in ("rt", "service"):
+            os.kill(bench.pid(role), signal.SIGKILL)
+        bench.service.wait()
+        assert bench.seen().last_v != 0.0
+        assert bench.rtloop("park", bench.config).wait(120.0) == 0
+        assert bench.seen().last_v == 0.0
+        assert "as it last ran" in bench.log()
 
 
 def in_a_process(work: Callable[[], object]) -> int:
