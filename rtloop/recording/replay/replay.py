@@ -19,10 +19,10 @@ from rtloop.law.memory import LawMemory
 from rtloop.laws.binding import functions_of
 from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.checked import extras_of
-from rtloop.recording.file.events import GAP, RECOVERED, Event, json_value, message_of
-from rtloop.recording.file.overview import uncovered
 from rtloop.recording.file.reader import Snapshot
+from rtloop.recording.file.topics.checked import extras_of
+from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_of
+from rtloop.recording.file.topics.overview import uncovered
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.rerun import Rerun, Rows, Tape
