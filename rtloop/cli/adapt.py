@@ -34,7 +34,7 @@ def learn(
     A number to a line and tick, in µm. It is played, and corrected by its error from cycle to cycle: the reference, and
     what is added to the command. The best table goes on playing. At Ctrl-C what was held is held again.
     """
-    from rtloop.commands.learn import learn as learn_scan
+    from rtloop.commands.adapt.learn import learn as learn_scan
 
     samples = [number for numbers in numbers_in(file) for number in numbers[:1]]
     body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
@@ -76,8 +76,8 @@ def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> in
     a tick, after a look at a step before and after. With --json and without --yes nothing is swapped. Exit 1 where the
     taps stayed.
     """
-    from rtloop.commands.retune import Asked
-    from rtloop.commands.retune import retune as retune_axis
+    from rtloop.commands.adapt.retune import Asked
+    from rtloop.commands.adapt.retune import retune as retune_axis
 
     return retune_axis(client_of(context), Asked(axis=axis, **asked), as_json)
 

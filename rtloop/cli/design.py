@@ -30,7 +30,7 @@ def synthesise(spec: Path, out: Path | None, axis: str, cross_check: bool, as_js
     configuration around a simulated rig of that plant: `check` and `run` take it, and `ctl controller` swaps its
     controller into a running loop. Exit 1 where no controller does what is asked, with the condition that fails.
     """
-    from rtloop.commands.design import synthesise_specification
+    from rtloop.commands.design.synthesise import synthesise_specification
 
     return synthesise_specification(spec, out, axis, cross_check, as_json)
 
@@ -48,7 +48,7 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 
     Exit 1, "the answer is no", where a loop as it will run is unstable or misses a specification; 0 where all are met.
     """
-    from rtloop.commands.design import verify_configuration
+    from rtloop.commands.design.verify import verify_configuration
 
     return verify_configuration(config, spec, out, as_json)
 
@@ -68,7 +68,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 
     Takes minutes; deploy/robust-spec.toml is a complete example. Exit 1 where nothing found keeps what is asked.
     """
-    from rtloop.commands.robust import search_specification
+    from rtloop.commands.design.robust import search_specification
 
     return search_specification(spec, config, out, axis, as_json)
 
@@ -89,7 +89,7 @@ def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Pa
 
     Exit 1 where there are none, with the constraint that binds and the fastest that is possible.
     """
-    from rtloop.commands.robust import shape_configuration
+    from rtloop.commands.design.robust import shape_configuration
 
     return shape_configuration(config, spec, out, axis, plot, as_json)
 

@@ -193,7 +193,7 @@ def auto(
     HYST is a slow sine from rest, STEP a step; driver and limits are those that STEP was recorded with. Exit 1 where
     the loop misses the specification; the configuration is written all the same.
     """
-    from rtloop.commands.design_auto import design_from_recordings
+    from rtloop.commands.design.auto import design_from_recordings
 
     return design_from_recordings(hysteresis, step, specs, out, axis, order, robust, as_json)
 

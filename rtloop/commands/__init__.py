@@ -1,1 +1,1 @@
-"""What each command does, one module a command; numbers come from below, words from `rtloop.terminal`."""
+"""What each command does, a module a command; numbers come from below, words from `rtloop.terminal`."""

@@ -84,7 +84,7 @@ def _judged(prepared: Prepared, check: AxisCheck) -> Verification | None:
     axis = prepared.configuration.axes[prepared.plan.axes.index(check.name)]
     if axis.specification is None or not check.is_known:
         return None
-    from rtloop.commands.design import verified  # half a second of import, for who has a specification
+    from rtloop.commands.design.verify import verified  # half a second of import, for who has a specification
 
     return verified(prepared.configuration, check, None)[0]
 

@@ -20,6 +20,7 @@ from rtloop.errors import ConfigError
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
+from rtloop.recording.replay.earlier import as_of_today
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws, require_law
 from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
 
@@ -28,8 +29,7 @@ Progress = Callable[[int], None]
 
 def replay_with_other_law(files: Sequence[Path], other: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Differences between the recorded outputs and those of another configuration's law on the recorded inputs."""
-    recording = load(files)
-    require_law(recording)
+    recording = _opened(files)
     law = _law(config.load(other), recording)
     return {**_about(recording, other), **other_law(recording, law, progress)}
 
@@ -38,8 +38,7 @@ def replay_on_the_rig(
     files: Sequence[Path], other: Path | None, progress: Progress | None = None, trust: Trust = NOTHING
 ) -> dict[str, Any]:
     """The recorded reference through a law on a simulated rig: those of `other`, or the recorded ones."""
-    recording = load(files)
-    require_law(recording)
+    recording = _opened(files)
     if other is None:
         path = recording.paths[0]
         library = Library(path.parent, recorded_laws(recording, trust))
@@ -59,6 +58,12 @@ def trust_in(files: Sequence[Path], recorded: bool) -> Trust:
     except ValueError as error:
         raise RecordingError(str(error)) from None
     return Trust(tuple(laws), recorded)
+
+
+def _opened(files: Sequence[Path]) -> Recording:
+    recording = load(files)
+    require_law(recording)
+    return as_of_today(recording)
 
 
 def _about(recording: Recording, other: Path | None) -> dict[str, Any]:

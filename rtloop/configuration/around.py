@@ -8,7 +8,7 @@ from rtloop.configuration.file import AroundOptions
 from rtloop.engine.memory import RING_SECONDS, Sizes, ring_ticks
 from rtloop.recording.capture.conditions import unknown_signal
 from rtloop.recording.file.around import Around
-from rtloop.recording.file.overview import MAX_COLUMNS
+from rtloop.recording.file.topics.overview import MAX_COLUMNS
 
 MOST_BYTES = 1 << 30
 """Of the loop's ring, which is locked in memory, and of the recorder's copy of it."""

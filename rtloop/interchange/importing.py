@@ -23,10 +23,10 @@ from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import Column, axes_of, bare, column_of, find_column, own_name, signal_name, unit_in
 from rtloop.interchange.sampling import OWN, Sampling, came_from_a_recording, sampling, time_column
 from rtloop.interchange.wanted import NAME, Wanted
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import FINISHED, recorder_event
-from rtloop.recording.file.ticks import WHOLE, whole_fault
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import FINISHED, recorder_event
+from rtloop.recording.file.topics.ticks import WHOLE, whole_fault
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.load import unit_of
 

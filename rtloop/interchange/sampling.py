@@ -12,8 +12,8 @@ from rtloop.interchange.formats.groups import TIMES, rows_of
 from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import bare, column_of, unit_in
 from rtloop.interchange.units import UnknownUnit, factor_between, scaled
-from rtloop.recording.file.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
-from rtloop.recording.file.ticks import LARGEST
+from rtloop.recording.file.topics.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
+from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.signals import COMMON, DEADLINE, TICK
 from rtloop.values import counted
 

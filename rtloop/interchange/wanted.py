@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.errors import ConfigError
-from rtloop.recording.file.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
+from rtloop.recording.file.topics.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
 BESIDE = "map.toml"

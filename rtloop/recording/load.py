@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.events import Event
-from rtloop.recording.file.overview import Overview, Range
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
+from rtloop.recording.file.topics.events import Event
+from rtloop.recording.file.topics.overview import Overview, Range
 from rtloop.signals import COMMON, DEADLINE, PER_AXIS
 from rtloop.signals import Signal as Column
 

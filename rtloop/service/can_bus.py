@@ -19,7 +19,7 @@ from rtloop import errors, signals
 from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
-from rtloop.recording.file.events import OPERATOR
+from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.service.desk import Asker, Refused, asked_by
 from rtloop.service.service import Service, State
 from rtloop.signals import Mode

@@ -25,7 +25,7 @@ from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
 from rtloop.recording.capture.names import Names
-from rtloop.recording.file.events import trip_reason
+from rtloop.recording.file.topics.events import trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
 from rtloop.supervision.host_delay import require_margins

@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as StockWriter
 
-from rtloop.recording.file import format
-from rtloop.recording.file.chunkfile import LEVEL
-from rtloop.recording.file.contents import Message
+from rtloop.recording.file.mcap.chunkfile import LEVEL
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.writer import Writer
 from tests.benchmarks.kernels import Differs
 from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, spread

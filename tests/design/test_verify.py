@@ -15,7 +15,7 @@ from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
 from rtloop.analysis.perturbation import changes as robust_changes
 from rtloop.analysis.perturbation import maker, until_unstable, with_damping_changed, with_gain_changed
 from rtloop.cli import main
-from rtloop.commands.design import verified, with_simulation
+from rtloop.commands.design.verify import verified, with_simulation
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rtloop.engine.messages import Kind
-from rtloop.recording.file.events import event_of
+from rtloop.recording.file.topics.events import event_of
 from rtloop.signals import Flag
 from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, TUSTIN, LoopBench, text

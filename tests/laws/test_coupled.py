@@ -24,7 +24,7 @@ from rtloop.errors import ConfigError
 from rtloop.laws.conformance import Bench
 from rtloop.laws.linearise import linearised
 from rtloop.recording.capture.session import Session
-from rtloop.recording.file.events import event_of
+from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.replay.laws import Trust
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing import live

@@ -14,7 +14,7 @@ from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.law.extras import ExtraOutput
 from rtloop.recording.capture.session import Session
-from rtloop.recording.file.events import event_of
+from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.replay.laws import Trust
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode

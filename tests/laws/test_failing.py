@@ -13,7 +13,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
-from rtloop.recording.file.events import event_of
+from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.replay.laws import Trust
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode

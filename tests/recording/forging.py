@@ -21,10 +21,10 @@ from rtloop.law.memory import view
 from rtloop.laws.shipped import transfer
 from rtloop.recording.capture import session as session_module
 from rtloop.recording.capture.session import Options, Session
-from rtloop.recording.file import format
-from rtloop.recording.file.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
-from rtloop.recording.file.contents import Message, split_messages
+from rtloop.recording.file.mcap.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message, split_messages
 from tests.recording.law_fields import COUNTS, fields_of
 from tests.recording.real_loop import TWO_AXES, RealLoop, changed
 

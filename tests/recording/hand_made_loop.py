@@ -19,9 +19,9 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.ring import claim, publish
 from rtloop.laws.registry import layout_of
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import event_of, recorder_event
-from rtloop.recording.file.format import EVENTS, LAW, chunk_rows
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import event_of, recorder_event
+from rtloop.recording.file.topics.format import EVENTS, LAW, chunk_rows
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import (
     DRIVE,

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import FINAL
-from rtloop.recording.file.format import CONFIGURATION, EVENTS, LAW
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import FINAL
+from rtloop.recording.file.topics.format import CONFIGURATION, EVENTS, LAW
 from rtloop.recording.file.writer import Writer
 
 Rows = np.ndarray[Any, Any]

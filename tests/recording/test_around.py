@@ -14,8 +14,8 @@ from rtloop.recording.capture.conditions import Conditions, comparison_of, unkno
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import layout
-from rtloop.recording.file.overview import uncovered
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics.overview import uncovered
 from rtloop.recording.load import Recording, load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.bands import read_bands

@@ -14,11 +14,11 @@ from mcap.writer import Writer as StockWriter
 
 from rtloop.errors import OutputError, RtloopError
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.container import DATA_END_BYTES
-from rtloop.recording.file.contents import Message
+from rtloop.recording.file.mcap.container import DATA_END_BYTES
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.views.summary import summarise
 from tests.recording.hand_made_loop import START_UNIX_NS, make_header, make_rows, snapshot, write_recording

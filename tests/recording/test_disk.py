@@ -16,9 +16,9 @@ import pytest
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.errors import OutputError
 from rtloop.recording.capture.session import Options, Session
-from rtloop.recording.file.format import chunk_rows
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise

@@ -19,8 +19,8 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from rtloop.errors import OutputError
-from rtloop.recording.file.format import TICKS, chunk_rows, tick_dtype, tick_schema
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.topics.format import TICKS, chunk_rows, tick_dtype, tick_schema
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DRIVER_STATUS, FLAGS, MODE, PERIODS_MISSED, columns
 from tests.recording.hand_made_loop import (

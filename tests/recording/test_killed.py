@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rtloop.recording.capture.session import FLUSH_S
-from rtloop.recording.file.format import chunk_rows
+from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from tests.recording.hand_made_loop import COLUMNS

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from rtloop.engine.messages import Kind, message
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import event_of
-from rtloop.recording.file.format import EVENTS
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import event_of
+from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import Flag
 from rtloop.supervision.quota import SPARE_BYTES, Quota

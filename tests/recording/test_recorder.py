@@ -13,9 +13,9 @@ import pytest
 
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import MESSAGE, Kind, Origin
-from rtloop.recording.file.events import message_of
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics.events import message_of
 from rtloop.recording.load import load
 from rtloop.signals import Mode
 from tests.recording.hand_made_loop import (

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.capture.session import Options, Session
-from rtloop.recording.file.events import RECORDER
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics.events import RECORDER
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode

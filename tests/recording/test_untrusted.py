@@ -19,8 +19,8 @@ from rtloop.law.layout import MAX_SECTIONS, MAX_TAPS
 from rtloop.laws.shipped.play_model import MAX_PLAYS
 from rtloop.laws.shipped.transfer import MAX_ORDER
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise

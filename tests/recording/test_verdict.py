@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
-from rtloop.recording.file import format
+from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import ReplayReport, replay
 from rtloop.recording.views.summary import summarise

@@ -15,7 +15,7 @@ from rtloop.configuration.file import load
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.errors import ConfigError
 from rtloop.recording.capture.names import Names
-from rtloop.recording.file.events import OPERATOR, event_of, message_of, name_fault
+from rtloop.recording.file.topics.events import OPERATOR, event_of, message_of, name_fault
 from rtloop.service.api.application import application
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.lock import Lock

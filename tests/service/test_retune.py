@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from rtloop.commands.retune import Asked, retune
+from rtloop.commands.adapt.retune import Asked, retune
 from rtloop.errors import LoopFault
 
 HZ, DAMPING, PERIOD_S = 600.0, 0.02, 1e-4

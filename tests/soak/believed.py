@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 import rtloop
-from rtloop.commands.design import verified
-from rtloop.commands.design_auto import write_design
+from rtloop.commands.design.auto import write_design
+from rtloop.commands.design.verify import verified
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench

@@ -14,9 +14,9 @@ import numpy as np
 from rtloop.errors import RtloopError
 from rtloop.interchange.export import export
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.format import TICKS
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
+from rtloop.recording.file.topics.format import TICKS
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise

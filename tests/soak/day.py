@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.overview import uncovered
+from rtloop.recording.file.topics.overview import uncovered
 from rtloop.recording.load import load
 from tests.recording.real_loop import PAPER, ROOT
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.format import chunk_rows
+from rtloop.recording.file.topics.format import chunk_rows
 from tests.recording.hand_made_loop import COLUMNS
 from tests.recording.killing import kill_a_run, recovered_ticks
 from tests.recording.real_loop import ROOT, TWO_AXES, record, scheduled

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rtloop
-from rtloop.commands.design import verified
-from rtloop.commands.design_auto import write_design, write_robust_design
+from rtloop.commands.design.auto import write_design, write_robust_design
+from rtloop.commands.design.verify import verified
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench, Stand

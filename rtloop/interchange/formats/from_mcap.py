@@ -18,10 +18,10 @@ import numpy as np
 from rtloop.hil.modal import Real
 from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.chunks import Source
-from rtloop.recording.file.container import DamagedChunk
 from rtloop.recording.file.foreign.fields import Undecodable, decoder, encoding
 from rtloop.recording.file.foreign.stretches import Run, Topics, contents, runs, stretches
+from rtloop.recording.file.mcap.chunks import Source
+from rtloop.recording.file.mcap.container import DamagedChunk
 
 LOG_TIME = "log_time_s"
 MOST_TIMES, SPARE_BYTES = 64, 64 << 20

@@ -15,7 +15,7 @@ from rtloop.panel.views.frames import pack
 from rtloop.panel.views.wishes import MAX_PIXELS
 from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.file.reader import Reader
-from rtloop.recording.file.ticks import LARGEST
+from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.signals import TICK
 
 MOST_VALUES = 10_000_000

@@ -11,7 +11,7 @@ from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
 from rtloop.panel.views.link import Description, Service
 from rtloop.panel.views.words import words
-from rtloop.recording.file.events import Event, event_of
+from rtloop.recording.file.topics.events import Event, event_of
 
 KEPT = 200
 ASK_S = 0.2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rtloop.law.reference import Generator
-from rtloop.recording.file.events import Event
+from rtloop.recording.file.topics.events import Event
 from rtloop.values import counted
 
 

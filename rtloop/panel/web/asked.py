@@ -7,7 +7,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rtloop.configuration.file import describe
-from rtloop.recording.file.ticks import LARGEST
+from rtloop.recording.file.topics.ticks import LARGEST
 
 LONGEST_S = 600.0
 

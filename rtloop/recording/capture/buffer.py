@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.recording.capture.rings import RingReader
-from rtloop.recording.file import format
-from rtloop.recording.file.overview import LEAST, MOST, Intervals
-from rtloop.recording.file.ticks import missing
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.overview import LEAST, MOST, Intervals
+from rtloop.recording.file.topics.ticks import missing
 from rtloop.signals import DEADLINE, TICK
 
 NS_PER_S = 1e9

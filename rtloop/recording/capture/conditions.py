@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.events import COMMANDS
+from rtloop.recording.file.topics.events import COMMANDS
 from rtloop.signals import PERIODS_MISSED, TICK
 
 COMPARISONS = {">=": operator.ge, "<=": operator.le, "==": operator.eq, "!=": operator.ne, ">": operator.gt,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.overview import LEAST, PARTS, Intervals
+from rtloop.recording.file.topics.overview import LEAST, PARTS, Intervals
 from rtloop.signals import TICK
 
 Rows = np.ndarray[Any, Any]

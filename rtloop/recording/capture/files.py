@@ -10,8 +10,8 @@ import numpy as np
 
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import Place
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.overview import Intervals
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.overview import Intervals
 from rtloop.recording.file.writer import Writer
 
 

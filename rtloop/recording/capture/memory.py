@@ -17,9 +17,9 @@ import numpy as np
 from rtloop.recording.capture.conditions import Conditions, Hit
 from rtloop.recording.capture.decimation import Decimation
 from rtloop.recording.capture.pending import KEPT_EVENTS, Entry, waiting
-from rtloop.recording.file import format
 from rtloop.recording.file.around import BATCH_S, SNAPSHOT_S, Around
-from rtloop.recording.file.overview import Intervals
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.overview import Intervals
 from rtloop.signals import TICK
 
 MOST_BYTES = 512 << 20

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtloop.engine.memory import EVENT_SLOTS
 from rtloop.hil.native.words import load_acquire, store_release
-from rtloop.recording.file.events import MAX_NAME
+from rtloop.recording.file.topics.events import MAX_NAME
 
 SLOT = np.dtype([("identity", np.uint64), ("name", f"S{4 * MAX_NAME}")])
 """At most four bytes a character; no name has NULs. Identity 0 stands for none."""

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from rtloop.recording.capture.buffer import Place, TickBuffer
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import RECORDER, Event, recorder_event
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import RECORDER, Event, recorder_event
 
 KEPT_EVENTS = 4096
 """From a time in which nothing can be written, for the file that follows."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.contents import contents_behind, is_ticks, tells_of_ticks
+from rtloop.recording.file.topics.contents import contents_behind, is_ticks, tells_of_ticks
 
 
 class Position(NamedTuple):

@@ -18,7 +18,7 @@ from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.pending import Entry
 from rtloop.recording.capture.session import Session
 from rtloop.recording.file.around import Around
-from rtloop.recording.file.events import FINISHED, KEPT, recorder_event
+from rtloop.recording.file.topics.events import FINISHED, KEPT, recorder_event
 
 
 class SelectiveSession(Session):

@@ -21,9 +21,9 @@ from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.pending import Entry, Pending, tick_of
 from rtloop.recording.capture.progress import Position, Progress
 from rtloop.recording.capture.rings import RingReader
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import (
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import (
     FINISHED,
     GAP,
     RECORDING_FAILED,
@@ -32,7 +32,7 @@ from rtloop.recording.file.events import (
     event_of,
     recorder_event,
 )
-from rtloop.recording.file.overview import Intervals
+from rtloop.recording.file.topics.overview import Intervals
 
 FLUSH_S = 0.5
 ROOM_BYTES = 1 << 20

@@ -13,14 +13,14 @@ from typing import Any
 from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.cutting.source import Source, Stretch
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import CUT, GAP, recorder_event
-from rtloop.recording.file.overview import Range, uncovered
 from rtloop.recording.file.parts import Files, Parts, find_files
 from rtloop.recording.file.reader import Rows
 from rtloop.recording.file.recover import Progress, grows
-from rtloop.recording.file.ticks import missing
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import CUT, GAP, recorder_event
+from rtloop.recording.file.topics.overview import Range, uncovered
+from rtloop.recording.file.topics.ticks import missing
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import FINAL
-from rtloop.recording.file.format import EVENTS
 from rtloop.recording.file.reader import Reader, Rows
-from rtloop.recording.file.ticks import Ticks
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import FINAL
+from rtloop.recording.file.topics.format import EVENTS
+from rtloop.recording.file.topics.ticks import Ticks
 from rtloop.signals import DEADLINE, TICK
 
 REMEMBERED = 1 << 14

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 from rtloop.engine.memory import ring_ticks
 from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message, may_hold
-from rtloop.recording.file.events import FINAL
-from rtloop.recording.file.overview import LEAST, MEAN, MOST, OverviewLayout, Range, ranges
 from rtloop.recording.file.reader import Rows, tick_of
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message, may_hold
+from rtloop.recording.file.topics.events import FINAL
+from rtloop.recording.file.topics.overview import LEAST, MEAN, MOST, OverviewLayout, Range, ranges
 from rtloop.signals import DEADLINE, TICK
 
 OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "cut")

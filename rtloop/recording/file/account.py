@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from rtloop.recording.file.container import DamagedChunk
-from rtloop.recording.file.ticks import LARGEST, Ticks
+from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.topics.ticks import LARGEST, Ticks
 
 
 class Account:

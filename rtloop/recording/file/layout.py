@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.chunks import Entry, Source, indexed_chunks, scanned_chunks
-from rtloop.recording.file.container import MAGIC, DamagedChunk, unpack_chunk
-from rtloop.recording.file.contents import read_chunk
 from rtloop.recording.file.foreign.rewritten import NoRecording, Rewritten
 from rtloop.recording.file.foreign.stretches import library
-from rtloop.recording.file.header import own_header, read_header
+from rtloop.recording.file.mcap.chunks import Entry, Source, indexed_chunks, scanned_chunks
+from rtloop.recording.file.mcap.container import MAGIC, DamagedChunk, unpack_chunk
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import read_chunk
+from rtloop.recording.file.topics.header import own_header, read_header
 
 OWN = (format.LIBRARY, "")
 """What the first record says of who wrote the file, if it says it."""

@@ -9,8 +9,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.header import OF_A_RUN, absent
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.topics.header import OF_A_RUN, absent
 
 Files = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""

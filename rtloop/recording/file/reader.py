@@ -19,12 +19,13 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
 from rtloop.recording.file.account import Account
-from rtloop.recording.file.checked import Malformed, event_from
-from rtloop.recording.file.chunks import Entry, Source
-from rtloop.recording.file.container import DamagedChunk
-from rtloop.recording.file.contents import (
+from rtloop.recording.file.layout import layout_of
+from rtloop.recording.file.mcap.chunks import Entry, Source
+from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.checked import Malformed, event_from
+from rtloop.recording.file.topics.contents import (
     Message,
     is_ticks,
     may_hold,
@@ -32,10 +33,9 @@ from rtloop.recording.file.contents import (
     overlaps,
     split_messages,
 )
-from rtloop.recording.file.events import FINAL, Event
-from rtloop.recording.file.layout import layout_of
-from rtloop.recording.file.overview import Intervals, OverviewLayout, Range, plausible, ranges
-from rtloop.recording.file.ticks import LARGEST, TickLayout, Ticks
+from rtloop.recording.file.topics.events import FINAL, Event
+from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Range, plausible, ranges
+from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
@@ -184,7 +184,7 @@ class Reader:
 
     @cached_property
     def overview(self) -> Intervals:
-        """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.overview`."""
+        """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.topics.overview`."""
         found = self.intervals_of(self._messages(format.OVERVIEW))
         good = plausible(found)
         if not good.all():

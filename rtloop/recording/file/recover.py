@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.events import FINAL, FINISHED, RECOVERED, recorder_event
-from rtloop.recording.file.overview import MOST, ranges
 from rtloop.recording.file.reader import Reader, Rows
-from rtloop.recording.file.ticks import missing
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import FINAL, FINISHED, RECOVERED, recorder_event
+from rtloop.recording.file.topics.overview import MOST, ranges
+from rtloop.recording.file.topics.ticks import missing
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 

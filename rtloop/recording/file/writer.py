@@ -16,11 +16,11 @@ from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
 from rtloop.errors import LOW_SPACE, OutputError
-from rtloop.recording.file import format
-from rtloop.recording.file.chunkfile import ChunkFile, Content
-from rtloop.recording.file.container import PREFIX, pack_message, pack_records
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.overview import Intervals, OverviewLayout, declared, ranges
+from rtloop.recording.file.mcap.chunkfile import ChunkFile, Content
+from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, declared, ranges
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 

@@ -17,7 +17,7 @@ from rtloop.engine.plan import Pacing, Plan
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
-from rtloop.recording.file.checked import extra_channels_of, extras_of
+from rtloop.recording.file.topics.checked import extra_channels_of, extras_of
 from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048

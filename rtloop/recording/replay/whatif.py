@@ -19,7 +19,7 @@ from rtloop.law.memory import LawMemory
 from rtloop.laws.binding import functions_of
 from rtloop.laws.registry import LawReference, layout_of
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.checked import extra_channels_of, extras_of
+from rtloop.recording.file.topics.checked import extra_channels_of, extras_of
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.outcome import Differences, Performance

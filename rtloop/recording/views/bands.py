@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.events import FINAL
+from rtloop.recording.file.topics.events import FINAL
 from rtloop.recording.load import Recording, unit_of
 from rtloop.signals import DEADLINE
 

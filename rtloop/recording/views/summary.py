@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.events import COMMANDS, RECOVERED
-from rtloop.recording.file.overview import LEAST, MOST, uncovered
 from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
+from rtloop.recording.file.topics.overview import LEAST, MOST, uncovered
 from rtloop.recording.views.histogram import Histogram
 from rtloop.signals import DEADLINE, Flag, Mode
 

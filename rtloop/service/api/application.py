@@ -24,7 +24,7 @@ from rtloop.configuration.axis import TableOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.references import read_samples
 from rtloop.errors import ConfigError
-from rtloop.recording.file.events import OPERATOR
+from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.service.api.asking import asking, lock
 from rtloop.service.api.bodies import (
     MAX_BODY_BYTES,

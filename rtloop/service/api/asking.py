@@ -10,7 +10,7 @@ from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse, Response
 
 from rtloop.errors import ConfigError
-from rtloop.recording.file.events import OPERATOR, name_fault
+from rtloop.recording.file.topics.events import OPERATOR, name_fault
 from rtloop.service.api.bodies import LockBody
 from rtloop.service.api.refusals import refusal
 from rtloop.service.desk import NOBODY, Asker, asked_by

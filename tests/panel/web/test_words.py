@@ -8,7 +8,7 @@ import pytest
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.reference import Generator
 from rtloop.panel.views.words import words
-from rtloop.recording.file.events import event_of
+from rtloop.recording.file.topics.events import event_of
 from rtloop.signals import Flag, Mode
 
 

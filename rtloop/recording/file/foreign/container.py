@@ -9,7 +9,7 @@ from collections.abc import Callable
 import lz4.frame
 import zstandard
 
-from rtloop.recording.file.container import PREFIX, DamagedChunk
+from rtloop.recording.file.mcap.container import PREFIX, DamagedChunk
 
 HEAD = struct.Struct("<BQQQQII")
 """Of a chunk record: opcode, length, first and last log time, uncompressed size, CRC-32, length of what follows."""

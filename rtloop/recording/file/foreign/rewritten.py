@@ -19,15 +19,15 @@ import numpy as np
 from mcap.records import ChunkIndex
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.checked import final_event
-from rtloop.recording.file.chunks import Entry, Source
-from rtloop.recording.file.container import DamagedChunk, pack_message
-from rtloop.recording.file.contents import Message
 from rtloop.recording.file.foreign.fields import Undecodable, encoding
 from rtloop.recording.file.foreign.stretches import Run, Stretch, Topics, contents, halves, runs, stretches
 from rtloop.recording.file.foreign.ticks import TickDecoder
-from rtloop.recording.file.header import absent, merged_header
+from rtloop.recording.file.mcap.chunks import Entry, Source
+from rtloop.recording.file.mcap.container import DamagedChunk, pack_message
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.checked import final_event
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.header import absent, merged_header
 
 NUMBERS = {channel.topic: channel.id for channel in format.channels()} | {format.OVERVIEW_TOPIC: format.OVERVIEW}
 SLOW = (format.EVENTS, format.LAW, format.OVERVIEW)

@@ -18,9 +18,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Schema
 
-from rtloop.recording.file.chunks import Source
-from rtloop.recording.file.container import MAGIC, MESSAGE_HEAD, PREFIX, DamagedChunk
 from rtloop.recording.file.foreign.container import HEAD, LARGEST_BYTES, record_length, said_size, unpack
+from rtloop.recording.file.mcap.chunks import Source
+from rtloop.recording.file.mcap.container import MAGIC, MESSAGE_HEAD, PREFIX, DamagedChunk
 
 STRETCH_BYTES = 1 << 20
 """Uncompressed; a single record may be larger."""

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file import format
-from rtloop.recording.file.container import MESSAGE_HEAD, DamagedChunk
 from rtloop.recording.file.foreign.container import LARGEST_BYTES
 from rtloop.recording.file.foreign.fields import Fields, Undecodable, decoder, message_class
 from rtloop.recording.file.foreign.stretches import Run, Topics
-from rtloop.recording.file.ticks import LARGEST_NS
+from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.ticks import LARGEST_NS
 from rtloop.signals import DEADLINE, TICK
 
 Rows = np.ndarray[Any, Any]

@@ -18,7 +18,7 @@ from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
 from rtloop.law.extras import ExtraOutput, Extras
 from rtloop.law.layout import MAX_EXTRAS
 from rtloop.law.reference import Generator
-from rtloop.recording.file.events import (
+from rtloop.recording.file.topics.events import (
     FINAL,
     GAP,
     KEPT,
@@ -29,7 +29,7 @@ from rtloop.recording.file.events import (
     known,
     name_fault,
 )
-from rtloop.recording.file.format import FORMAT
+from rtloop.recording.file.topics.format import FORMAT
 from rtloop.signals import Mode
 
 HIGHEST_RATE_HZ, LOWEST_RATE_HZ = 1e6, 1e-3

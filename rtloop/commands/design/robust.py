@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rtloop.commands.design import write_over
+from rtloop.commands.design.verify import write_over
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.configuration.text_files import read_text

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Channel, McapRecord, Schema
 
-from rtloop.recording.file import format
-from rtloop.recording.file.contents import Message
-from rtloop.recording.file.ticks import LARGEST
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.signals import DEADLINE, TICK
 
 LEAST, MOST, MEAN = range(3)

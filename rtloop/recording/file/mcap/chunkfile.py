@@ -20,7 +20,7 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
-from rtloop.recording.file.container import (
+from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     MAGIC,
     indexed_span,

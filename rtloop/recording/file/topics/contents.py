@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from rtloop.recording.file import format
-from rtloop.recording.file.chunks import Entry, Source, scanned_chunks
-from rtloop.recording.file.container import (
+from rtloop.recording.file.mcap.chunks import Entry, Source, scanned_chunks
+from rtloop.recording.file.mcap.container import (
     MESSAGE_HEAD,
     PREFIX,
     DamagedChunk,
@@ -19,6 +18,7 @@ from rtloop.recording.file.container import (
     split_records,
     unpack_chunk,
 )
+from rtloop.recording.file.topics import format
 
 
 class Message(NamedTuple):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from rtloop.commands.design import verify_configuration
+from rtloop.commands.design.verify import verify_configuration
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain, configuration_text, designed, identified

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file import format
-from rtloop.recording.file.container import DamagedChunk
+from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.topics import format
 from rtloop.signals import Mode
 
 LARGEST, LARGEST_NS = float(1 << 53), 1 << 62

@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.container import (
+from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     CHUNK_MARK,
     CHUNK_MARK_OFFSET,

@@ -16,10 +16,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file import format
-from rtloop.recording.file.checked import Malformed, header_from, require_columns
-from rtloop.recording.file.container import DamagedChunk, pack_records, split_records
-from rtloop.recording.file.contents import split_messages
+from rtloop.recording.file.mcap.container import DamagedChunk, pack_records, split_records
+from rtloop.recording.file.topics import format
+from rtloop.recording.file.topics.checked import Malformed, header_from, require_columns
+from rtloop.recording.file.topics.contents import split_messages
 
 EVERY = [(one.id, one.topic) for one in format.channels()]
 OWN_CHANNELS = (EVERY, [*EVERY, (format.OVERVIEW, format.OVERVIEW_TOPIC)])
