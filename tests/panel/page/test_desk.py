@@ -33,6 +33,8 @@ def test_whoever_arms_starts_sets_tunes_undoes_captures_and_stops_sees_all_of_it
     page.fill("#setpoint", "12,5")
     page.keyboard.press("Enter")
     near(page, "#position-x", 12.5)
+    for figure in (2, 3):  # low and high: sweeps from before it was set are over
+        near(page, f"#traces tbody tr:nth-of-type(2) td:nth-of-type({figure})", 12.5, 0.001)
     near(page, "#traces tbody tr:nth-of-type(1) td:nth-of-type(4)", 12.5)
     assert trace(page, "x_reference_um", 1) == trace(page, "x_reference_um", 2) == 12.5
     assert trace(page, "x_position_um", 3) == pytest.approx(12.5, abs=0.1)
