@@ -114,6 +114,7 @@ def test_the_keyboard_alone_drives(page: Any) -> None:
     keys.press("]")
     near(page, "#position-x", 6.25)
     keys.press("m")
+    page.wait_for_selector("[aria-label='Cursor A'][aria-valuenow]")  # placed in the next frame
     page.focus("[role=slider][aria-label='Cursor A']")
     at_s = float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow"))
     keys.press("Shift+ArrowRight")

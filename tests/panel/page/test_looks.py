@@ -76,7 +76,7 @@ def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any, bench: Bench) 
     page.keyboard.press("Escape")
     page.keyboard.press("m")
     slider = "[role=slider][aria-label='Cursor A']"
-    assert "Cursor A" in page.get_attribute(slider, "aria-valuetext")
+    page.wait_for_selector(f"{slider}[aria-valuetext*='Cursor A']")  # placed in the next frame
     said(page, "#measured", "1/Δt")
     stopped(page)
 
