@@ -118,7 +118,8 @@ def test_the_keyboard_alone_drives(page: Any) -> None:
     page.focus("[role=slider][aria-label='Cursor A']")
     at_s = float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow"))
     keys.press("Shift+ArrowRight")
-    assert float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow")) > at_s
+    moved = "(at_s) => Number(document.querySelector('[aria-label=\"Cursor A\"]').ariaValueNow) > at_s"
+    page.wait_for_function(moved, arg=at_s)
     keys.press("3")
     assert page.is_visible("#spectrum")
     keys.press("?")
