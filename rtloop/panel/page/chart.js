@@ -25,7 +25,7 @@ export class Chart {
       pxAlign: 1,
       legend: { show: false },
       cursor: { drag: { x: false, y: false, setScale: false }, points: { show: false }, x: false, y: false },
-      padding: [8, scales.some(({ side }) => side === 1) ? 0 : 14, bare ? 4 : 0, 0],
+      padding: [8, scales.some(({ side }) => side === 1) ? 0 : 26, bare ? 4 : 0, 0],
       scales: Object.fromEntries([
         ["x", { time: false, distr: x.log ? 3 : 1, log: 10 }],
         ...scales.map(({ key, log }) => [key, { distr: log ? 3 : 1, log: 10, range: () => this.#ranges[key] }]),
@@ -114,7 +114,10 @@ export class Chart {
       ctx.textAlign = right ? "right" : "left";
       ctx.textBaseline = key === "x" ? "bottom" : "top";
       const y = key === "x" ? bbox.top + bbox.height - 3 * ratio : bbox.top + 3 * ratio;
-      ctx.fillText(unit, right ? bbox.left + bbox.width - 5 * ratio : bbox.left + 5 * ratio, y);
+      ctx.strokeStyle = palette().back; // around the letters, where traces run
+      ctx.lineWidth = 4 * ratio;
+      ctx.lineJoin = "round";
+      for (const put of [ctx.strokeText, ctx.fillText]) put.call(ctx, unit, right ? bbox.left + bbox.width - 5 * ratio : bbox.left + 5 * ratio, y);
     }
     ctx.restore();
   }

@@ -1,6 +1,7 @@
 // The page: a session, a connection, and its parts.
 
 import { get, who } from "./api.js";
+import { Configuration } from "./desk/configuration.js";
 import { showDigits } from "./desk/digits.js";
 import { Drive } from "./desk/drive.js";
 import { showEvents } from "./desk/events.js";
@@ -40,12 +41,13 @@ addEventListener("rtloop-session-lost", () => askForToken());
 const panel = await openSession(get, () => live.connect());
 $("name").textContent = panel.name;
 strip.begin(get);
-showDigits(live, panel);
+const configuration = new Configuration(panel);
+showDigits(live, panel, configuration);
 showEvents(live);
 const scope = new Scope(live, panel);
 views = new Views(live, panel, scope, strip);
-const reference = new Reference(live, panel, drive, () => tuning.read());
-tuning = new Tuning(drive, () => reference.axis);
+const reference = new Reference(live, panel, configuration, drive, () => tuning.read());
+tuning = new Tuning(drive, configuration, () => reference.axis);
 tuning.read();
 live.connect();
 let run = null;
@@ -55,7 +57,7 @@ live.addEventListener("state", async ({ detail }) => {
   run = detail.run;
   if (!another) return;
   const now = await get("/api/panel").catch(() => panel);
-  if (JSON.stringify(now) !== JSON.stringify(panel)) location.reload(); // the loop that came has other signals, rate or limits
+  if (JSON.stringify(now) !== JSON.stringify(panel)) location.reload(); // the loop that came has other signals, or another rate
   else tuning.read();
 });
 live.addEventListener("events", ({ detail }) => {

@@ -61,6 +61,8 @@ export class Picker {
   #toggle() {
     if (!this.#list.hidden) return this.#close();
     this.#list.hidden = false;
+    const { top, bottom } = this.#button.getBoundingClientRect();
+    this.#list.classList.toggle("upward", innerHeight - bottom < this.#list.offsetHeight && top > innerHeight - bottom);
     this.#button.setAttribute("aria-expanded", "true");
     this.#go(Math.max(0, this.#options.findIndex((option) => option.value === this.#value)));
     this.#list.focus();

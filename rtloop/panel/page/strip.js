@@ -6,6 +6,12 @@ import { counted, fixed } from "./numbers.js";
 const words = (name) => String(name).replaceAll("_", " ");
 const STATUS_MS = 1000;
 
+/** The one found first with its numbers, then the others. */
+function causes(trip, reason) {
+  const others = trip.filter((cause) => !reason?.includes(cause));
+  return [reason, ...others].filter(Boolean).map(words).join(", ");
+}
+
 export class Strip {
   #state = null;
   #tripped = "";
@@ -40,7 +46,7 @@ export class Strip {
     say($("mode"), state.mode ? words(state.mode) : "");
     say($("tick"), counted(state.tick));
     if (before !== state.state) say($("spoken"), `${words(state.state)}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
-    const tripped = state.trip?.length ? `Tripped: ${state.trip.map(words).join(", ")}${state.trip_reason ? ` — ${state.trip_reason}` : ""}. Reset to go on.` : "";
+    const tripped = state.trip?.length ? `Tripped: ${causes(state.trip, state.trip_reason)}. Reset to go on.` : "";
     if (tripped !== this.#tripped) {
       this.#tripped = tripped;
       say($("alarm"), tripped);

@@ -94,7 +94,7 @@ class _Viewer:
         self._digest = Digest()
         self._live: Channel | None = None
         self._subscriptions = Subscriptions()
-        self._told, _ = feed.events.after(0)
+        self._told = feed.events.newest
         self._event_due_s = 0.0
         self._clock = asyncio.get_running_loop().time
 
@@ -143,10 +143,9 @@ class _Viewer:
         """The next event, if it is time for one."""
         if self._clock() < self._event_due_s:
             return
-        newest, events = self._feed.events.after(self._told)
-        if not events:
+        if not (told := self._feed.events.after(self._told)):
             return
-        event, self._told = events[0], newest - len(events) + 1
+        self._told, event = told[0]
         texts = event["kind"], event["who"], event["axis"] or "", json.dumps(event["what"])
         await self._send(EVENTS, now_ns, cdr.event_message(now_ns, event["tick"], *texts))
         self._event_due_s = self._clock() + 1 / EVENTS_HZ

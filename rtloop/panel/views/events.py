@@ -1,14 +1,19 @@
-"""What was commanded, tripped and changed, as the loop said it: the last of it, in words, for all clients."""
+"""What was commanded, tripped and changed, as the loop said it: the last of it, in words, for all clients.
+
+Late ticks with nothing else between them are one row, which grows: on an overloaded host they would push off the rest.
+"""
 
 from __future__ import annotations
 
 import json
 import threading
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
+from rtloop.panel.views.lateness import BEGINS, OVER, Lateness
 from rtloop.panel.views.link import Description, Service
 from rtloop.panel.views.words import words
 from rtloop.recording.file.topics.events import Event, event_of
@@ -18,14 +23,26 @@ ASK_S = 0.2
 """For a name; ticks come meanwhile, and the ring holds ten seconds: a silent service is not asked for the others."""
 
 
+@dataclass
+class Row:
+    """What is kept of an event, or of several that are one."""
+
+    number: int
+    """Under which it was told last."""
+    event: Event
+
+
 class Events:
-    """The last KEPT, numbered from 1 on."""
+    """The last KEPT rows. What is told has a number, from 1 on; a row that grew is told again, under another one."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
-        self._kept: deque[tuple[int, Event]] = deque(maxlen=KEPT)
-        self._count = 0
+        self._kept: deque[Row] = deque(maxlen=KEPT)
+        self._late: tuple[Row, Lateness] | None = None
+        """The last one of late ticks."""
         self._lock = threading.Lock()
+        self.newest = 0
+        """Number of what was told last."""
 
     def take(self, messages: Any, loop: Description, run: int) -> None:
         """Add records of MESSAGE, (n,), of the run that is read; who asked is asked of the service while it answers."""
@@ -38,18 +55,42 @@ class Events:
                 except RtloopError:
                     answers = False
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
-            event = event_of(message, tuple(loop.axes), time_ns, name=name)
-            event["what"]["text"] = words(event)
+            event = {**event_of(message, tuple(loop.axes), time_ns, name=name), "run": run}
             with self._lock:
-                self._count += 1
-                self._kept.append((self._count, {**event, "run": run}))
+                self.newest += 1
+                self._add(event, loop.rate_hz)
 
-    def after(self, number: int) -> tuple[int, list[Event]]:
-        """The number of the newest, and those that are kept behind `number`."""
+    def after(self, number: int) -> list[tuple[int, Event]]:
+        """What was told behind `number` and is kept, in turn, each as it is now, with its number."""
         with self._lock:
-            return self._count, [event for at, event in self._kept if at > number]
+            rows = [(row.number, row.event) for row in self._kept if row.number > number]
+        return sorted(rows, key=lambda row: row[0])
+
+    def _add(self, event: Event, rate_hz: float) -> None:
+        if event["kind"] not in (BEGINS, OVER):
+            self._kept.append(Row(self.newest, told(event)))
+            return
+        if (grown := self._grown_by(event)) is not None:
+            row, lateness = grown
+            lateness.add(event)
+            row.number, row.event = self.newest, told(lateness.row())
+            return
+        lateness = Lateness(event, rate_hz)
+        self._late = Row(self.newest, told(lateness.row())), lateness
+        self._kept.append(self._late[0])
+
+    def _grown_by(self, event: Event) -> tuple[Row, Lateness] | None:
+        """The newest row, where that is one of late ticks; of an episode's end, the row that it began in."""
+        if self._late is None or self._late[0].event["run"] != event["run"]:
+            return None
+        return self._late if event["kind"] == OVER or self._late[0] is self._kept[-1] else None
 
     def _name(self, identity: int) -> str | None:
         """Of the operator; None where no name was given. Raises UnavailableError, HostRefused."""
         status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, ASK_S)
         return json.loads(data)["name"] if status == 200 else None
+
+
+def told(event: Event) -> Event:
+    """An event with its words."""
+    return {**event, "what": {**event["what"], "text": words(event)}}

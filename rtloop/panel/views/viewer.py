@@ -151,8 +151,11 @@ class Viewer:
         return None if self._drawn is None or past is None else self._drawn.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        self._told, events = self._feed.events.after(self._told)
-        return pack("events", {"events": events}) if events else None
+        told = self._feed.events.after(self._told)
+        if not told:
+            return None
+        self._told = told[-1][0]
+        return pack("events", {"events": [event for _, event in told]})
 
     def _refuse(self, name: str, error: str) -> None:
         frame = pack("refused", {"wish": name[:100], "error": error[:2000]})

@@ -8,7 +8,7 @@ from rtloop.values import counted
 
 
 def words(event: Event) -> str:
-    """Of an event as `event_of` makes it; empty where its kind says all there is."""
+    """Of an event as `event_of` makes it, of late ticks as `Lateness` does; empty where its kind says all there is."""
     what = event["what"]
     match event["kind"]:
         case "set_reference":
@@ -20,10 +20,7 @@ def words(event: Event) -> str:
         case "tripped":
             return what["reason"] or ", ".join(what["causes"])
         case "periods_missed":
-            return counted(int(what["periods"] or 0), "period")
-        case "lateness_over":
-            periods, ticks = (int(what[name] or 0) for name in ("periods", "late_ticks"))
-            return f"{counted(periods, 'period')} missed by {counted(ticks, 'tick')}"
+            return f"{counted(what['late_ticks'], 'late tick')}, worst {what['worst_ms']:.3g} ms"
     return ""
 
 

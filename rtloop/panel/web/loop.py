@@ -10,7 +10,7 @@ from rtloop.panel.views.past import longest_s
 
 
 def loop_for_pages(loop: Description) -> dict[str, Any]:
-    """Name, rate, signals with units, the longest screen, and the limits of each axis as they are configured."""
+    """Name, rate, signals with units, the longest screen, and what limits and interlocks are where nothing is said."""
     return {
         "name": loop.name,
         "rate_hz": loop.rate_hz,
@@ -18,17 +18,5 @@ def loop_for_pages(loop: Description) -> dict[str, Any]:
         "columns": [column._asdict() for column in loop.columns],
         "units": {column.name: column.unit for column in loop.columns},
         "longest_s": longest_s(len(loop.columns), loop.rate_hz),
-        "limits": {name: _limits(axis) for name, axis in loop.axes.items()},
-    }
-
-
-def _limits(axis: dict[str, Any]) -> dict[str, float]:
-    """As configured, or by default."""
-    limits = LimitsOptions.model_validate(axis.get("limits") or {})
-    interlocks = InterlockOptions.model_validate(axis.get("interlocks") or {})
-    return {
-        "drive_v": limits.drive_v,
-        "lowest_v": limits.lowest_v,
-        "command_um": limits.command_um,
-        "position_um": interlocks.position_um,
+        "defaults": {"limits": LimitsOptions().model_dump(), "interlocks": InterlockOptions().model_dump()},
     }

@@ -33,6 +33,8 @@ def test_whoever_arms_starts_sets_tunes_undoes_captures_and_stops_sees_all_of_it
     page.fill("#setpoint", "12,5")
     page.keyboard.press("Enter")
     near(page, "#position-x", 12.5)
+    for figure in (2, 3):  # low and high: sweeps from before it was set are over
+        near(page, f"#traces tbody tr:nth-of-type(2) td:nth-of-type({figure})", 12.5, 0.001)
     near(page, "#traces tbody tr:nth-of-type(1) td:nth-of-type(4)", 12.5)
     assert trace(page, "x_reference_um", 1) == trace(page, "x_reference_um", 2) == 12.5
     assert trace(page, "x_position_um", 3) == pytest.approx(12.5, abs=0.1)
@@ -112,10 +114,12 @@ def test_the_keyboard_alone_drives(page: Any) -> None:
     keys.press("]")
     near(page, "#position-x", 6.25)
     keys.press("m")
+    page.wait_for_selector("[aria-label='Cursor A'][aria-valuenow]")  # placed in the next frame
     page.focus("[role=slider][aria-label='Cursor A']")
     at_s = float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow"))
     keys.press("Shift+ArrowRight")
-    assert float(page.get_attribute("[aria-label='Cursor A']", "aria-valuenow")) > at_s
+    moved = "(at_s) => Number(document.querySelector('[aria-label=\"Cursor A\"]').ariaValueNow) > at_s"
+    page.wait_for_function(moved, arg=at_s)
     keys.press("3")
     assert page.is_visible("#spectrum")
     keys.press("?")

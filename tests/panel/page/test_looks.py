@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import AXE, opened, running, said, stopped
+from tests.panel.page.browser import AXE, running, said, stopped
 
 MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings")
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
-
-
-@pytest.fixture(scope="module")
-def shown(browser: Any, address: str) -> Iterator[Any]:
-    """One page for all that is only looked at: windows and themes change under it, as they do for people."""
-    page = opened(browser, address)
-    yield page
-    assert not page.faults
-    page.context.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -41,9 +31,6 @@ def test_axe_finds_no_violation_in_any_view(shown: Any, scheme: str) -> None:
         drawn(page)
         found = page.evaluate(check, RULES)
         assert [(view, one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
-    page.keyboard.press("Escape")
-    page.keyboard.press("1")
-    page.keyboard.press("m")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(320, "light"), (400, "dark"), (1400, "light"), (2560, "dark")])
@@ -58,6 +45,7 @@ def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(shown: Any, width:
         assert page.is_visible(f"#{view}")
         assert page.is_visible("#scope") or width < 1900, "a large screen keeps the scope"
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), view
+        assert page.evaluate("document.documentElement.scrollHeight <= innerHeight") or width < 1400, view
         for scrolled in ("0", "document.body.scrollHeight"):
             page.evaluate(f"scrollTo(0, {scrolled})")
             seen = page.evaluate(
@@ -78,7 +66,6 @@ def test_with_reduced_motion_it_works_as_well(shown: Any) -> None:
     shown.emulate_media(reduced_motion="reduce")
     assert shown.evaluate(f"{MOVING}.length") == 0
     said(shown, "#position-x", r"\d")
-    shown.emulate_media(reduced_motion="no-preference")
 
 
 def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any, bench: Bench) -> None:
@@ -89,7 +76,7 @@ def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any, bench: Bench) 
     page.keyboard.press("Escape")
     page.keyboard.press("m")
     slider = "[role=slider][aria-label='Cursor A']"
-    assert "Cursor A" in page.get_attribute(slider, "aria-valuetext")
+    page.wait_for_selector(f"{slider}[aria-valuetext*='Cursor A']")  # placed in the next frame
     said(page, "#measured", "1/Δt")
     stopped(page)
 

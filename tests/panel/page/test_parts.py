@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -12,17 +13,20 @@ from typing import Any
 import pytest
 
 from rtloop.panel.web.application import PAGE
-from tests.panel.page.browser import PATIENCE_S, launched
+from tests.panel.page.browser import PATIENCE_S
 
 SET_UP = """async () => {
-  const [{Scope}, {Reference}, {Drive}, {showEvents}, {themes}] = await Promise.all(
-    ["scope/scope", "desk/reference", "desk/drive", "desk/events", "palette"].map((name) => import(`/page/${name}.js`)),
-  );
+  const names = ["scope/scope", "views/xy", "palette"];
+  names.push(...["reference", "drive", "events", "configuration"].map((name) => `desk/${name}`));
+  const parts = await Promise.all(names.map((name) => import(`/page/${name}.js`)));
+  const {Scope, Reference, Drive, showEvents, Configuration, Xy, themes} = Object.assign({}, ...parts);
   const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
-  const columns = [["x_position_um", "µm"], ["x_reference_um", "µm"], ["x_drive_v", "V"]];
-  const panel = {axes: ["x"], longest_s: 60, rate_hz: 1000, columns: columns.map(([name, unit]) => ({name, unit}))};
+  const units = {x_position_um: "µm", x_reference_um: "µm", x_drive_v: "V", tick: "1", y_drive_v: "V"};
+  const columns = Object.entries(units).map(([name, unit]) => ({name, unit}));
+  const defaults = {limits: {command_um: 30}, interlocks: {}};
+  const panel = {axes: ["x", "y"], longest_s: 60, rate_hz: 1000, columns, defaults};
   const arrays = {offset: Float32Array.from({length: 200}, (_, tick) => tick - 40)};
-  for (const [name] of columns) {
+  for (const {name} of columns) {
     arrays[`${name}:low`] = arrays[`${name}:high`] = arrays.offset.map((tick) => 12 + Math.sin(tick / 9));
   }
   themes(document.getElementById("theme"), () => {});
@@ -35,28 +39,39 @@ SET_UP = """async () => {
   const answering = {driving: async (_, {value}) => (asked.push(value), {tick: 100})};
   window.scope = new Scope(live, panel);
   window.drive = new Drive(live, {tell() {}});
-  window.reference = new Reference(live, panel, answering, () => {});
+  window.configuration = new Configuration(panel);
+  window.reference = new Reference(live, panel, configuration, answering, () => {});
+  window.xy = new Xy(live, panel);
   showEvents(live);
 }"""
 
+Y = {"name": "y", "limits": {"command_um": 25, "drive_min_v": 0}}
+
 
 @pytest.fixture(scope="module")
-def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def parts(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The page's elements and its parts, with nobody behind them."""
     folder: Path = tmp_path_factory.mktemp("parts")
     (folder / "page").symlink_to(PAGE)
+    (folder / "api").mkdir()
+    (folder / "api" / "configuration").write_text(json.dumps({"values": {"axis": [{"name": "x"}, Y]}}))
     scriptless = (PAGE / "index.html").read_text(encoding="utf-8").replace('src="/page/main.js"', "")
     (folder / "index.html").write_text(scriptless, encoding="utf-8")
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    with launched() as browser:
-        page = browser.new_page()
-        page.set_default_timeout(1000 * PATIENCE_S)
-        page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
-        page.evaluate(SET_UP)
-        yield page
+    page = browser.new_page()
+    page.set_default_timeout(1000 * PATIENCE_S)
+    page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
+    page.evaluate(SET_UP)
+    yield page
+    page.close()
     server.shutdown()
     server.server_close()
+
+
+def choose(parts: Any, picker: str, text: str) -> None:
+    parts.click(f"#{picker} button")
+    parts.click(f"#{picker}-list li:text-is('{text}')")
 
 
 def says(parts: Any, selector: str, text: str) -> None:
@@ -90,6 +105,57 @@ def test_an_event_that_is_told_again_is_shown_once(parts: Any) -> None:
     for _ in range(2):
         parts.evaluate(f"tell('events', {{events: [{event}]}})")
     assert parts.locator("#events li").all_inner_texts() == ["5\nada\nset mode · off"]
+
+
+def test_late_ticks_are_one_row_that_grows(parts: Any) -> None:
+    event = "{tick: 9, run: 0, kind: 'periods_missed', who: 'loop', axis: null, what: {text: '%s late ticks'}}"
+    for count in (2, 3):
+        parts.evaluate(f"tell('events', {{events: [{event % count}]}})")
+    assert parts.locator("#events li").all_inner_texts()[0] == "9\nloop\n3 late ticks"
+    assert parts.locator("#events li:has-text('late')").count() == 1
+
+
+def test_the_slider_ends_where_limits_are_now(parts: Any) -> None:
+    ends = "[document.getElementById('setpoint-slider')].map(({min, max}) => [Number(min), Number(max)])[0]"
+    parts.evaluate("state({mode: 'closed_loop'})")
+    choose(parts, "desk-axis", "axis y")
+    assert parts.evaluate(ends) == [-30, 30]
+    parts.evaluate("configuration.read()")
+    assert parts.evaluate(ends) == [-25, 25]
+    parts.evaluate("state({mode: 'raw'})")
+    assert parts.evaluate(ends) == [0, 10]
+    parts.evaluate("state()")
+    choose(parts, "desk-axis", "axis x")
+
+
+def test_another_axis_is_not_sent_the_setpoint_of_this_one(parts: Any) -> None:
+    parts.evaluate("state({axes: {x: {reference_um: 5}, y: {reference_um: -2}}})")
+    parts.fill("#setpoint", "20")
+    choose(parts, "desk-axis", "axis y")
+    assert parts.input_value("#setpoint") == "-2.00"
+    choose(parts, "desk-axis", "axis x")
+
+
+def test_a_list_near_the_edge_opens_upward_and_names_axes_first(parts: Any) -> None:
+    parts.locator("#add-trace").evaluate("(one) => one.scrollIntoView({block: 'end'})")
+    parts.click("#add-trace button")
+    below, edge = parts.evaluate(
+        "[document.getElementById('add-trace-list').getBoundingClientRect().bottom, innerHeight]"
+    )
+    assert below <= edge
+    names = parts.locator("#add-trace-list li").all_inner_texts()
+    assert names.index("tick") == len(names) - 1
+    parts.keyboard.press("Escape")
+
+
+def test_the_key_names_a_model_only_where_there_is_one(parts: Any) -> None:
+    loop = "drive_v: new Float32Array([0, 1]), position_um: new Float32Array([0, 9])"
+    model = ", model_drive_v: new Float32Array([0, 1]), model_position_um: new Float32Array([0, 8])"
+    parts.evaluate("document.getElementById('xy').hidden = false, xy.open()")
+    for more, named in (("", False), (model, True), ("", False)):
+        parts.evaluate(f"tell('xy', {{loop_percent: null, arrays: {{{loop}{more}}}}})")
+        parts.wait_for_selector("#xy-model", state="visible" if named else "hidden")
+    parts.evaluate("document.getElementById('xy').hidden = true")
 
 
 def test_the_scale_that_is_held_is_the_one_that_was_in_force(parts: Any) -> None:

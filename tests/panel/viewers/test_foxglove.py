@@ -116,17 +116,18 @@ class Feed:
     def __init__(self) -> None:
         self.lock, self.viewers, self.tick = threading.Lock(), [], 0
         self.kept: list[tuple[int, dict[str, Any]]] = []
-        self.events: Any = SimpleNamespace(after=self.after)
+        self.events: Any = SimpleNamespace(after=self.after, newest=0)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def after(self, number: int) -> tuple[int, list[dict[str, Any]]]:
-        return len(self.kept), [event for at, event in list(self.kept) if at > number]
+    def after(self, number: int) -> list[tuple[int, dict[str, Any]]]:
+        return [one for one in list(self.kept) if one[0] > number]
 
     def say(self, kind: str, tick: int) -> None:
         event = {"tick": tick, "kind": kind, "who": "ada", "axis": None, "what": {"mode": "off"}}
         self.kept.append((len(self.kept) + 1, event))
+        self.events.newest += 1
 
     def join(self, viewer: Any) -> None:
         with self.lock:

@@ -10,8 +10,9 @@ import numpy as np
 
 from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.errors import UnavailableError
-from rtloop.panel.views.events import Events
+from rtloop.panel.views.events import KEPT, Events
 
+KINDS = {"m": Kind.PERIODS_MISSED, "o": Kind.LATENESS_OVER, "t": Kind.TRIPPED}
 LOOP: Any = SimpleNamespace(rate_hz=1000.0, axes={"x": {}})
 
 
@@ -30,7 +31,46 @@ def test_a_silent_service_is_asked_for_one_name_and_not_for_all() -> None:
     events = Events(service)
     events.take(messages, LOOP, 0)
     assert asked == ["/asked_by?identity=0", "/asked_by?identity=1"]
-    told = [event["who"] for event in events.after(0)[1]]
+    told = [event["who"] for _, event in events.after(0)]
     assert (told[0], set(told[1:]), len(told)) == ("ada", {"operator"}, 50)
     events.take(messages[:1], LOOP, 0)
     assert len(asked) == 3, "it may answer again"
+
+
+def late(text: str, first: int = 0) -> np.ndarray:
+    """Messages such as "m3 o9,2,6 t": kind and values of each, a tick apart."""
+    messages = np.zeros(len(text.split()), MESSAGE)
+    for place, word in enumerate(text.split()):
+        values = [float(value) for value in word[1:].split(",") if value]
+        messages[place]["tick"], messages[place]["kind"] = first + place, KINDS[word[0]]
+        messages[place]["values"][: len(values)] = values
+    return messages
+
+
+def shown(events: Events, behind: int = 0) -> list[tuple[int, str]]:
+    """Tick and words of what was told behind a number."""
+    return [(event["tick"], event["what"]["text"]) for _, event in events.after(behind)]
+
+
+def test_late_ticks_are_one_row_until_something_else_happens() -> None:
+    events = Events(SimpleNamespace())  # type: ignore[arg-type]
+    events.take(late("m3"), LOOP, 0)
+    assert shown(events) == [(0, "1 late tick, worst 3 ms")]
+    events.take(late("o9,2,6 m1 m2", 1), LOOP, 0)
+    assert shown(events) == [(0, "4 late ticks, worst 6 ms")]
+    assert shown(events, 1) == shown(events), "it grew, and is told again"
+    assert shown(events, events.newest) == []
+    events.take(late("t o20,12,8 m1", 4), LOOP, 0)
+    assert [tick for tick, _ in shown(events)] == [4, 0, 6], "in the order in which they were told"
+    assert shown(events)[1:] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
+    events.take(late("m1", 7), LOOP, 1)
+    assert shown(events)[-1] == (7, "1 late tick, worst 1 ms"), "another run"
+
+
+def test_late_ticks_push_off_no_trip() -> None:
+    events = Events(SimpleNamespace())  # type: ignore[arg-type]
+    events.take(late("t"), LOOP, 0)
+    for tick in range(1, 2 * KEPT, 2):
+        events.take(late("m3 o9,2,6", tick), LOOP, 0)
+    assert [event["kind"] for _, event in events.after(0)] == ["tripped", "periods_missed"]
+    assert events.after(0)[-1][1]["what"]["late_ticks"] == 2 * KEPT

@@ -36,7 +36,8 @@ def test_what_the_page_is_told(bench: Bench, browser: Browser):
     status, said = browser.json("GET", "/api/panel")
     assert status == 200
     assert (said["name"], said["rate_hz"], said["axes"], said["longest_s"]) == ("lab", 4000.0, ["x"], 60.0)
-    assert said["limits"] == {"x": {"drive_v": 10.0, "lowest_v": -10.0, "command_um": 42.0, "position_um": 60.0}}
+    assert said["defaults"]["limits"]["command_um"] == 42.0
+    assert said["defaults"]["interlocks"]["position_um"] == 60.0
     by_name = {column["name"]: column for column in said["columns"]}
     assert (by_name["x_drive_v"]["unit"], by_name["lateness_us"]["unit"]) == ("V", "µs")
     assert "drive u" in by_name["x_drive_v"]["meaning"]

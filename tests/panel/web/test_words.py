@@ -25,8 +25,6 @@ from rtloop.signals import Flag, Mode
         (Kind.SET_MODE, (Mode.CLOSED_LOOP,), "closed loop"),
         (Kind.LOAD_LAW, (1.0,), "another controller"),
         (Kind.LOAD_LAW, (0.0,), "other numbers"),
-        (Kind.PERIODS_MISSED, (1.0,), "1 period"),
-        (Kind.LATENESS_OVER, (9.0, 2.0, 6.0), "9 periods missed by 2 ticks"),
         (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)),
          "x: position 61 µm, its limit 60 µm"),
         (Kind.PARKED, (), ""),

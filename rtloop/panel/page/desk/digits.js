@@ -6,7 +6,7 @@ import { fixed } from "../numbers.js";
 const EVERY_MS = 150;
 
 /** Show the axes of `panel` from the states that come. */
-export function showDigits(live, panel) {
+export function showDigits(live, panel, configuration) {
   const shown = panel.axes.map((axis) => {
     const part = (name, unit) => {
       const [value, of] = [make("span", {}, "—"), make("span", {}, unit)];
@@ -38,8 +38,8 @@ export function showDigits(live, panel) {
       say(reference, fixed(values.reference_um, 3));
       say(error, raw ? "—" : fixed(values.error_um, 3));
       say(drive, fixed(values.drive_v, 3));
-      const { lowest_v = -10, drive_v = 10 } = panel.limits?.[axis] ?? {};
-      const place = (volts) => Math.min(Math.max(((volts - lowest_v) / (drive_v - lowest_v)) * 100, 0), 100);
+      const { lowest_v, highest_v } = configuration.limits(axis);
+      const place = (volts) => Math.min(Math.max(((volts - lowest_v) / (highest_v - lowest_v)) * 100, 0), 100);
       const [zero, now] = [place(0), place(values.drive_v ?? 0)];
       fill.style.left = `${Math.min(zero, now)}%`;
       fill.style.width = `${Math.abs(now - zero)}%`;

@@ -4,21 +4,30 @@ import { $, make } from "../dom.js";
 import { counted } from "../numbers.js";
 
 const MOST = 200;
+const LATE = "periods_missed";
+/** Late ticks without anything else between them: one row, told again as it grows. */
+const CALLED = { [LATE]: "", load_law: "tuned" };
+
+const keyOf = (event) => (event.kind === LATE ? `${event.run} ${event.tick}` : JSON.stringify(event));
+
+function rowOf({ tick, kind, who, axis, what }) {
+  const tripped = kind === "tripped"; // its words begin with the axis
+  const text = [!tripped && axis, CALLED[kind] ?? String(kind).replaceAll("_", " "), what?.text].filter(Boolean).join(" · ");
+  return make("li", { class: tripped && "trip", title: text }, make("span", {}, counted(tick)), make("span", {}, who ?? ""), text);
+}
 
 export function showEvents(live) {
-  const seen = new Set();
+  const rows = new Map();
   live.addEventListener("events", ({ detail }) => {
-    const list = $("events");
     for (const event of detail.events) {
-      const said = JSON.stringify(event);
-      if (seen.has(said)) continue; // said again after a break
-      seen.add(said);
-      if (seen.size > 2 * MOST) seen.delete(seen.values().next().value);
-      const { tick, kind, who, axis, what } = event;
-      const tripped = kind === "tripped";
-      const text = [axis, String(kind).replaceAll("_", " "), what?.text].filter(Boolean).join(" · ");
-      list.prepend(make("li", { class: tripped && "trip", title: text }, make("span", {}, counted(tick)), make("span", {}, who ?? ""), text));
+      const [key, row] = [keyOf(event), rowOf(event)];
+      if (rows.has(key)) rows.get(key).replaceWith(row); // it grew, or is said again after a break
+      else $("events").prepend(row);
+      rows.set(key, row);
     }
-    while (list.children.length > MOST) list.lastElementChild.remove();
+    for (const [key, row] of [...rows].slice(0, -MOST)) {
+      row.remove();
+      rows.delete(key);
+    }
   });
 }

@@ -29,7 +29,7 @@ export function columns(text) {
 }
 
 export class Reference {
-  #panel;
+  #configuration;
   #drive;
   #axis;
   #kind;
@@ -42,11 +42,12 @@ export class Reference {
   #asked = {};
   #mode = null;
 
-  constructor(live, panel, drive, changed) {
-    this.#panel = panel;
+  constructor(live, panel, configuration, drive, changed) {
+    this.#configuration = configuration;
     this.#drive = drive;
     this.#axis = new Picker($("desk-axis"), () => {
       this.#limit();
+      this.#start();
       changed();
     });
     this.#axis.options = panel.axes.map((value) => ({ value, text: `axis ${value}` }));
@@ -65,13 +66,15 @@ export class Reference {
       event.preventDefault();
       this.#try(action, $(place));
     });
+    configuration.addEventListener("read", () => this.#limit());
     submitted("setpoint-form", () => this.set(fromField($("setpoint"))), "setpoint-error");
     submitted("generator", () => this.#play(), "generator-error");
     submitted("waveform", () => this.#upload(), "waveform-error");
     for (const button of document.querySelectorAll("[data-jog]")) button.addEventListener("click", () => this.jog(Number(button.dataset.jog)));
     live.addEventListener("state", ({ detail }) => {
-      if (!Number.isFinite(this.#now[this.axis]?.reference_um) && detail.axes) $("setpoint").value = $("setpoint-slider").value = (detail.axes[this.axis]?.reference_um ?? 0).toFixed(2);
+      const first = !Number.isFinite(this.#now[this.axis]?.reference_um) && detail.axes;
       this.#now = detail.axes ?? this.#now;
+      if (first) this.#start();
       this.#tick = detail.tick ?? -1;
       if (detail.mode === this.#mode) return;
       this.#mode = detail.mode;
@@ -81,6 +84,12 @@ export class Reference {
 
   get axis() {
     return this.#axis.value;
+  }
+
+  /** Show what the axis is at: what was typed for another one is not to be sent to this one. */
+  #start() {
+    $("setpoint").value = $("setpoint-slider").value = (this.#now[this.axis]?.reference_um ?? 0).toFixed(2);
+    complain($("setpoint-error"), null);
   }
 
   /** Hold a value, in µm, in V in raw mode. */
@@ -108,12 +117,9 @@ export class Reference {
   }
 
   #limit() {
-    const { command_um = 40, position_um = 40, drive_v = 10, lowest_v = -drive_v } = this.#panel.limits?.[this.axis] ?? {};
+    const { most_um, lowest_v, highest_v } = this.#configuration.limits(this.axis);
     const raw = this.#mode === "raw";
-    const most = raw ? drive_v : Math.min(command_um, position_um);
-    $("setpoint-slider").min = String(raw ? lowest_v : -most);
-    $("setpoint-slider").max = String(most);
-    $("setpoint-slider").step = raw ? "0.001" : "0.01";
+    Object.assign($("setpoint-slider"), raw ? { min: lowest_v, max: highest_v, step: 0.001 } : { min: -most_um, max: most_um, step: 0.01 });
     this.#unit = raw ? "V" : "µm";
     $("setpoint-form").querySelector(".unit").textContent = this.#unit;
     this.#jog.options = JOGS.map((value) => ({ value, text: `${value} ${this.#unit}` }));

@@ -1,8 +1,8 @@
 // Tuning: nothing of the controller or the model is applied before its margins, its step and what it bears were seen.
 
-import { command, get } from "../api.js";
+import { command } from "../api.js";
 import { $, calmly, complain, make, say } from "../dom.js";
-import { fromField } from "../numbers.js";
+import { counted, fromField } from "../numbers.js";
 import { Picker } from "../picker.js";
 import { Preview } from "./preview.js";
 
@@ -15,14 +15,15 @@ export class Tuning {
   #axis;
   #section;
   #key;
-  #values = {};
+  #configuration;
   #asked = 0;
   #shown = null;
   #preview = new Preview();
 
   /** `axis()` is the axis of the desk. */
-  constructor(drive, axis) {
+  constructor(drive, configuration, axis) {
     this.#drive = drive;
+    this.#configuration = configuration;
     this.#axis = axis;
     this.#section = new Picker($("tune-section"), () => this.#arrange());
     this.#section.options = SECTIONS.map((value) => ({ value, text: value }));
@@ -41,20 +42,19 @@ export class Tuning {
     });
     $("tune-many").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.#ask(() => fromJson($("tune-json").value));
+      this.#ask(() => changed(fromJson($("tune-json").value), this.#values));
     });
+    configuration.addEventListener("read", () => this.#arrange());
     $("apply").addEventListener("click", () => this.#apply());
     $("discard").addEventListener("click", () => this.#start());
     $("undo").addEventListener("click", () => this.undo());
   }
 
-  /** Read the configuration as it runs. */
+  /** Read the configuration as it runs, and begin anew from it. */
   async read() {
     try {
-      const { values } = await get("/api/configuration");
-      this.#values = values.axis.find(({ name }) => name === this.#axis()) ?? {};
+      await this.#configuration.read();
       complain($("tune-error"), null);
-      this.#arrange();
     } catch (error) {
       complain($("tune-error"), error);
     }
@@ -68,17 +68,24 @@ export class Tuning {
   async undo() {
     const answer = await this.#drive.driving("undo", { axis: this.#axis() }, $("tune-error"));
     if (!answer) return;
-    say($("tune-done"), `undone at tick ${answer.tick}${answer.undone ? `: ${answer.undone}` : ""}`);
+    say($("tune-done"), `undone at tick ${counted(answer.tick)}${answer.undone ? `: ${answer.undone}` : ""}`);
     await this.read();
   }
 
+  /** Of the section that is chosen. */
+  get #values() {
+    return this.#configuration.section(this.#axis(), this.#section.value);
+  }
+
   #numbersOf() {
-    return Object.entries(this.#values[this.#section.value] ?? {}).filter(([, value]) => typeof value === "number");
+    return Object.entries(this.#values).filter(([, value]) => typeof value === "number");
   }
 
   #arrange() {
     const keys = this.#numbersOf();
-    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: "no number here" }];
+    const lists = !keys.length && Object.keys(this.#values).length > 0;
+    this.#key.options = keys.length ? keys.map(([value]) => ({ value, text: value })) : [{ value: "", text: lists ? "lists alone: see below" : "nothing configured" }];
+    if (lists) $("tune-json").closest("details").open = true;
     this.#start();
   }
 
@@ -92,7 +99,7 @@ export class Tuning {
     const step = 10 ** Math.floor(Math.log10(span / 100));
     Object.assign($("tune-slider"), { step: String(Number(step.toPrecision(1))), min: String(Number(((value || 0) - span).toPrecision(6))), max: String(Number(((value || 0) + span).toPrecision(6))) });
     $("tune-slider").value = String(value ?? 0);
-    $("tune-json").value = "{}";
+    $("tune-json").value = asJson(this.#values);
     this.#withdraw();
   }
 
@@ -110,7 +117,7 @@ export class Tuning {
     const number = this.#asked;
     try {
       const wanted = { axis: this.#axis(), section: this.#section.value, values: read() };
-      if (!Object.keys(wanted.values).length) throw new Error("keys: none given; one at least is needed");
+      if (!Object.keys(wanted.values).length) throw new Error("keys: none is changed; one at least is needed");
       $("tune").setAttribute("aria-busy", "true");
       const { before, after } = await command("preview", wanted);
       if (number !== this.#asked) return;
@@ -134,11 +141,22 @@ export class Tuning {
     const answer = await this.#drive.driving("tune", wanted, $("tune-error"));
     $("apply").disabled = false;
     if (!answer) return;
-    say($("tune-done"), `applied at tick ${answer.tick}`);
+    say($("tune-done"), `applied at tick ${counted(answer.tick)}`);
     this.#withdraw();
     $("undo").focus();
     await this.read();
   }
+}
+
+/** A key to a line, lists as they are. */
+function asJson(values) {
+  const lines = Object.entries(values).map(([key, value]) => `  ${JSON.stringify(key)}: ${JSON.stringify(value)}`);
+  return lines.length ? `{\n${lines.join(",\n")}\n}` : "{}";
+}
+
+/** Those of `wanted` that are otherwise now. */
+function changed(wanted, now) {
+  return Object.fromEntries(Object.entries(wanted).filter(([key, value]) => JSON.stringify(value) !== JSON.stringify(now[key])));
 }
 
 function fromJson(text) {

@@ -108,12 +108,18 @@ export class Scope {
     $("autoscale").setAttribute("aria-pressed", String(this.#view.autoscale));
     this.#figures.arrange(this.traces, (gone) => this.#traces(this.#view.signals.filter((name) => name !== gone)));
     const free = this.#panel.columns.filter(({ name }) => !this.#view.signals.includes(name));
+    free.sort((one, other) => this.#ofTheHost(one) - this.#ofTheHost(other)); // the axes' first
     this.#add.options = [{ value: "", text: "a trace…" }, ...free.map(({ name, unit }) => ({ value: name, text: unit === "1" ? name : `${name}, ${unit}` }))];
     this.#add.value = "";
     this.#add.disabled = this.#view.signals.length >= MOST_TRACES;
     this.#markers.arrange(this.#view, this.#span());
     this.#show();
     showScales(this.#lanes, this.#view.autoscale, () => this.#later());
+  }
+
+  /** A signal of no axis. */
+  #ofTheHost({ name }) {
+    return !this.#panel.axes.some((axis) => name.startsWith(`${axis}_`));
   }
 
   #keep(changes) {

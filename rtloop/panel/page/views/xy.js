@@ -69,6 +69,7 @@ export class Xy {
   #show() {
     if (!this.#loop || !this.#chart) return;
     const { drive_v, position_um, model_drive_v = [], model_position_um = [] } = this.#loop.arrays;
+    $("xy-model").hidden = !("model_drive_v" in this.#loop.arrays);
     const limits = (key, least, ...values) => {
       const all = values.flatMap((numbers) => [...numbers]).filter(Number.isFinite);
       const [low, high] = all.reduce(([a, b], value) => [Math.min(a, value), Math.max(b, value)], [Infinity, -Infinity]);
