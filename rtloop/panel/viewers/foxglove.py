@@ -145,7 +145,7 @@ class _Viewer:
             return
         if not (told := self._feed.events.after(self._told)):
             return
-        self._told, event = told[0]
+        self._told, event = min(told, key=lambda row: row[0])
         texts = event["kind"], event["who"], event["axis"] or "", json.dumps(event["what"])
         await self._send(EVENTS, now_ns, cdr.event_message(now_ns, event["tick"], *texts))
         self._event_due_s = self._clock() + 1 / EVENTS_HZ

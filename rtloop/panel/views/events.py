@@ -20,7 +20,7 @@ from rtloop.recording.file.topics.events import Event, event_of
 
 KEPT = 200
 ASK_S = 0.2
-"""For a name; ticks come meanwhile, and the ring holds ten seconds: a silent service is not asked for the others."""
+"""For a name; ticks come meanwhile, and the ring holds ten seconds: a silent service is asked for the others later."""
 
 
 @dataclass
@@ -41,17 +41,20 @@ class Events:
         self._late: tuple[Row, Lateness] | None = None
         """The last one of late ticks."""
         self._lock = threading.Lock()
+        self._unasked: deque[tuple[Row, int]] = deque(maxlen=KEPT)
+        """Rows whose operator's name the service has not said yet, and the identity of each."""
         self.newest = 0
         """Number of what was told last."""
 
     def take(self, messages: Any, loop: Description, run: int) -> None:
-        """Add records of MESSAGE, (n,), of the run that is read; who asked is asked of the service while it answers."""
-        answers = True
+        """Add records of MESSAGE, (n,), or none, of the run that is read; who asked is asked of the service."""
+        answers = self._ask()
         for message in messages[-KEPT:]:
-            name = None
-            if answers and int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR:
+            name, identity = None, int(message["identity"])
+            asked = int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR
+            if asked and answers:
                 try:
-                    name = self._name(int(message["identity"]))
+                    name = self._name(identity)
                 except RtloopError:
                     answers = False
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
@@ -59,12 +62,28 @@ class Events:
             with self._lock:
                 self.newest += 1
                 self._add(event, loop.rate_hz)
+            if asked and not answers:
+                self._unasked.append((self._kept[-1], identity))
+
+    def _ask(self) -> bool:
+        """Have rows tell who asked, oldest first; whether the service answers."""
+        while self._unasked:
+            row, identity = self._unasked[0]
+            try:
+                name = self._name(identity)
+            except RtloopError:
+                return False
+            self._unasked.popleft()
+            if name is not None:
+                with self._lock:
+                    self.newest += 1
+                    row.number, row.event = self.newest, {**row.event, "who": name}
+        return True
 
     def after(self, number: int) -> list[tuple[int, Event]]:
-        """What was told behind `number` and is kept, in turn, each as it is now, with its number."""
+        """What was told behind `number` and is kept, as it happened, each as it is now, with its number."""
         with self._lock:
-            rows = [(row.number, row.event) for row in self._kept if row.number > number]
-        return sorted(rows, key=lambda row: row[0])
+            return [(row.number, row.event) for row in self._kept if row.number > number]
 
     def _add(self, event: Event, rate_hz: float) -> None:
         if event["kind"] not in (BEGINS, OVER):

@@ -146,7 +146,7 @@ class Feed:
 
     def _tell_events(self, messages: Messages) -> None:
         """Who asked is asked of the service before the lock is taken."""
-        if self.loop is not None and len(messages):
+        if self.loop is not None:
             self.events.take(messages, self.loop, self.run)
 
     def _begin(self, loop: Description) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from rtloop.recording.file.events import Event
+from rtloop.recording.file.topics.events import Event
 
 BEGINS, OVER = "periods_missed", "lateness_over"
 

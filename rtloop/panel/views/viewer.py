@@ -154,7 +154,7 @@ class Viewer:
         told = self._feed.events.after(self._told)
         if not told:
             return None
-        self._told = told[-1][0]
+        self._told = max(number for number, _ in told)
         return pack("events", {"events": [event for _, event in told]})
 
     def _refuse(self, name: str, error: str) -> None:

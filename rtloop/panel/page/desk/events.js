@@ -8,7 +8,7 @@ const LATE = "periods_missed";
 /** Late ticks without anything else between them: one row, told again as it grows. */
 const CALLED = { [LATE]: "", load_law: "tuned" };
 
-const keyOf = (event) => (event.kind === LATE ? `${event.run} ${event.tick}` : JSON.stringify(event));
+const keyOf = (event) => (event.kind === LATE ? `${event.run} ${event.tick}` : JSON.stringify({ ...event, who: null }));
 
 function rowOf({ tick, kind, who, axis, what }) {
   const tripped = kind === "tripped"; // its words begin with the axis
@@ -21,7 +21,7 @@ export function showEvents(live) {
   live.addEventListener("events", ({ detail }) => {
     for (const event of detail.events) {
       const [key, row] = [keyOf(event), rowOf(event)];
-      if (rows.has(key)) rows.get(key).replaceWith(row); // it grew, or is said again after a break
+      if (rows.has(key)) rows.get(key).replaceWith(row); // it grew, or says who asked, or is said again after a break
       else $("events").prepend(row);
       rows.set(key, row);
     }
