@@ -67,7 +67,7 @@ def test_late_ticks_are_one_row_until_something_else_happens() -> None:
     assert shown(events, events.newest) == []
     events.take(late("t o20,12,8 m1", 4), LOOP, 0)
     assert [tick for tick, _ in shown(events)] == [0, 4, 6], "in the order in which they happened"
-    assert shown(events)[1:] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
+    assert shown(events)[::2] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
     events.take(late("m1", 7), LOOP, 1)
     assert shown(events)[-1] == (7, "1 late tick, worst 1 ms"), "another run"
 
