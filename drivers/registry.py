@@ -28,11 +28,11 @@ def driver_class(kind: str) -> type[Driver]:
 
     Raises ValueError for an unknown kind, MissingLibrary for a module, or a package that it needs, that is not there.
     """
-    known = kinds()
-    if kind not in known:
-        raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(known)}")
-    module, _, name = known[kind].partition(":")
+    place = BUILT_IN.get(kind) or kinds().get(kind)  # what is installed is looked through where it has to be
+    if place is None:
+        raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(kinds())}")
+    module, _, name = place.partition(":")
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise MissingLibrary(f"driver {kind!r}, {known[kind]}: cannot be imported: {error}") from error
+        raise MissingLibrary(f"driver {kind!r}, {place}: cannot be imported: {error}") from error

@@ -18,7 +18,8 @@ What a driver raises is a `DriverError` (69, rtloop.drivers.errors), which knows
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 LOW_SPACE = 1 << 16
 """Beyond every errno: less space is free than is to stay free."""
@@ -60,6 +61,15 @@ class OutputError(RtloopError):
     def __init__(self, message: str, number: int = 0) -> None:
         super().__init__(message)
         self.number = number
+
+
+@contextmanager
+def writing(what: object) -> Iterator[None]:
+    """Where the system refuses, OutputError says `what` is written and why not."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{what}: {error.strerror or error}", error.errno or 0) from None
 
 
 class MissingExtra(RtloopError):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import Margins, margins
 from rtloop.analysis.step_response import step_metrics
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
@@ -57,7 +57,8 @@ class LoopAnalysis:
 
 def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
     """C(s) and D(s) without sampling or delay. Raises ValueError for a plant with direct feedthrough."""
-    return analyse(continuous_loop(controller, plant), 0, times_s)
+    loop = continuous_loop(controller, plant)
+    return analyse(loop, margins(loop), 0, times_s)
 
 
 def analyse_discrete(
@@ -68,14 +69,14 @@ def analyse_discrete(
     No delay is the least there can be: a command computed from a sample shows in the next one. Raises ValueError for
     a plant with direct feedthrough.
     """
-    return analyse(discrete_loop(controller, plant, delay_ticks), delay_ticks, times_s)
+    loop = discrete_loop(controller, plant, delay_ticks)
+    return analyse(loop, margins(loop), delay_ticks, times_s)
 
 
-def analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
-    """A loop that is put together already."""
+def analyse(loop: Loop, found: Margins, delay_ticks: int, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
+    """A loop that is put together already, with the margins that were found of it."""
     continuous = loop.period_s is None
     poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]
-    with_margins = margins(loop)._asdict()
     step = step_metrics(loop, times_s)
     return LoopAnalysis(
         period_s=loop.period_s,
@@ -91,7 +92,7 @@ def analyse(loop: Loop, delay_ticks: int, times_s: Sequence[float] = TIMES_S) ->
         step_times_s=tuple(float(t) for t in times_s),
         step_position=step.position_at,
         poles=tuple(complex(p) for p in poles),
-        **with_margins,
+        **found._asdict(),
     )
 
 

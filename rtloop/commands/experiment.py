@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import click
 
+from rtloop.commands.output import write_over
 from rtloop.commands.run import recover_leftovers
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, load
@@ -20,7 +21,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.drivers.errors import DriverError
-from rtloop.errors import ConfigError, LoopFault, OutputError, RtloopError
+from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.experiments.derive import derived, keep_tables
 from rtloop.experiments.page import page
 from rtloop.experiments.procedure import Experiment, Run, Unsuited
@@ -255,12 +256,7 @@ def _write(
         **{f"{name}-{theme}.png": png for name, files in made.pictures.items() for theme, png in files.items()},
     }
     for name, content in contents.items():
-        path = folder / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        except OSError as error:
-            raise OutputError(f"{path}: {error.strerror}") from None
+        write_over(folder / name, content)
     return made, [folder / name for name in contents]
 
 

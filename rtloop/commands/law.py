@@ -6,7 +6,7 @@ import errno
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import OutputError
+from rtloop.errors import OutputError, writing
 from rtloop.laws.registry import BUILT_IN, kinds, law_class, reference
 
 LAW = '''"""{title}: what it does, and where its equation is from.
@@ -121,10 +121,8 @@ def new_law(name: str, folder: Path) -> list[Path]:
     for path in paths:
         if path.exists():
             raise OutputError(f"{path}: is there already; it is not overwritten", errno.EEXIST)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in zip(paths, texts.values(), strict=True):
             path.write_text(text.format(title=title, name=name), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{folder}: {error.strerror}", error.errno or 0) from None
     return paths

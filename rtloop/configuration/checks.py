@@ -98,12 +98,14 @@ class AxisCheck:
     @cached_property
     def continuous(self) -> LoopAnalysis | None:
         """All there is to know of the loop on paper."""
-        return None if self.on_paper is None else analyse(self.on_paper, 0)
+        return None if self.on_paper is None else analyse(self.on_paper, margins(self.on_paper), 0)
 
     @cached_property
     def running(self) -> LoopAnalysis | None:
         """All there is to know of the loop as it will run."""
-        return None if self.on_model is None else analyse(self.on_model, self.delay_ticks)
+        if self.on_model is None or self.margins is None:
+            return None
+        return analyse(self.on_model, self.margins, self.delay_ticks)
 
     @cached_property
     def margins(self) -> Margins | None:

@@ -164,8 +164,3 @@ WATCHED = (
     *("oscillation_um", "oscillation_swings", "swing_ticks", "late_us", "late_ticks"),
 )
 """Thresholds of the interlocks with memory: named alike in options and coefficients."""
-
-
-def joined(parts: Sequence[Records]) -> Records:
-    """Coefficients of all axes."""
-    return np.concatenate(parts).view(np.recarray)

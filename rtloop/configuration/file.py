@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -155,7 +156,7 @@ class Configuration:
     laws: tuple[LawReference, ...] = DEFAULT_LAWS
     """All that the loop is to know, in an order that does not depend on where they are used."""
 
-    @property
+    @cached_property
     def owners(self) -> tuple[int, ...]:
         """Of each axis, the number of the one whose controller it has: its own, unless that has several axes."""
         found: list[int] = []

@@ -10,7 +10,7 @@ import numpy as np
 from rtloop.configuration.around import around_faults
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
-from rtloop.configuration.coefficients import axis_coefficients, joined
+from rtloop.configuration.coefficients import axis_coefficients
 from rtloop.configuration.extras import extras_of
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
@@ -78,7 +78,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         driver_options=configuration.driver_options.model_dump(exclude_unset=True),
         wiring=configuration.wiring,
         laws=configuration.laws,
-        coefficients=joined(coefficients),
+        coefficients=np.concatenate(coefficients).view(np.recarray),
         mode=Mode[configuration.loop.mode.upper()],
         generators=generators,
         table=table.samples,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rtloop.doctor.examine import Latency
-from rtloop.errors import MissingExtra, OutputError
+from rtloop.errors import MissingExtra, writing
 
 FINEST_US = 0.01
 
@@ -39,7 +39,5 @@ def draw(latency: Latency, target: Path) -> None:
     panel.set_title(f"{latency.lateness_us.size:,} ticks at {pacing.rate_hz:g} Hz, spinning {pacing.spin_us:g} µs")
     panel.grid(visible=True, alpha=0.3)
     panel.legend()
-    try:
+    with writing(target):
         figure.savefig(target, format="png", dpi=110)
-    except OSError as error:
-        raise OutputError(f"{target}: {error.strerror}") from None

@@ -16,7 +16,7 @@ import numpy as np
 
 from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import section
-from rtloop.errors import OutputError
+from rtloop.errors import writing
 from rtloop.experiments.procedure import Run, hold
 
 MARK = "rtloop experiment "
@@ -59,11 +59,9 @@ def derived(
 def keep_tables(run: Run, folder: Path) -> None:
     """Write the tables of a run to a folder, and have its references read them there. Raises OutputError."""
     for name, samples in run.tables.items():
-        try:
+        with writing(folder / name):
             folder.mkdir(parents=True, exist_ok=True)
             np.save(folder / name, samples)
-        except OSError as error:
-            raise OutputError(f"{folder / name}: {error.strerror}") from None
     references = run.timeline.references
     references[:] = [
         {**one, "file": str((folder / one["file"]).resolve())} if one.get("file") in run.tables else one

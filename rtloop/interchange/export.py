@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.errors import MissingExtra, OutputError
+from rtloop.errors import MissingExtra, OutputError, writing
 from rtloop.interchange.hdf5_signals import append, begin
 from rtloop.interchange.to_mat import write_mat
 from rtloop.recording.errors import RecordingError
@@ -68,10 +68,9 @@ def _new_file(target: Path) -> Iterator[Path]:
     if target.exists():
         raise OutputError(f"{target} exists already; it is not overwritten")
     try:
-        yield part
-        os.replace(part, target)
-    except OSError as error:
-        raise OutputError(f"{target}: {error.strerror or error}") from None
+        with writing(target):
+            yield part
+            os.replace(part, target)
     finally:
         part.unlink(missing_ok=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -46,7 +47,12 @@ class TransferOptions(Options):
         return self
 
     def transfer(self) -> Transfer:
-        """The transfer function. Raises ValueError for an improper or malformed one."""
+        """The transfer function."""
+        return self._built
+
+    @cached_property
+    def _built(self) -> Transfer:
+        """Once, where the options are checked. Raises ValueError for an improper or malformed one."""
         if self.form == "zpk":
             zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))
             return Transfer.from_zpk(zeros, poles, self._gain())

@@ -6,16 +6,14 @@ import time
 from pathlib import Path
 
 from rtloop.configuration.prepare import Prepared
-from rtloop.errors import OutputError
+from rtloop.errors import OutputError, writing
 
 
 def recording_path(prepared: Prepared, out: Path | None) -> Path:
     """A new path in the recordings' folder, which is made. Raises OutputError."""
     folder = out or Path(prepared.configuration.recording.folder)
-    try:
+    with writing(f"{folder}: cannot make the folder for recordings"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot make the folder for recordings: {error.strerror}") from None
     stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
     for number in range(1, 1000):
         path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")

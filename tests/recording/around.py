@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.recording.capture.selective import SelectiveSession
-from rtloop.recording.capture.session import Options
-from tests.recording.real_loop import BURST_TICKS, RealLoop, record, rows_of, scheduled
+from tests.recording.disk import Recorded
+from tests.recording.real_loop import record, rows_of, scheduled
 
 SECOND = 10_000
 """Ticks, from snapshot to snapshot."""
@@ -35,32 +35,18 @@ def around(*on: str, **changes: Any) -> dict[str, Any]:
     return {"before_s": BEFORE_S, "after_s": AFTER_S, "every_s": 1.0, "on": list(on)} | changes
 
 
-class Selected:
+class Selected(Recorded):
     """The run, recorded around events as a paced one, or as it is in virtual time."""
 
+    kind = SelectiveSession
+
     def __init__(self, path: Path, said: dict[str, Any], *, paced: bool = False, **options: Any) -> None:
-        self.path, self.loop = path, RealLoop(text())
-        self.header = {**self.loop.header, "format": 2, "around": said, "paced": paced}
-        self.session = self.begin(**options)
-
-    def begin(self, **options: Any) -> SelectiveSession:
-        """A recorder, or one that goes on where the last one died."""
-        options = {"min_free_bytes": 0, **options}
-        self.session = SelectiveSession(self.loop.block, self.path, self.header, Options(**options))
-        return self.session
-
-    def run_to(self, tick: int) -> None:
-        """Execute ticks and drain them all."""
-        while self.loop.tick < tick:
-            self.loop.run(min(BURST_TICKS, tick - self.loop.tick))
-            while self.session.cursor < self.loop.tick:
-                self.session.drain()
-                self.session.write_due()
+        super().__init__(path, text(), {"format": 2, "around": said}, paced=paced, **options)
 
     def whole(self, tick: int = TICKS) -> dict[str, Any]:
         """The totals of all of it."""
         self.run_to(tick)
-        return self.session.finish("finished")
+        return self.end()
 
 
 def recorded_whole(folder: Path) -> np.ndarray[Any, Any]:

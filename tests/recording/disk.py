@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from rtloop.recording.capture.session import Options, Session
 from tests.recording.real_loop import BURST_TICKS, RealLoop, scheduled
 
 PLENTY_BYTES = 1 << 40
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Disk:
@@ -50,16 +52,21 @@ class Disk:
 
 
 class Recorded:
-    """A scheduled run of a real law, recorded in the test's own process as a paced one."""
+    """A run of a real law, recorded in the test's own process as a paced one; `said` goes into its header."""
 
-    def __init__(self, path: Path, *, paced: bool = True, **options: Any) -> None:
-        self.path, self.loop = path, RealLoop(scheduled())
-        self.header = {**self.loop.header, "paced": paced}
+    kind: type[Session] = Session
+
+    def __init__(
+        self, path: Path, text: str | None = None, said: Mapping[str, Any] = NOTHING, *, paced: bool = True,
+        **options: Any,
+    ) -> None:  # fmt: skip
+        self.path, self.loop = path, RealLoop(scheduled() if text is None else text)
+        self.header = {**self.loop.header, **said, "paced": paced}
         self.session = self.begin(**options)
 
     def begin(self, **options: Any) -> Session:
-        """A recorder that goes on where the last one died."""
-        self.session = Session(self.loop.block, self.path, self.header, Options(**{"min_free_bytes": 0, **options}))
+        """A recorder, or one that goes on where the last one died."""
+        self.session = self.kind(self.loop.block, self.path, self.header, Options(**{"min_free_bytes": 0, **options}))
         return self.session
 
     def run_to(self, tick: int) -> None:

@@ -71,6 +71,15 @@ def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live)
     assert live.replace_all(prepared(TIGHTER)) == []
 
 
+def test_what_is_known_of_a_loop_is_that_of_the_law_that_runs(live):
+    before, other = live.prepared.checks, prepared(("gain = 0.016", "gain = 0.012"))
+    live._staging.desk.refuses.add((Kind.LOAD_LAW, 1))
+    with pytest.raises(Refused):
+        live.replace_all(other)
+    assert live.prepared.checks == (other.checks[0], before[1])
+    assert live.prepared.checks[0].margins.gain_margin > 1.2 * before[0].margins.gain_margin
+
+
 def test_a_refusal_of_the_first_changes_nothing(live):
     live._staging.desk.refuses.add((Kind.LOAD_LAW, 0))
     with pytest.raises(Refused, match=r"tripped or stopping$"):

@@ -9,9 +9,8 @@ from typing import Any
 
 import click
 
-from rtloop.commands.design.verify import write_over
-from rtloop.configuration.file import load, parse
-from rtloop.configuration.prepare import prepare
+from rtloop.commands.output import write_configuration, write_over
+from rtloop.configuration.file import load
 from rtloop.configuration.text_files import read_text
 from rtloop.design.robust.search import Robust, robust_controller
 from rtloop.design.robust.section import robust_configuration, robust_section, taps_section, with_controller, with_taps
@@ -44,7 +43,7 @@ def search_specification(spec: Path, config: Path | None, out: Path | None, axis
         beside = os.path.relpath(path.resolve(), out.resolve().parent)
         whole = robust_configuration(found, design, path.name, text, axis, beside)
     if out is not None and whole is not None:
-        _write_configuration(out, whole)
+        write_configuration(out, whole)
     if as_json:
         click.echo(json.dumps(_robust_as_dict(found, out)))
         return 0
@@ -72,7 +71,7 @@ def shape_configuration(
     files = []
     if out is not None:
         beside = os.path.relpath(spec.resolve(), out.resolve().parent)
-        _write_configuration(out, with_taps(read_text(config), found, subject, config.name, axis, beside))
+        write_configuration(out, with_taps(read_text(config), found, subject, config.name, axis, beside))
         files.append(out)
     if plot is not None:
         from rtloop.design.robust.plots import picture
@@ -124,9 +123,3 @@ def _shaped_as_dict(found: Shaped, files: list[Path]) -> dict[str, Any]:
         "trade_off": [list(point) for point in found.curve],
         "files": [str(file) for file in files],
     }
-
-
-def _write_configuration(out: Path, text: str) -> None:
-    """Checked as `check` does, then written."""
-    prepare(parse(text, out.stem, out.resolve().parent, str(out)))
-    write_over(out, text.encode())

@@ -9,9 +9,7 @@ from typing import Any
 
 import click
 
-from rtloop.commands.design.verify import write_over
-from rtloop.configuration.file import parse
-from rtloop.configuration.prepare import prepare
+from rtloop.commands.output import write_configuration
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.hinf.augment import augmented
 from rtloop.design.synthesis.section import controller_configuration, controller_section
@@ -38,8 +36,7 @@ def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_chec
     if out is not None:
         beside = os.path.relpath(path.resolve(), out.resolve().parent)
         whole = controller_configuration(found, design, path.name, text, axis, beside)
-        prepare(parse(whole, out.stem, out.resolve().parent, str(out)))
-        write_over(out, whole.encode())
+        write_configuration(out, whole)
     if as_json:
         click.echo(json.dumps(_as_dict(found, other, out)))
         return 0

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from rtloop.commands.output import write_over
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.file import Configuration, load
@@ -21,7 +22,7 @@ from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import Plants
 from rtloop.design.verification.simulated import simulate
 from rtloop.design.verification.verify import Subject, Verification, verify
-from rtloop.errors import ConfigError, OutputError, RtloopError
+from rtloop.errors import ConfigError, RtloopError
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import measured_delay, spent_margin
 from rtloop.terminal.design import print_verification
@@ -127,12 +128,3 @@ def _write_report(folder: Path, name: str, judged: Judged, report: dict[str, Any
     for file, content in contents.items():
         write_over(folder / file, content)
     return [folder / file for file in contents]
-
-
-def write_over(path: Path, content: bytes) -> None:
-    """Write a file, over one that is there. Raises OutputError."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    except OSError as error:
-        raise OutputError(f"{path}: {error.strerror}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -42,6 +43,11 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
 
     def models(self) -> tuple[PlayModel, PlayModel]:
         """Forward model and inverse, consistent with each other."""
+        return self._built
+
+    @cached_property
+    def _built(self) -> tuple[PlayModel, PlayModel]:
+        """Once, where the options are checked. Raises ValueError for what has no inverse."""
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(
                 "either thresholds_v with weights_um_per_v, or inverse_thresholds_um with inverse_weights_v_per_um, "

@@ -17,7 +17,7 @@ Real = npt.NDArray[np.float64]
 MAX_PLAYS = 64
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlayModel:
     """Thresholds (n,) ascending from ≥ 0 and weights (n,) of a Prandtl-Ishlinskii operator."""
 

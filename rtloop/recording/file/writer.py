@@ -15,7 +15,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
-from rtloop.errors import LOW_SPACE, OutputError
+from rtloop.errors import LOW_SPACE, OutputError, writing
 from rtloop.recording.file.mcap.chunkfile import ChunkFile, Content
 from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
 from rtloop.recording.file.topics import format
@@ -183,10 +183,8 @@ class Writer:
         least = self._min_free_bytes + room_bytes
         if least == 0:
             return
-        try:
+        with writing(self.path):
             status = os.statvfs(self.path.parent)
-        except OSError as error:
-            raise OutputError(f"{self.path}: {error.strerror}", error.errno or 0) from None
         free = status.f_bavail * status.f_frsize
         if free >= least:
             return

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.errors import OutputError
+from rtloop.errors import writing
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import Band, Panel, Progress, kind_of, marks, panels, read_bands, title
@@ -44,10 +44,8 @@ def write_page(
         "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
     embedded = json.dumps(data).replace("<", "\\u003c")
-    try:
+    with writing(target):
         target.write_text(rendered(__package__, title=title(recording), data=embedded), "utf-8")
-    except OSError as error:
-        raise OutputError(f"{target}: {error.strerror}") from None
     return target
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.errors import MissingExtra, OutputError
+from rtloop.errors import MissingExtra, OutputError, writing
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import (
@@ -71,10 +71,8 @@ def plot(
             for panel in figure.axes:
                 panel.axvspan(max(begin, time_s[0]), min(end, time_s[-1]), color=KEPT, alpha=0.25, linewidth=0)
     figure.suptitle(title(recording), fontsize=11, parse_math=False)
-    try:
+    with writing(target):
         figure.savefig(target, format=target.suffix[1:], dpi=110)
-    except OSError as error:
-        raise OutputError(f"{target}: {error.strerror}") from None
     return target
 
 

@@ -170,16 +170,15 @@ class LiveLaw:
         """The loop has taken an axis of `prepared`, with those that share its controller, and of what that axis does
         `axis` is true; the others are as they were.
         """
-        coefficients = np.asarray(self.prepared.plan.coefficients).copy()
+        coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration
         for i in prepared.configuration.together(number):
-            coefficients[i] = np.asarray(prepared.plan.coefficients)[i]
+            coefficients[i], checks[i] = np.asarray(prepared.plan.coefficients)[i], prepared.checks[i]
             beside = {"reference": configuration.axes[i].reference}
             options = axis if i == number else prepared.configuration.axes[i].model_copy(update=beside)
             configuration = _with_axis(configuration, i, options)
-        self.prepared = replace(
-            self.prepared, configuration=configuration, plan=replace(self.prepared.plan, coefficients=coefficients)
-        )
+        plan = replace(self.prepared.plan, coefficients=coefficients)
+        self.prepared = replace(self.prepared, configuration=configuration, plan=plan, checks=tuple(checks))
 
     def _validated_axis(self, raw: Mapping[str, Any]) -> AxisOptions:
         """An axis with the laws that the loop has loaded. Raises ConfigError."""

@@ -78,18 +78,8 @@ class Schedule:
                 self._retune(axis.name, axis.adapt)
 
     def _retune(self, axis: str, options: AdaptOptions) -> None:
-        command = [
-            sys.executable,
-            "-m",
-            "rtloop",
-            "ctl",
-            "--socket",
-            str(self._socket),
-            "retune",
-            axis,
-            "--yes",
-            "--json",
-        ]
+        ctl = [sys.executable, "-m", "rtloop", "ctl", "--socket", str(self._socket)]
+        command = [*ctl, "retune", axis, "--yes", "--json"]
         for name in ("amplitude_um", "bound_percent", "within_percent"):
             command += [f"--{name.replace('_', '-')}", repr(getattr(options, name))]
         try:

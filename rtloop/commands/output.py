@@ -1,0 +1,22 @@
+"""Files that commands write over what is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
+from rtloop.errors import writing
+
+
+def write_over(path: Path, content: bytes) -> None:
+    """Write a file, and its folder where there is none. Raises OutputError."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def write_configuration(path: Path, text: str) -> None:
+    """The same with a configuration, if it can run. Raises ConfigError, OutputError."""
+    prepare(parse(text, path.stem, path.resolve().parent, str(path)))
+    write_over(path, text.encode())
