@@ -9,6 +9,7 @@ import click
 from rtloop import __version__
 from rtloop.cli import (
     adapt,
+    ctl,
     design,
     doctor,
     experiment,
@@ -49,10 +50,12 @@ for module in (
     recordings,
     interchange,
     service,
+    ctl,
     panel,
     identify,
     response,
     adapt,
+    ctl,
     design,
     experiment,
 ):

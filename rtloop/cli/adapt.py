@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
+from rtloop.cli.ctl import client_of, ctl, numbers_in
 from rtloop.cli.options import JSON, OUTPUT, fails_clearly
-from rtloop.cli.service import client_of, ctl, numbers_in
 
 
 @ctl.command()

@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
+from rtloop.cli.ctl import client_of, ctl
 from rtloop.cli.identify import AXIS, PLOT, identify
 from rtloop.cli.options import JSON, OUTPUT, fails_clearly
-from rtloop.cli.service import client_of, ctl
 
 AMPLITUDE = click.option(
     "--amplitude-um", default=0.5, show_default=True, type=click.FloatRange(0, min_open=True),
