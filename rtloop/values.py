@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
+import math
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 
 def fields_of(value: Any) -> dict[str, Any]:
@@ -28,16 +27,14 @@ def plain(value: Any) -> Any:
         return plain(fields_of(value))
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
+    if hasattr(value, "tolist"):  # of numpy, which is not imported for this
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, complex | np.complexfloating):
-        return [float(value.real), float(value.imag)]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, int | np.integer):
-        return int(value)
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
 
 

@@ -18,7 +18,11 @@ def run(*arguments: Any) -> Result:
 
 
 def answer(*arguments: Any, code: int = 0) -> dict[str, Any]:
-    """Its one JSON object."""
+    """Its one JSON object, which strict readers take."""
     result = run(*arguments, "--json")
     assert result.exit_code == code, result.output
-    return json.loads(result.stdout)
+    return json.loads(result.stdout, parse_constant=_refused)
+
+
+def _refused(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")

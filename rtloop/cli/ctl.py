@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from rtloop.cli.options import OUTPUT, fails_clearly
+from rtloop.terminal.machine import echo_json
 
 SECTION = click.Choice(["controller", "limits", "interlocks", "prefilter", "model"])
 
@@ -41,7 +41,7 @@ def _post(name: str, help_text: str) -> None:
     @click.pass_context
     @fails_clearly
     def command(context: click.Context) -> int:
-        click.echo(json.dumps(client_of(context).post(f"/{name}")))
+        echo_json(client_of(context).post(f"/{name}"))
         return 0
 
 
@@ -67,7 +67,7 @@ def lock(context: click.Context, breaks: bool) -> int:
     if breaks:
         at_terminal = sys.stdin.isatty()
         key = click.prompt("emergency key", hide_input=True, err=True) if at_terminal else sys.stdin.readline().strip()
-    click.echo(json.dumps(client_of(context).lock(key)))
+    echo_json(client_of(context).lock(key))
     return 0
 
 
@@ -76,7 +76,7 @@ def lock(context: click.Context, breaks: bool) -> int:
 @fails_clearly
 def release(context: click.Context) -> int:
     """Release the lock: somebody else may drive."""
-    click.echo(json.dumps(client_of(context).delete("/lock")))
+    echo_json(client_of(context).delete("/lock"))
     return 0
 
 
@@ -85,7 +85,7 @@ def release(context: click.Context) -> int:
 @fails_clearly
 def status(context: click.Context) -> int:
     """State, who drives, rate, lateness, faults and the newest signals."""
-    click.echo(json.dumps(client_of(context).get("/status"), indent=2))
+    echo_json(client_of(context).get("/status"), indent=2)
     return 0
 
 
@@ -105,7 +105,7 @@ def metrics(context: click.Context) -> int:
 def watch(context: click.Context, count: int | None) -> int:
     """Newest signals, a line of JSON 20 times a second."""
     for number, line in enumerate(client_of(context).watch(), start=1):
-        click.echo(json.dumps(line))
+        echo_json(line)
         if number == count:
             break
     return 0
@@ -117,7 +117,7 @@ def watch(context: click.Context, count: int | None) -> int:
 @fails_clearly
 def mode(context: click.Context, mode: str) -> int:
     """Change the mode of all axes, bumplessly."""
-    click.echo(json.dumps(client_of(context).post("/mode", {"mode": mode})))
+    echo_json(client_of(context).post("/mode", {"mode": mode}))
     return 0
 
 
@@ -128,7 +128,7 @@ def mode(context: click.Context, mode: str) -> int:
 @fails_clearly
 def setpoint(context: click.Context, axis: str, value: float) -> int:
     """Hold the reference of AXIS at VALUE, in µm (V in raw mode)."""
-    click.echo(json.dumps(client_of(context).post("/setpoint", {"axis": axis, "value": value})))
+    echo_json(client_of(context).post("/setpoint", {"axis": axis, "value": value}))
     return 0
 
 
@@ -143,7 +143,7 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
     As in [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
     """
     body = {"axis": axis, "reference": _inline_table(reference)}
-    click.echo(json.dumps(client_of(context).post("/reference", body)))
+    echo_json(client_of(context).post("/reference", body))
     return 0
 
 
@@ -160,7 +160,7 @@ def waveform(context: click.Context, axis: str, file: Any, hold_ticks: int, repe
     body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
     if len(columns) > 1:
         body["command_um"] = columns[1]
-    click.echo(json.dumps(client_of(context).post("/waveform", body)))
+    echo_json(client_of(context).post("/waveform", body))
     return 0
 
 
@@ -192,7 +192,7 @@ def preview(context: click.Context, axis: str, section: str, values: str) -> int
 def _change(context: click.Context, resource: str, axis: str, section: str, values: str) -> int:
     """Ask for a change of keys of [axis.SECTION], or what it would do."""
     body = {"axis": axis, "section": section, "values": _inline_table(values)}
-    click.echo(json.dumps(client_of(context).post(resource, body)))
+    echo_json(client_of(context).post(resource, body))
     return 0
 
 
@@ -202,7 +202,7 @@ def _change(context: click.Context, resource: str, axis: str, section: str, valu
 @fails_clearly
 def undo(context: click.Context, axis: str) -> int:
     """Go back to before the last change of AXIS by tune or controller, bumplessly."""
-    click.echo(json.dumps(client_of(context).post("/undo", {"axis": axis})))
+    echo_json(client_of(context).post("/undo", {"axis": axis}))
     return 0
 
 
@@ -225,7 +225,7 @@ def controller(context: click.Context, axis: str, config: Path) -> int:
     section = axes[axis].controller
     assert section is not None
     body = {"axis": axis, "controller": section.model_dump(exclude_unset=True)}
-    click.echo(json.dumps(client_of(context).post("/controller", body)))
+    echo_json(client_of(context).post("/controller", body))
     return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +10,7 @@ import click
 
 from rtloop.cli.design import design
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, fails_clearly
+from rtloop.terminal.machine import echo_json
 
 RUNS = click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
 AXIS = click.option("--axis", help="Name of the axis [the only one].")
@@ -200,7 +200,7 @@ def auto(
 
 def _show(report: dict[str, Any], as_json: bool, for_people: Callable[[dict[str, Any]], None]) -> None:
     if as_json:
-        click.echo(json.dumps(report))
+        echo_json(report)
     else:
         for_people(report)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 import click
 
 from rtloop.cli.options import FILES, JSON, OUTPUT, fails_clearly
+from rtloop.terminal.machine import echo_json
 
 NOTHING_WANTED = 2
 """Exit code where a file was only shown."""
@@ -68,7 +68,7 @@ def import_command(
         with Counter("ticks imported", sys.stderr) as counter:
             report = import_file(file, given, mapping, out, counter.show)
         if as_json:
-            click.echo(json.dumps(report))
+            echo_json(report)
         elif isinstance(report, Shown):
             print_listing(report)
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from rtloop.cli.options import JSON, OUTPUT, fails_clearly
+from rtloop.terminal.machine import echo_json
 
 
 class LawName(click.ParamType):
@@ -33,7 +33,7 @@ def laws(as_json: bool) -> int:
     from rtloop.terminal.laws import print_laws
 
     found = known_laws()
-    click.echo(json.dumps({"laws": found})) if as_json else print_laws(found)
+    echo_json({"laws": found}) if as_json else print_laws(found)
     return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import click
 
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds, fails_clearly, require_text
 from rtloop.cli.panel import beside, with_panel
+from rtloop.terminal.machine import echo_json
 
 
 class Positive(click.FloatRange):
@@ -108,7 +108,7 @@ def drivers(
         from rtloop.terminal.run import known_drivers, print_drivers
 
         if as_json:
-            click.echo(json.dumps({"drivers": known_drivers()}))
+            echo_json({"drivers": known_drivers()})
         else:
             print_drivers()
         return 0

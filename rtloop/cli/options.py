@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Callable
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import click
+
+from rtloop.terminal.machine import echo_json
 
 OUTPUT = click.Path(path_type=Path)
 CONFIG = click.argument("config", type=OUTPUT)
@@ -33,7 +34,7 @@ def fails_clearly(command: Callable[..., int | None]) -> Callable[..., None]:
             message = _with_lines(error) if isinstance(error, ConfigError) else str(error)
             click.echo(f"rtloop: {message}", err=True)
             if kwargs.get("as_json"):
-                click.echo(json.dumps({"error": message, "exit_code": code}))
+                echo_json({"error": message, "exit_code": code})
         sys.exit(code)
 
     return wrapped

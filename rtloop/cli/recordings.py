@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Any
 import click
 
 from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds, fails_clearly
+from rtloop.terminal.machine import echo_json
 
 TICK = click.IntRange(min=0)
 TO = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
@@ -33,7 +33,7 @@ def info(files: tuple[Path, ...], as_json: bool) -> int:
     with Counter("ticks read", sys.stderr) as counter:
         summary = summarise(files, counter.show)
     if as_json:
-        click.echo(json.dumps(summary.as_dict()))
+        echo_json(summary.as_dict())
     else:
         print_summary(summary)
     return 0
@@ -217,7 +217,7 @@ def plot(
 def _show(result: dict[str, Any], as_json: bool, for_people: Callable[[dict[str, Any]], None]) -> None:
     """One JSON object, or words."""
     if as_json:
-        click.echo(json.dumps(result))
+        echo_json(result)
     else:
         for_people(result)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from rtloop.design.verification.text import answer, span, together
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
 from rtloop.supervision.host_delay import SpentMargin, measured_delay, spent_margin
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console as _console
 from rtloop.values import counted
 
@@ -49,7 +49,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     host = measured_delay(prepared.configuration)
     spent = {} if host is None else {check.name: spent_margin(check, host) for check in prepared.checks}
     if as_json:
-        click.echo(json.dumps(_report(prepared, warnings, shifts, judged, spent)))
+        echo_json(_report(prepared, warnings, shifts, judged, spent))
         return 0
     console = _console()
     plan, facts = prepared.plan, prepared.facts

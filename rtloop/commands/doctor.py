@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import click
 from rich.markup import escape
 
 from rtloop.configuration.file import load
@@ -20,6 +18,7 @@ from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
 from rtloop.recording.views.histogram import Histogram
 from rtloop.supervision.host_delay import note_host_delay
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.run import bars
 from rtloop.terminal.table import console, table
@@ -47,7 +46,7 @@ def doctor_host(config: Path | None, seconds: float, change: bool, png: Path | N
 
         draw(examination.latency, png)
     if as_json:
-        click.echo(json.dumps(_report(examination, delays, found, writes)))
+        echo_json(_report(examination, delays, found, writes))
     else:
         _print(prepared, examination, delays, found, writes)
     return 1 if found else 0

@@ -34,6 +34,7 @@ from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.naming import recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.experiments import Progress, print_report
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import StatusLine
 
 
@@ -263,7 +264,7 @@ def _write(
 def _show(made: Report, files: Sequence[Path], skipped: Mapping[str, str], as_json: bool, more: dict[str, Any]) -> None:
     with suppress(BrokenPipeError):
         if as_json:
-            click.echo(json.dumps({**made.content, **more, "files": [str(file) for file in files]}, allow_nan=False))
+            echo_json({**made.content, **more, "files": [str(file) for file in files]})
             return
         print_report(made.content, skipped)
         click.echo(files[0])

@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import click
-
 from rtloop.design.identification.identified import write_new
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.identification.plot_response import plot_response
 from rtloop.design.identification.recorded_response import recorded_measurement
 from rtloop.service.client import Client
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.response import print_resonance, print_response
 
 TIMES, MORE_S = 3.0, 60.0
@@ -43,7 +42,7 @@ def _show(content: dict[str, Any], resonance_only: bool, out: Path | None, plot:
     if plot is not None:
         plot_response(content, plot)
     if as_json:
-        click.echo(json.dumps({"resonance": content["resonance"]} if resonance_only else content))
+        echo_json({"resonance": content["resonance"]} if resonance_only else content)
     elif resonance_only:
         print_resonance(content)
     else:

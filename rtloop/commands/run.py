@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from rtloop.recording.views.summary import Summary, summarise
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.naming import recording_path
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import Counter
 from rtloop.terminal.run import RunView, print_run
 from rtloop.values import counted
@@ -44,7 +44,7 @@ def run_configuration(
         interruption.attend(None)
     summary = summarise(result.recordings) if result.recordings else None
     if as_json:
-        click.echo(json.dumps(_for_json(summary, result, warnings, supervisor.startup_s)))
+        echo_json(_for_json(summary, result, warnings, supervisor.startup_s))
     else:
         print_run(prepared, summary)
     for note in result.notes:
@@ -58,7 +58,7 @@ def _stopped_before(as_json: bool) -> int:
     """Ctrl-C came before there was a loop: no output was touched, and that is what was wanted."""
     click.echo("stopped before the loop began: nothing was driven, nothing is recorded", err=True)
     if as_json:
-        click.echo(json.dumps({"outcome": "stopped", "recording": None, "recordings": []}))
+        echo_json({"outcome": "stopped", "recording": None, "recordings": []})
     return 0
 
 

@@ -7,7 +7,6 @@ channels knows that a wire is there: without tolerances there are numbers and no
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import tempfile
@@ -30,6 +29,7 @@ from rtloop.recording.load import load as load_recording
 from rtloop.supervision.host_delay import note_host_delay
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, table
 
@@ -71,7 +71,7 @@ def selftest_configuration(config: Path, amplitude_v: float, tolerances: Toleran
             configuration, wire_ticks={name: pair.delay_ticks for name, pair in pairs.items() if pair.delay_ticks}
         )
     if as_json:
-        click.echo(json.dumps(report))
+        echo_json(report)
     else:
         _print(report)
     return LoopFault.exit_code if report["passed"] is False else 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import click
 
 from rtloop.design.identification.identified import write_new
 from rtloop.service.client import Client
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console, table
 
 LONGEST_S = 360.0
@@ -24,7 +24,7 @@ def learn(client: Client, body: Mapping[str, Any], out: Path | None, as_json: bo
         rows = zip(content["reference_um"], content["command_um"], strict=True)
         write_new(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))
     if as_json:
-        click.echo(json.dumps(content))
+        echo_json(content)
         return 0
     shown = table("cycle", "rms error / nm", "largest / nm")
     for number, cycle in enumerate(content["cycles"]):

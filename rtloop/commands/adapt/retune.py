@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from rtloop.design.robust.subject import subject_in
 from rtloop.design.toml_text import section
 from rtloop.errors import ConfigError, LoopFault
 from rtloop.service.client import Client
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console, table
 
 STAGES = 4
@@ -74,7 +74,7 @@ def retune(client: Client, asked: Asked, as_json: bool) -> int:
             tick = _swapped(client, asked.axis, _between(_taps_of(axis), found.taps, part))
     if as_json:
         said = {"resonance": mode, "percent_from_model": percent, "before": before._asdict(), "after": after._asdict()}
-        click.echo(json.dumps({**said, "settling_ms": found.settling_ms, "tick": tick}))
+        echo_json({**said, "settling_ms": found.settling_ms, "tick": tick})
     elif tick is not None:
         click.echo(f"swapped at tick {tick}")
     return 0 if swapped else LoopFault.exit_code

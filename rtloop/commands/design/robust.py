@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from rtloop.design.robust.subject import subject_in
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, NoDesign
+from rtloop.terminal.machine import echo_json
 from rtloop.terminal.robust import print_robust, print_shaped
 
 
@@ -45,7 +45,7 @@ def search_specification(spec: Path, config: Path | None, out: Path | None, axis
     if out is not None and whole is not None:
         write_configuration(out, whole)
     if as_json:
-        click.echo(json.dumps(_robust_as_dict(found, out)))
+        echo_json(_robust_as_dict(found, out))
         return 0
     print_robust(found)
     if out is None:
@@ -79,7 +79,7 @@ def shape_configuration(
         write_over(plot, picture(found, subject, f"{configuration.name}, axis {axis}"))
         files.append(plot)
     if as_json:
-        click.echo(json.dumps(_shaped_as_dict(found, files)))
+        echo_json(_shaped_as_dict(found, files))
         return 0
     print_shaped(found, subject)
     if out is None:

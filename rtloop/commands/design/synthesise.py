@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.errors import ConfigError, NoDesign
 from rtloop.terminal.design import print_synthesis
+from rtloop.terminal.machine import echo_json
 
 
 def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> int:
@@ -38,7 +38,7 @@ def synthesise_specification(spec: Path, out: Path | None, axis: str, cross_chec
         whole = controller_configuration(found, design, path.name, text, axis, beside)
         write_configuration(out, whole)
     if as_json:
-        click.echo(json.dumps(_as_dict(found, other, out)))
+        echo_json(_as_dict(found, other, out))
         return 0
     print_synthesis(found, other)
     if out is None:

@@ -26,6 +26,7 @@ from rtloop.errors import ConfigError, RtloopError
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import measured_delay, spent_margin
 from rtloop.terminal.design import print_verification
+from rtloop.terminal.machine import echo_json
 
 
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
@@ -47,7 +48,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     }
     files = [] if out is None else _write_report(out, configuration.name, judged, report)
     if as_json:
-        click.echo(json.dumps({**report, "files": [str(file) for file in files]}, allow_nan=False))
+        echo_json({**report, "files": [str(file) for file in files]})
     else:
         for name, (found, _) in judged.items():
             print_verification(name, found)
