@@ -27,8 +27,8 @@ def plain(value: Any) -> Any:
         return plain(fields_of(value))
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):  # of numpy, which is not imported for this
-        return plain(value.tolist())
+    if (as_list := getattr(value, "tolist", None)) is not None:  # of numpy, which is not imported for this
+        return plain(as_list())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, complex):
