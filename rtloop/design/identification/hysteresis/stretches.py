@@ -1,4 +1,4 @@
-"""Recordings as the equations of a sum of plays with unknown memory need them: averaged, with bounds of every play."""
+"""Recordings as the equations of a sum of plays need them: averaged, with the stretches whose memory is known."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.memory_fit import Stretch
+from rtloop.design.identification.hysteresis.held_out import PIECES
+from rtloop.design.identification.hysteresis.least_squares import Equations
 from rtloop.design.identification.measured import Measured
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
+from rtloop.hysteresis.unknown_memory import known_stretches, settled_memory
 
 Term = Literal["drift", "creep"]
 
@@ -26,14 +28,15 @@ AT_ONCE = 100_000
 class Kept(NamedTuple):
     """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, each (blocks,).
 
-    `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where
-    unknown.
+    `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; `full_v` the
+    drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where unknown.
     """
 
     name: str
     time_s: Real
     drive_v: Real
     position_um: Real
+    stretch: npt.NDArray[np.intp]
     full_v: Real
     size: int
     before_v: Real | None
@@ -46,20 +49,42 @@ def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kep
     time_s = run.seconds[:-1] - run.seconds[0]
     before = None if before_v is None else np.asarray(before_v, float)
     time_s, slow, position = averaged(np.column_stack([time_s, drive, run.position_um[1:]]), size).T
-    return Kept(run.name, time_s, slow, position, drive, size, before)
+    stretch = np.zeros(slow.size, np.intp) if before is not None else _stretches(drive, size)
+    return Kept(run.name, time_s, slow, position, stretch, drive, size, before)
 
 
-def stretch(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: float) -> Stretch:
-    """With plays at these thresholds in V and these terms; `duration_s` is that of the longest recording."""
-    first_v = float(run.full_v[0])
+def equations(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: float) -> Equations:
+    """With plays at these thresholds in V and these terms; `duration_s` is that of the longest recording.
+
+    Where memory is not known, the plays are those of a drive that has gone before again and again.
+    """
     if run.before_v is None:
-        low, high = (_plays(run, thresholds, first_v + side * thresholds) for side in (-1.0, 1.0))
+        memory = settled_memory(run.full_v, thresholds)
     else:
-        low = high = _plays(run, thresholds, play_outputs(np.append(run.before_v, first_v), thresholds)[-1])
-    constant, since = np.ones(run.time_s.size), run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
-    own = np.column_stack([constant, since] if "drift" in terms else [constant])
+        memory = play_outputs(np.append(run.before_v, run.full_v[0]), thresholds)[-1]
+    plays = _plays(run, thresholds, memory)
+    plays[:, :-1] -= plays[:, 1:].copy()
+    stretches = int(run.stretch.max()) + 1
+    offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
+    since = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
+    drift = [since] if "drift" in terms else []
     creep = [_lag(run, duration_s / part) for part in CREEP_PARTS] if "creep" in terms else []
-    return Stretch(first_v, low, high, np.array(creep).reshape(-1, run.time_s.size).T, own, run.position_um)
+    return Equations(
+        plays,
+        np.array(creep).reshape(-1, since.size).T,
+        offsets.astype(float),
+        np.array(drift).reshape(-1, since.size).T,
+        run.position_um,
+        run.stretch >= 0,
+    )
+
+
+def _stretches(drive: Real, size: int) -> npt.NDArray[np.intp]:
+    """Of every block; −1 for those that are not all in one, and where there are too few to judge any."""
+    numbers = known_stretches(drive)[: drive.size // size * size].reshape(-1, size)
+    found = np.where(np.all(numbers == numbers[:, :1], axis=1), numbers[:, 0], -1)
+    long = [number for number in range(found.max() + 1) if np.sum(found == number) >= PIECES]
+    return np.select([found == number for number in long], range(len(long)), -1) if long else np.full(found.size, -1)
 
 
 def averaged(rows: Real, size: int) -> Real:
