@@ -116,6 +116,7 @@ def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
         "max_error_percent": 100 * one.max_um / one.range_um, "range_um": one.range_um, "offset_um": one.offset_um,
         "drift_um": one.drift_um, "memory": "rest" if one.from_rest else "unknown", "known_from_s": one.known_from_s,
         "unsettled": one.unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.judged_part,
+        "early_max_error_percent": 100 * one.early_max_um / one.range_um,
     }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from rtloop.design.identification.hysteresis.early_part import early_errors
 from rtloop.design.identification.hysteresis.held_out import held_out, judged
 from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
 from rtloop.design.identification.hysteresis.least_squares import Common, Equations, Limits, errors, fitted, own_of
@@ -26,7 +27,8 @@ branches differ in shape, or creep, depart by half of it where their loops close
 class Judgement:
     """A recording under a model that it had no part in: averaged samples (blocks,), and what was found of its own.
 
-    `error_um` is held out, NaN where the memory is not known; `left_um` is what the model that is written leaves of the
+    `error_um` is held out, NaN where the memory is not known, and `early_um` is that of the other blocks, with a memory
+    estimated for these alone (`early_part`), NaN elsewhere; `left_um` is what the model that is written leaves of the
     rest. `offset_um` is the last stretch's. `from_rest` says that the memory at the beginning was given; `known_from_s`
     is when that of all plays that are written is known, None where never; `unsettled_um` how far the recording departs
     from a loop that repeats itself where it is not; `drift_um` the drift over its duration.
@@ -37,6 +39,7 @@ class Judgement:
     drive_v: Real
     position_um: Real
     error_um: Real
+    early_um: Real
     left_um: Real
     offset_um: float
     drift_um: float
@@ -63,6 +66,11 @@ class Judgement:
     def max_um(self) -> float:
         """The largest error as held out; NaN without any."""
         return float(np.nanmax(np.abs(self.error_um))) if self.judged_part else np.nan
+
+    @property
+    def early_max_um(self) -> float:
+        """The largest error where the memory is not known; NaN without any."""
+        return float(np.nanmax(np.abs(self.early_um))) if np.isfinite(self.early_um).any() else np.nan
 
     @property
     def unsettled(self) -> bool:
@@ -139,7 +147,8 @@ def _judgement(run: Kept, one: Equations, own: Real, error: Real, common: Common
     apart = np.concatenate([left[~one.known], moved, np.zeros(1)])
     known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[-1]))
     return Judgement(
-        run.name, run.time_s, run.drive_v, run.position_um, error, left[one.known],
+        run.name, run.time_s, run.drive_v, run.position_um, error,
+        early_errors(run, one, common, own, trial.thresholds_v), left[one.known],
         float(offsets[-1]) if offsets.size else np.nan, float(own[offsets.size :].sum()), run.before_v is not None,
         None if known is None else float(run.time_s[known]), float(np.abs(apart).max()) if offsets.size else np.nan,
     )  # fmt: skip

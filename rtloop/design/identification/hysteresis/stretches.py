@@ -62,7 +62,7 @@ def equations(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: fl
         memory = settled_memory(run.full_v, thresholds)
     else:
         memory = play_outputs(np.append(run.before_v, run.full_v[0]), thresholds)[-1]
-    plays = _plays(run, thresholds, memory)
+    plays = averaged_plays(run, thresholds, memory)
     plays[:, :-1] -= plays[:, 1:].copy()
     stretches = int(run.stretch.max()) + 1
     offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
@@ -87,19 +87,20 @@ def _stretches(drive: Real, size: int) -> npt.NDArray[np.intp]:
     return np.select([found == number for number in long], range(len(long)), -1) if long else np.full(found.size, -1)
 
 
-def averaged(rows: Real, size: int) -> Real:
-    """Means of `size` successive rows; an incomplete block at the end is left out."""
-    whole = rows[: rows.shape[0] // size * size]
-    return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
-
-
-def _plays(run: Kept, thresholds: Real, state: Real) -> Real:
+def averaged_plays(run: Kept, thresholds: Real, state: Real) -> Real:
+    """(blocks, plays), of plays that stood at `state` (plays,) when the recording began."""
     parts, at_once = [], max(1, AT_ONCE // run.size) * run.size
     for start in range(0, run.full_v.size, at_once):
         outputs = play_outputs(run.full_v[start : start + at_once], thresholds, state)
         state = outputs[-1]
         parts.append(averaged(outputs, run.size))
     return np.concatenate(parts)
+
+
+def averaged(rows: Real, size: int) -> Real:
+    """Means of `size` successive rows; an incomplete block at the end is left out."""
+    whole = rows[: rows.shape[0] // size * size]
+    return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
 def _lag(run: Kept, time_constant_s: float) -> Real:
