@@ -13,17 +13,13 @@ nothing of the weights (Brokate & Sprekels, Hysteresis and Phase Transitions, 19
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.modal import Real
-from rtloop.hysteresis.plays import play_outputs, turning_points
-
-LEAST_TURN = 1e-3
-"""Part of the drive's range by which it must turn back for a stroke to end."""
+from rtloop.hysteresis.plays import play_outputs
 
 LEAST_WITHIN = 0.03
 """Part of the drive's range that a stretch within what was covered has at least: noise makes small ones."""
@@ -39,28 +35,22 @@ class Missing(NamedTuple):
 
 
 def known_stretches(drive: Real) -> npt.NDArray[np.intp]:
-    """Number of the stretch within what was covered before that each sample (samples,) is in; −1 where in none."""
+    """Number of the stretch within what was covered before that each sample (samples,) is in; −1 where in none.
+
+    A stretch begins at an end of what was covered, and shows plays of up to half of its own range, no larger ones.
+    """
     grown = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
     beyond = np.concatenate([[True], grown, [True]])
-    found, number = np.full(drive.size, -1), 0
+    found, number, least_v = np.full(drive.size, -1), 0, LEAST_WITHIN * float(np.ptp(drive))
     for start, end in np.flatnonzero(np.diff(beyond)).reshape(-1, 2):
-        if np.ptp(drive[start : end + 1]) >= LEAST_WITHIN * np.ptp(drive):
+        if np.ptp(drive[start : end + 1]) >= least_v:
             found[start + 1 : end + 1] = number
             number += 1
     return found
 
 
-def known_stroke_v(drive: Real) -> float:
-    """The longest way in V that the drive went in one direction, from where it had covered as much before.
-
-    Plays of up to half of it show beyond doubt, and no larger ones. 0 where the drive never turns back.
-    """
-    turns = [0, *turning_points(drive, LEAST_TURN * float(np.ptp(drive))).tolist(), drive.size - 1]
-    return max(min(float(np.ptp(drive[: k + 1])), abs(float(drive[end] - drive[k]))) for k, end in pairwise(turns))
-
-
 def missing_stroke(drive: Real) -> Missing:
-    """What would have let `known_stroke_v` be the drive's whole range."""
+    """What would have let a stretch within what was covered have the drive's whole range."""
     low, high = int(np.argmin(drive)), int(np.argmax(drive))
     if low > high:
         return Missing(float(drive[low]), float(drive[low:].max()), float(drive[high]))

@@ -9,7 +9,7 @@ import pytest
 
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.measured import Measured, UnsuitableData
-from rtloop.hysteresis.unknown_memory import known_from, known_stretches, known_stroke_v, missing_stroke
+from rtloop.hysteresis.unknown_memory import known_from, known_stretches, missing_stroke
 from tests.design.other_truths import (
     THRESHOLDS_V,
     WEIGHTS_UM_PER_V,
@@ -68,7 +68,7 @@ def test_not_knowing_the_memory_costs_little(seed: int) -> None:
     """Of the soak's rigs the first three, and one of whose recordings the others show less than they seem to."""
     rig = drawn(seed)
     found, known = both(rig)
-    assert reported_um(found) <= ALLOWED_RATIO * reported_um(known)
+    assert reported_um(found, found) <= ALLOWED_RATIO * reported_um(known, found)
     assert true_um(found, rig, found.stroke_v) <= ALLOWED_RATIO * true_um(known, rig, found.stroke_v)
 
 
@@ -100,12 +100,11 @@ def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
         identify_from_parts([run], thresholds_v=[0.0, 1.0, 4.0])
 
 
-def test_known_strokes_by_hand() -> None:
-    drive = np.array([0.0, 5.0, -5.0, 3.0])
-    assert known_stroke_v(drive) == 8.0
-    assert known_stroke_v(np.array([0.0, 5.0, -5.0])) == 5.0
-    assert missing_stroke(drive) == (-5.0, 3.0, 5.0)
-    assert [known_from(drive, r) for r in (2.0, 5.0, 5.1)] == [1, 2, None]
+def test_known_stretches_by_hand() -> None:
+    drive = np.array([0.0, 5.0, -5.0, 3.0, 1.0, 7.0, 6.9, 8.0])
+    assert known_stretches(drive).tolist() == [-1, -1, -1, 0, 0, -1, -1, -1]
+    assert missing_stroke(drive[:4]) == (-5.0, 3.0, 5.0)
+    assert [known_from(drive[:4], r) for r in (2.0, 5.0, 5.1)] == [1, 2, None]
 
 
 def test_drift_stays_where_it_lessens_the_error_held_out_and_only_there() -> None:

@@ -1,8 +1,8 @@
 """Hysteresis from parts of loops, on rigs drawn at random: memory estimated beside memory known. `make soak-parts`.
 
 Each rig is recorded once to three times: a loop or less from anywhere, after a random past, with an offset, drift and
-noise. The plays are stepped one by one here. Beside the held-out error that is reported stands the true one: of
-strokes as long as the model is for, without noise, memory known.
+noise. The plays are stepped one by one here. Held-out errors are compared in the same samples, those in which memory
+is known in any case. Beside them stands the true error: of strokes as long as the model is for, without noise.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 
 SAMPLES, DURATION_S = 3000, 30.0
 ALLOWED_RATIO = 1.5
+MOST_PLAYS = 64
 PLAYS_V = np.array(THRESHOLDS_V)
 Array = np.ndarray[Any, Any]
 
@@ -59,7 +60,7 @@ def main() -> None:
             refused += 1
             print(f"{seed:4}{len(rig.drives_v):7}{1e3 * rig.noise_um:10.0f}  refused: {reason}", flush=True)
             continue
-        reported, best = reported_um(found), reported_um(known)
+        reported, best = reported_um(found, found), reported_um(known, found)
         true = true_um(found, rig, found.stroke_v) / true_um(known, rig, found.stroke_v)
         ratios.append(reported / best)
         true_ratios.append(true)
@@ -100,13 +101,16 @@ def both(rig: Rig) -> tuple[PartsFit, PartsFit]:
     found = identify_from_parts(rig.runs())
     thresholds, half_v = found.shape.model.thresholds, 0.5 * found.stroke_v
     largest_v = max(float(np.abs(np.append(*one)).max()) for one in zip(rig.past_v, rig.drives_v, strict=True))
-    more = np.arange(half_v, largest_v, half_v / thresholds.size)
+    count = min(MOST_PLAYS, round(thresholds.size * largest_v / half_v)) - thresholds.size
+    more = np.linspace(half_v, largest_v, max(0, count), endpoint=False)
     return found, identify_from_parts(rig.runs(), thresholds_v=[*thresholds, *more], before_v=rig.past_v)
 
 
-def reported_um(found: PartsFit) -> float:
-    """rms of the held-out errors."""
-    return float(np.sqrt(np.mean([one.rms_um**2 for one in found.judgements])))
+def reported_um(fit: PartsFit, found: PartsFit) -> float:
+    """rms of a fit's held-out errors, in those samples that were judged without knowing the memory."""
+    pairs = zip(fit.judgements, found.judgements, strict=True)
+    squares = [one.error_um[np.isfinite(judged.error_um)] ** 2 for one, judged in pairs if judged.judged_part]
+    return float(np.sqrt(np.mean([one.mean() for one in squares])))
 
 
 def true_um(found: PartsFit, rig: Rig, stroke_v: float) -> float:

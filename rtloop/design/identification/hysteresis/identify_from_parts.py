@@ -25,7 +25,7 @@ from rtloop.design.identification.hysteresis.judgement import (
     judgements_of,
     prepared_work,
 )
-from rtloop.design.identification.hysteresis.stretches import Kept, Term
+from rtloop.design.identification.hysteresis.stretches import Term
 from rtloop.design.identification.hysteresis.thresholds import (
     Placement,
     placed_thresholds,
@@ -36,7 +36,7 @@ from rtloop.design.identification.measured import Measured, UnsuitableData, nois
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output, turning_points
-from rtloop.hysteresis.unknown_memory import known_stroke_v, missing_stroke
+from rtloop.hysteresis.unknown_memory import missing_stroke
 from rtloop.laws.shipped.play_model import PlayModel
 
 EARNED = 0.95
@@ -108,8 +108,7 @@ def _given(thresholds: Real, stroke_v: float, missing: str) -> Trial:
 
 def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
     """The longest stroke of known memory, and what is missing to the whole range. Raises UnsuitableData."""
-    judged = [run for run in work.runs if np.any(run.stretch >= 0)]
-    stroke_v = max((_known_v(run) for run in judged), default=0.0)
+    stroke_v = max(run.stroke_v for run in work.runs)
     if stroke_v >= WHOLE * work.largest_v:
         return stroke_v, ""
     widest = max(work.runs, key=lambda run: float(np.ptp(run.full_v)))
@@ -125,13 +124,6 @@ def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
             f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN:g} % are needed; {missing}"
         )
     return stroke_v, missing
-
-
-def _known_v(run: Kept) -> float:
-    """Twice the largest threshold that may show in a recording."""
-    if run.before_v is None:
-        return known_stroke_v(run.full_v)
-    return 2 * float(np.abs(np.append(run.before_v, run.full_v)).max())
 
 
 def _chosen(work: Work, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:

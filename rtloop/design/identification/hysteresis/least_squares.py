@@ -56,7 +56,7 @@ class Equations(NamedTuple):
 
     def only(self, kept: npt.NDArray[np.bool_]) -> Equations:
         """Of these blocks, a mask."""
-        return Equations(*(rows[kept] for rows in self))
+        return Equations._make(rows[kept] for rows in self)
 
 
 class Common(NamedTuple):
@@ -78,7 +78,7 @@ def fitted(recordings: Sequence[Equations], limits: Limits) -> tuple[Common, lis
     known = [one.only(one.known) for one in recordings]
     plays, creep = known[0].slopes.shape[1], known[0].creep.shape[1]
     shared = np.vstack([np.hstack([one.slopes, one.creep]) for one in known])
-    columns = np.hstack([shared, block_diag(*(one.own for one in known))])
+    columns = np.hstack([shared, np.asarray(block_diag(*(one.own for one in known)), np.float64)])
     weights = np.concatenate([np.full(plays + creep, FLOOR), *(one.own_weights for one in known)])
     neighbours = np.zeros((plays - 1, weights.size))
     neighbours[:, :plays] = RIDGE * limits.drive_v * np.diff(np.eye(plays), axis=0)
@@ -97,7 +97,7 @@ def own_of(one: Equations, common: Common) -> Real:
     known = one.only(one.known)
     held = known.known.size**0.5 * np.diag(one.own_weights)
     left = np.append(errors(known, common, np.zeros(one.own_weights.size)), np.zeros(one.own_weights.size))
-    return np.linalg.lstsq(np.vstack([known.own, held]), left, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(np.vstack([known.own, held]), left, rcond=None)[0], np.float64)
 
 
 def errors(one: Equations, common: Common, own: Real) -> Real:

@@ -28,8 +28,9 @@ AT_ONCE = 100_000
 class Kept(NamedTuple):
     """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, each (blocks,).
 
-    `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; `full_v` the
-    drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where unknown.
+    `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; plays of up
+    to half of `stroke_v` show in them. `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the
+    drive since rest, None where unknown.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Kept(NamedTuple):
     drive_v: Real
     position_um: Real
     stretch: npt.NDArray[np.intp]
+    stroke_v: float
     full_v: Real
     size: int
     before_v: Real | None
@@ -49,8 +51,11 @@ def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kep
     time_s = run.seconds[:-1] - run.seconds[0]
     before = None if before_v is None else np.asarray(before_v, float)
     time_s, slow, position = averaged(np.column_stack([time_s, drive, run.position_um[1:]]), size).T
-    stretch = np.zeros(slow.size, np.intp) if before is not None else _stretches(drive, size)
-    return Kept(run.name, time_s, slow, position, stretch, drive, size, before)
+    if before is None:
+        stretch, stroke_v = _stretches(drive, size)
+    else:
+        stretch, stroke_v = np.zeros(slow.size, np.intp), 2 * float(np.abs(np.append(before, drive)).max())
+    return Kept(run.name, time_s, slow, position, stretch, stroke_v, drive, size, before)
 
 
 def equations(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: float) -> Equations:
@@ -79,12 +84,16 @@ def equations(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: fl
     )
 
 
-def _stretches(drive: Real, size: int) -> npt.NDArray[np.intp]:
-    """Of every block; −1 for those that are not all in one, and where there are too few to judge any."""
-    numbers = known_stretches(drive)[: drive.size // size * size].reshape(-1, size)
-    found = np.where(np.all(numbers == numbers[:, :1], axis=1), numbers[:, 0], -1)
-    long = [number for number in range(found.max() + 1) if np.sum(found == number) >= PIECES]
-    return np.select([found == number for number in long], range(len(long)), -1) if long else np.full(found.size, -1)
+def _stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
+    """Of every block, −1 for those that are not all in one or in one with too few to judge any; the longest stroke."""
+    numbers = known_stretches(drive)
+    among = numbers[: drive.size // size * size].reshape(-1, size)
+    whole = np.where(np.all(among == among[:, :1], axis=1), among[:, 0], -1)
+    found, stroke_v = np.full(whole.size, -1), 0.0
+    for number in np.flatnonzero(np.bincount(whole[whole >= 0]) >= PIECES):
+        found[whole == number] = found.max() + 1
+        stroke_v = max(stroke_v, float(np.ptp(drive[numbers == number])))
+    return found, stroke_v
 
 
 def averaged_plays(run: Kept, thresholds: Real, state: Real) -> Real:
