@@ -45,6 +45,7 @@ def test_one_part_of_a_loop_gives_the_weights_that_it_shows() -> None:
     found = identify_from_parts([run_of(drive, position)], thresholds_v=THRESHOLDS_V.tolist())
     assert np.allclose(np.cumsum(found.shape.model.weights), np.cumsum(WEIGHTS_UM_PER_V), atol=0.05)
     assert found.judgements[0].rms_um < 0.5
+    assert found.judgements[0].early_max_um < 0.01 * found.judgements[0].range_um
     assert not found.judgements[0].from_rest
     assert found.missing == ""
 
