@@ -89,9 +89,10 @@ soak-forged: $(READY)
 soak-identification: $(READY)
 	$(BIN)/python -m tests.soak.identification
 
-# Hysteresis from parts of loops on 50 rigs drawn at random, memory unknown beside memory known: ten minutes of one core.
+# Hysteresis from parts of loops on 50 rigs drawn at random, memory unknown beside memory known: a minute or two
+# of one core; `FIRST=100` for other rigs.
 soak-parts: $(READY)
-	$(BIN)/python -m tests.soak.parts --draws $(or $(DRAWS),50)
+	$(BIN)/python -m tests.soak.parts --draws $(or $(DRAWS),50) --first $(or $(FIRST),0)
 
 # The error reported of a Preisach actuator, which no sum of plays is, beside the error on later recordings: a minute.
 soak-preisach: $(READY)

@@ -9,7 +9,7 @@ import pytest
 
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.measured import Measured, UnsuitableData
-from rtloop.hysteresis.unknown_memory import known_from, known_stroke_v, missing_stroke
+from rtloop.hysteresis.unknown_memory import known_from, known_stretches, missing_stroke
 from tests.design.other_truths import (
     THRESHOLDS_V,
     WEIGHTS_UM_PER_V,
@@ -17,6 +17,7 @@ from tests.design.other_truths import (
     part_of_a_drive,
     sum_of_plays,
 )
+from tests.soak.parts import ALLOWED_RATIO, both, drawn, reported_um, stepped, true_um
 
 Array = np.ndarray[Any, Any]
 SAMPLES = 300
@@ -44,8 +45,42 @@ def test_one_part_of_a_loop_gives_the_weights_that_it_shows() -> None:
     found = identify_from_parts([run_of(drive, position)], thresholds_v=THRESHOLDS_V.tolist())
     assert np.allclose(np.cumsum(found.shape.model.weights), np.cumsum(WEIGHTS_UM_PER_V), atol=0.05)
     assert found.judgements[0].rms_um < 0.5
+    assert found.judgements[0].early_max_um < 0.01 * found.judgements[0].range_um
     assert not found.judgements[0].from_rest
     assert found.missing == ""
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_within_what_was_covered_a_past_is_a_constant(seed: int) -> None:
+    """Two pasts, one drive: what they differ by stands still in every stretch, and moves elsewhere."""
+    random = np.random.default_rng(seed)
+    drive = np.interp(np.linspace(0, 5, SAMPLES), range(6), [1.0, 5.0, -2.0, 7.0, -8.0, random.uniform(-7, 9)])
+    pasts = [np.append(random.uniform(-10, 10, 5), drive[0]) for _ in range(2)]
+    one, other = (stepped(np.append(past, drive), THRESHOLDS_V)[past.size :] @ WEIGHTS_UM_PER_V for past in pasts)
+    stretches = known_stretches(drive)
+    assert stretches.max() == 3
+    for number in range(stretches.max() + 1):
+        assert np.ptp((one - other)[stretches == number]) < 1e-12
+    assert np.ptp(one - other) > 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 103])
+def test_not_knowing_the_memory_costs_little(seed: int) -> None:
+    """Of the soak's rigs the first three, and one of whose recordings the others show less than they seem to."""
+    rig = drawn(seed)
+    found, known = both(rig)
+    assert reported_um(found, found) <= ALLOWED_RATIO * reported_um(known, found)
+    assert true_um(found, rig, found.stroke_v) <= ALLOWED_RATIO * true_um(known, rig, found.stroke_v)
+
+
+def test_a_recording_whose_memory_is_never_known_is_not_judged() -> None:
+    drive = 1.0 + 8.0 * np.sin(np.linspace(0.5, 9.0, SAMPLES))
+    straight = np.linspace(-5.0, 5.0, SAMPLES)
+    runs = [run_of(one, sum_of_plays(one)) for one in (drive, straight)]
+    found = identify_from_parts(runs, 8, others=runs[1:])
+    assert [one.judged_part > 0 for one in (*found.judgements, *found.others)] == [True, False, False]
+    assert np.isnan(found.others[0].rms_um)
+    assert not found.others[0].unsettled
 
 
 def test_a_drive_that_never_turns_back_is_told_what_it_misses() -> None:
@@ -66,12 +101,11 @@ def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
         identify_from_parts([run], thresholds_v=[0.0, 1.0, 4.0])
 
 
-def test_known_strokes_by_hand() -> None:
-    drive = np.array([0.0, 5.0, -5.0, 3.0])
-    assert known_stroke_v(drive) == 8.0
-    assert known_stroke_v(np.array([0.0, 5.0, -5.0])) == 5.0
-    assert missing_stroke(drive) == (-5.0, 3.0, 5.0)
-    assert [known_from(drive, r) for r in (2.0, 5.0, 5.1)] == [1, 2, None]
+def test_known_stretches_by_hand() -> None:
+    drive = np.array([0.0, 5.0, -5.0, 3.0, 1.0, 7.0, 6.9, 8.0])
+    assert known_stretches(drive).tolist() == [-1, -1, -1, 0, 0, -1, -1, -1]
+    assert missing_stroke(drive[:4]) == (-5.0, 3.0, 5.0)
+    assert [known_from(drive[:4], r) for r in (2.0, 5.0, 5.1)] == [1, 2, None]
 
 
 def test_drift_stays_where_it_lessens_the_error_held_out_and_only_there() -> None:
@@ -93,7 +127,7 @@ def test_the_error_that_is_reported_is_that_on_fresh_data(truth: Any) -> None:
     reported = np.sqrt(np.mean([one.rms_um**2 for one in found.judgements]))
     wrong = [one.position_um - one.error_um - averaged(clean, one.error_um.size)
              for one, (_, clean) in zip(found.others, fresh, strict=True)]  # fmt: skip
-    true = np.sqrt(np.mean(np.square(wrong)))
+    true = np.sqrt(np.nanmean(np.square(wrong)))
     print(f"{truth.__name__}: reported {reported:.4f}, true {true:.4f} µm, fit {found.shape.rms_error_um:.4f} µm")
     assert true > 0.05
     assert reported == pytest.approx(true, rel=0.2)

@@ -1,9 +1,9 @@
 """What a sum of plays errs by on data that it was not fitted to.
 
-Of several recordings each is left out in turn: slopes and creep come from the others. What is a recording's own
-(offset, drift, memory at its beginning) comes from every other fortieth of it, and is judged on those between, and
-the other way round: so fine, for what was remembered shows in those samples alone that it still governs. Of a single
-recording four fortieths are left out at a time; the plays remember what the drive did in them.
+A recording is left out whole, so that slopes and creep come from the others, where two of these move every play as far
+as it does: from a single one, drift would pass for hysteresis. Its own (offsets, drift) then comes from every other
+piece of it, and is judged on those between, and the other way round. What no two others show is left out piece by
+piece, of all recordings at once; the plays remember what the drive did there.
 """
 
 from __future__ import annotations
@@ -13,99 +13,67 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.memory_fit import Common, Limits, Own, Stretch, errors, fit_memory
+from rtloop.design.identification.hysteresis.least_squares import Common, Equations, Limits, errors, fitted, own_of
 from rtloop.hil.modal import Real
 
 PIECES, FOLDS = 40, 10
-"""A recording is judged piece by piece; a single one is fitted so often, each time without as many of them."""
+"""Of a stretch; there are so many fits, each time without as many of them."""
 GROUPS = 5
 """At most so many fits: more recordings than that are left out several at a time."""
+SHOWN, OTHERS = 0.95, 2
+"""Others show a recording where so many move every play by this part of what it does."""
 
 
-def fitted(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> tuple[Common, list[Own]]:
-    """Slopes, creep and what is each recording's own. `memories`, of each, are the rises of its memory curve to begin
-    at.
-
-    First without drift and creep, which an unsuitable memory would otherwise be made up for by.
-    """
-    bare = [_bare(stretch) for stretch in stretches]
-    flat = _flat(limits)
-    owns = [_beginning(one, flat, rises) for one, rises in zip(bare, memories, strict=True)]
-    common, owns = fit_memory(bare, flat, owns, limits)
-    if stretches[0].creep.shape[1] == 0 and stretches[0].own.shape[1] == 1:
-        return common, owns
-    common = Common(common.slopes, np.zeros(stretches[0].creep.shape[1]))
-    return fit_memory(
-        stretches, common, [_with_terms(one, full) for one, full in zip(owns, stretches, strict=True)], limits
-    )
-
-
-def nearest(stretch: Stretch, memories: Sequence[Real], limits: Limits, common: Common | None = None) -> Real:
-    """That one of several memories to begin at which ends nearest to the recording, by itself or by a model given."""
-    bare = _bare(stretch) if common is None else stretch._replace(own=stretch.own[:, :1])
-    left = []
-    for rises in memories if len(memories) > 1 else ():
-        begun = _flat(limits) if common is None else common
-        found, owns = fit_memory([bare], begun, [_beginning(bare, begun, rises)], limits, fixed=common is not None)
-        left.append(float(np.sum(errors(bare, found, owns[0]) ** 2)))
-    return memories[int(np.argmin(left)) if left else 0]
-
-
-def own_of(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Own:
-    """Offset, drift and memory of a recording by a model that is given."""
-    bare = stretch._replace(own=stretch.own[:, :1])
-    owns = fit_memory([bare], common, [_beginning(bare, common, rises)], limits, fixed=True)[1]
-    if stretch.own.shape[1] == 1:
-        return owns[0]
-    return fit_memory([stretch], common, [_with_terms(owns[0], stretch)], limits, fixed=True)[1][0]
-
-
-def judged(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Real:
-    """Errors in µm (blocks,) of a recording that the model knows nothing of."""
-    found, even = np.empty(stretch.position_um.size), _pieces(stretch, PIECES) % 2 == 0
-    for half in (even, ~even):
-        own = own_of(stretch.only(half), common, rises, limits)
-        found[~half] = errors(stretch.only(~half), common, own)
+def held_out(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+    """Errors in µm of every recording, (blocks,) each, by fits that they had no part in; NaN where memory is not
+    known."""
+    found = _piece_by_piece(recordings, limits)
+    for group in range(GROUPS):
+        others = [one for i, one in enumerate(recordings) if i % GROUPS != group]
+        whole = [i for i in range(group, len(recordings), GROUPS) if _shown(recordings[i], others)]
+        if whole:
+            common, _ = fitted(others, limits)
+            for i in whole:
+                found[i] = judged(recordings[i], common)
     return found
 
 
-def held_out(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> list[Real]:
-    """Errors in µm of every recording, (blocks,) each, by fits that it had no part in."""
-    if len(stretches) == 1:
-        return [_piece_by_piece(stretches[0], memories, limits)]
-    found: list[Real] = [np.empty(0)] * len(stretches)
-    for group in range(min(GROUPS, len(stretches))):
-        others = [i for i in range(len(stretches)) if i % GROUPS != group]
-        common, _ = fitted([stretches[i] for i in others], [memories[i] for i in others], limits)
-        for i in range(group, len(stretches), GROUPS):
-            found[i] = judged(stretches[i], common, memories[i], limits)
+def judged(one: Equations, common: Common) -> Real:
+    """Errors in µm (blocks,) of a recording that the model knows nothing of; NaN where memory is not known."""
+    found, odd = np.full(one.known.size, np.nan), pieces(one) % 2 == 1
+    for half in (one.known & odd, one.known & ~odd):
+        rest = one.known & ~half
+        found[rest] = errors(one.only(rest), common, own_of(one.only(half), common))
     return found
 
 
-def _piece_by_piece(stretch: Stretch, memories: Sequence[Real], limits: Limits) -> Real:
-    found, folds = np.empty(stretch.position_um.size), _pieces(stretch, PIECES) % FOLDS
+def pieces(one: Equations) -> npt.NDArray[np.intp]:
+    """Number of the piece of its stretch that each block is in; −1 where memory is not known."""
+    found = np.full(one.known.size, -1)
+    for column in (one.offsets.T > 0) & one.known:
+        found[column] = np.arange(column.sum()) * PIECES // column.sum()
+    return found
+
+
+def _piece_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+    found = [np.full(one.known.size, np.nan) for one in recordings]
+    folds = [np.where(one.known, pieces(one) % FOLDS, -1) for one in recordings]
     for fold in range(FOLDS):
-        common, owns = fitted([stretch.only(folds != fold)], memories, limits)
-        found[folds == fold] = errors(stretch.only(folds == fold), common, owns[0])
+        rest = [one.only(among != fold) for one, among in zip(recordings, folds, strict=True)]
+        common, owns = fitted(rest, limits)
+        for one, among, own, left in zip(recordings, folds, owns, found, strict=True):
+            left[among == fold] = errors(one.only(among == fold), common, own)
     return found
 
 
-def _pieces(stretch: Stretch, pieces: int) -> npt.NDArray[np.intp]:
-    """Number of the piece that each block belongs to."""
-    return np.arange(stretch.position_um.size) * pieces // stretch.position_um.size
+def _shown(one: Equations, others: Sequence[Equations]) -> bool:
+    if len(others) < OTHERS:
+        return False
+    moved = np.sort([_moved(other) for other in others], axis=0)[-OTHERS]
+    return bool(np.all(moved >= SHOWN * _moved(one)))
 
 
-def _flat(limits: Limits) -> Common:
-    return Common(np.full(limits.thresholds_v.size, limits.range_um / limits.drive_v), np.empty(0))
-
-
-def _beginning(stretch: Stretch, common: Common, rises: Real) -> Own:
-    return Own(np.full(1, float(np.mean(errors(stretch, common, Own(np.zeros(1), rises))))), rises)
-
-
-def _bare(stretch: Stretch) -> Stretch:
-    return stretch._replace(own=stretch.own[:, :1], creep=stretch.creep[:, :0])
-
-
-def _with_terms(own: Own, stretch: Stretch) -> Own:
-    return Own(np.append(own.terms, np.zeros(stretch.own.shape[1] - own.terms.size)), own.rises)
+def _moved(one: Equations) -> Real:
+    """How far every slope's column goes within a stretch (plays,): between them, it goes where memory is not known."""
+    stretches = (one.offsets.T > 0) & one.known
+    return np.max([np.zeros(one.slopes.shape[1]), *(np.ptp(one.slopes[part], axis=0) for part in stretches)], axis=0)
