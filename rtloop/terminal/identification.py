@@ -37,22 +37,44 @@ def print_hysteresis(report: dict[str, Any]) -> None:
 def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     """What the model errs by on each recording when that has no part in it, and what was taken along."""
     shown = table(
-        "held out", "error µm rms", "at most µm", "% of range", "offset µm", "drift µm", "memory at the start"
+        "held out",
+        "error µm rms",
+        "at most µm",
+        "% of range",
+        "as written µm rms",
+        "offset µm",
+        "drift µm",
+        "memory at the start",
     )
     for row in report["held_out"]:
         memory = "from rest" if row["memory"] == "rest" else f"estimated; {_known(row['known_from_s'])}"
         shown.add_row(
             Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"), f"{row['rms_error_um']:.3g}",
-            f"{row['max_error_um']:.3g}", f"{row['max_error_percent']:.3g}", f"{row['offset_um']:.4g}",
-            f"{row['drift_um']:.3g}", memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
+            f"{row['max_error_um']:.3g}", f"{row['max_error_percent']:.3g}",
+            _number(row["as_written_rms_um"], "{:.3g}"), f"{row['offset_um']:.4g}", f"{row['drift_um']:.3g}",
+            memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
         )  # fmt: skip
     out.print(shown)
+    _print_all(out, report["held_out_all"])
     if "tried_um" in report:
         tried = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
         out.print(f"held out, µm rms: {tried}; taken: {' + '.join(('plays', *report['terms']))}")
         out.print(
             f"for strokes of up to {report['stroke_v']:.4g} V" + (f"; {report['missing']}" if report["missing"] else "")
         )
+
+
+def _print_all(out: Console, found: dict[str, Any]) -> None:
+    """Of several recordings together."""
+    error, written = found["error"], found["as_written"]
+    if error["std_um"] is not None:
+        said = f"; the plays as written, where their memory is known, {_with_std(written)}" if written else ""
+        out.print(f"together, held out: {_with_std(error)} µm rms{said}")
+
+
+def _with_std(found: dict[str, Any]) -> str:
+    std_um = found["std_um"]
+    return f"{found['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
 
 
 def _known(from_s: float | None) -> str:

@@ -9,6 +9,7 @@ recording four fortieths are left out at a time; the plays remember what the dri
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,14 @@ PIECES, FOLDS = 40, 10
 """A recording is judged piece by piece; a single one is fitted so often, each time without as many of them."""
 GROUPS = 5
 """At most so many fits: more recordings than that are left out several at a time."""
+
+
+class Held(NamedTuple):
+    """Blocks of a recording (a mask), the model that knows nothing of them, and what is the recording's own."""
+
+    blocks: npt.NDArray[np.bool_]
+    common: Common
+    own: Own
 
 
 def fitted(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> tuple[Common, list[Own]]:
@@ -60,20 +69,46 @@ def own_of(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Own
     return fit_memory([stretch], common, [_with_terms(owns[0], stretch)], limits, fixed=True)[1][0]
 
 
-def judged(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> Real:
-    """Errors in µm (blocks,) of a recording that the model knows nothing of."""
-    found, even = np.empty(stretch.position_um.size), _pieces(stretch, PIECES) % 2 == 0
-    for half in (even, ~even):
-        own = own_of(stretch.only(half), common, rises, limits)
-        found[~half] = errors(stretch.only(~half), common, own)
+def errors_held_out(stretch: Stretch, held: Sequence[Held]) -> Real:
+    """In µm (blocks,)."""
+    found = np.empty(stretch.position_um.size)
+    for one in held:
+        found[one.blocks] = errors(stretch.only(one.blocks), one.common, one.own)
     return found
+
+
+def errors_as_written(stretch: Stretch, held: Sequence[Held], written: int, known: int) -> Real:
+    """In µm, of the first `written` plays alone: without larger ones, drift and creep, which no file gets.
+
+    Of the blocks from `known` on, where nothing of their memory is estimated. Their mean is taken for the sensor's
+    offset: the one that was found stands beside what larger plays remember.
+    """
+    found = []
+    for one in held:
+        slopes = one.common.slopes.copy()
+        slopes[written:] = slopes[written - 1]
+        found.append(Held(one.blocks, Common(slopes, np.empty(0)), one.own._replace(terms=np.zeros(1))))
+    left = errors_held_out(_bare(stretch), found)[known:]
+    return left - np.mean(left)
+
+
+def judged(stretch: Stretch, common: Common, rises: Real, limits: Limits) -> list[Held]:
+    """A recording that the model knows nothing of: its own from one half of it, held against the other."""
+    even = _pieces(stretch, PIECES) % 2 == 0
+    return [Held(~half, common, own_of(stretch.only(half), common, rises, limits)) for half in (even, ~even)]
 
 
 def held_out(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> list[Real]:
     """Errors in µm of every recording, (blocks,) each, by fits that it had no part in."""
+    fits = fits_held_out(stretches, memories, limits)
+    return [errors_held_out(one, held) for one, held in zip(stretches, fits, strict=True)]
+
+
+def fits_held_out(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Limits) -> list[list[Held]]:
+    """Every recording, by fits that it had no part in."""
     if len(stretches) == 1:
         return [_piece_by_piece(stretches[0], memories, limits)]
-    found: list[Real] = [np.empty(0)] * len(stretches)
+    found: list[list[Held]] = [[]] * len(stretches)
     for group in range(min(GROUPS, len(stretches))):
         others = [i for i in range(len(stretches)) if i % GROUPS != group]
         common, _ = fitted([stretches[i] for i in others], [memories[i] for i in others], limits)
@@ -82,11 +117,11 @@ def held_out(stretches: Sequence[Stretch], memories: Sequence[Real], limits: Lim
     return found
 
 
-def _piece_by_piece(stretch: Stretch, memories: Sequence[Real], limits: Limits) -> Real:
-    found, folds = np.empty(stretch.position_um.size), _pieces(stretch, PIECES) % FOLDS
+def _piece_by_piece(stretch: Stretch, memories: Sequence[Real], limits: Limits) -> list[Held]:
+    found, folds = [], _pieces(stretch, PIECES) % FOLDS
     for fold in range(FOLDS):
         common, owns = fitted([stretch.only(folds != fold)], memories, limits)
-        found[folds == fold] = errors(stretch.only(folds == fold), common, owns[0])
+        found.append(Held(folds == fold, common, owns[0]))
     return found
 
 

@@ -14,6 +14,8 @@ from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
 
 Term = Literal["drift", "creep"]
+Clock = Literal["time", "path"]
+"""What creep goes by. By the drive's path it is a memory that fades, which no passing of time makes."""
 
 BLOCKS, LEAST_BLOCKS = 3000, 300
 """Averaged samples of all recordings together, and of each at least."""
@@ -24,7 +26,8 @@ AT_ONCE = 100_000
 
 
 class Kept(NamedTuple):
-    """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, each (blocks,).
+    """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, the path that
+    the drive has gone in V, each (blocks,).
 
     `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where
     unknown.
@@ -34,6 +37,7 @@ class Kept(NamedTuple):
     time_s: Real
     drive_v: Real
     position_um: Real
+    path_v: Real
     full_v: Real
     size: int
     before_v: Real | None
@@ -45,12 +49,16 @@ def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kep
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most)
     time_s = run.seconds[:-1] - run.seconds[0]
     before = None if before_v is None else np.asarray(before_v, float)
-    time_s, slow, position = averaged(np.column_stack([time_s, drive, run.position_um[1:]]), size).T
-    return Kept(run.name, time_s, slow, position, drive, size, before)
+    path_v = np.cumsum(np.abs(np.diff(drive, prepend=drive[0])))
+    time_s, slow, position, path_v = averaged(np.column_stack([time_s, drive, run.position_um[1:], path_v]), size).T
+    return Kept(run.name, time_s, slow, position, path_v, drive, size, before)
 
 
-def stretch(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: float) -> Stretch:
-    """With plays at these thresholds in V and these terms; `duration_s` is that of the longest recording."""
+def stretch(
+    run: Kept, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
+) -> Stretch:
+    """With plays at these thresholds in V and these terms; `duration_s` and `path_v` are those of the longest
+    recordings."""
     first_v = float(run.full_v[0])
     if run.before_v is None:
         low, high = (_plays(run, thresholds, first_v + side * thresholds) for side in (-1.0, 1.0))
@@ -58,7 +66,8 @@ def stretch(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: floa
         low = high = _plays(run, thresholds, play_outputs(np.append(run.before_v, first_v), thresholds)[-1])
     constant, since = np.ones(run.time_s.size), run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
     own = np.column_stack([constant, since] if "drift" in terms else [constant])
-    creep = [_lag(run, duration_s / part) for part in CREEP_PARTS] if "creep" in terms else []
+    passed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
+    creep = [_lag(run.drive_v, passed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
     return Stretch(first_v, low, high, np.array(creep).reshape(-1, run.time_s.size).T, own, run.position_um)
 
 
@@ -77,11 +86,11 @@ def _plays(run: Kept, thresholds: Real, state: Real) -> Real:
     return np.concatenate(parts)
 
 
-def _lag(run: Kept, time_constant_s: float) -> Real:
-    """Drive behind a first-order lag, which stood still at first: (blocks,)."""
-    shares = -np.expm1(-np.diff(run.time_s, prepend=run.time_s[0]) / time_constant_s)
-    found, last = np.empty(run.drive_v.size), float(run.drive_v[0])
+def _lag(drive_v: Real, passed: Real, constant: float) -> Real:
+    """Drive behind a first-order lag, which stood still at first: (blocks,). `passed` is what the constant is in."""
+    shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
+    found, last = np.empty(drive_v.size), float(drive_v[0])
     for k, share in enumerate(shares):
-        last += share * (run.drive_v[k] - last)
+        last += share * (drive_v[k] - last)
         found[k] = last
     return found
