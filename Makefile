@@ -93,7 +93,7 @@ soak-identification: $(READY)
 soak-parts: $(READY)
 	$(BIN)/python -m tests.soak.parts --draws $(or $(DRAWS),50)
 
-# Bouc-Wen and Preisach actuators, six sets of recordings each: the error that is reported beside the true one: five minutes.
+# Bouc-Wen and Preisach actuators, six sets of recordings each: the error that is reported beside the true one: a minute.
 soak-truths: $(READY)
 	$(BIN)/python -m tests.soak.truths
 

@@ -54,7 +54,7 @@ def identify() -> None:
 )  # fmt: skip
 @click.option(
     "--memory", default="auto", show_default=True, type=click.Choice(["auto", "rest", "unknown"]),
-    help="Of the actuator at the start of each RUN: none (rest), or estimated; auto asks where its drive begins.",
+    help="Of the actuator at the start of each RUN: none (rest), or unknown; auto asks where its drive begins.",
 )  # fmt: skip
 @click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model on; repeatable.")
 @OUT
@@ -71,8 +71,9 @@ def hysteresis(
     """Thresholds and weights from recorded slow drives.
 
     Sines from rest tell most: RUNs that each begin at 0 V on a depolarised actuator and show its initial loading
-    curve. Any others do as well: part of a loop, from anywhere. What the actuator remembered is then estimated, and
-    plays that no stroke has shown beyond doubt are left out. The error is that on data held out of the fit.
+    curve. Any others do as well: part of a loop, from anywhere. What the drive does before the actuator's memory is
+    known is then left out, and so are plays that no later stroke has shown. The error is that on data held out of the
+    fit.
     """
     from rtloop.commands.identify import hysteresis_report
     from rtloop.terminal.identification import print_hysteresis

@@ -16,16 +16,16 @@ from rtloop.design.identification.dynamics.identify_in_loop import identified_dy
 from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
 from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, recorded_loop
 from rtloop.design.identification.frequency_response import agreement, measured_response
+from rtloop.design.identification.hysteresis.from_rest import begins_at_rest
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import (
     HysteresisFit,
-    Placement,
     Weights,
-    begins_at_rest,
     identify_hysteresis,
     unexplained_um,
 )
 from rtloop.design.identification.hysteresis.judgement import Judgement, judged_from_rest, together
+from rtloop.design.identification.hysteresis.thresholds import Placement
 from rtloop.design.identification.identified import (
     dynamics_provenance,
     feedforward_of,
@@ -118,28 +118,29 @@ def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
         "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "as_written_rms_um": one.as_written_rms_um,
         "max_error_um": one.max_um,
         "max_error_percent": 100 * one.max_um / one.range_um, "range_um": one.range_um, "offset_um": one.offset_um,
-        "drift_um": one.drift_um, "memory": "rest" if one.from_rest else "estimated", "known_from_s": one.known_from_s,
-        "unsettled": one.unsettled, "unsettled_um": one.unsettled_um,
+        "drift_um": one.drift_um, "memory": "rest" if one.from_rest else "unknown", "known_from_s": one.known_from_s,
+        "unsettled": one.unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.judged_part,
+        "early_max_error_percent": 100 * one.early_max_um / one.range_um,
     }  # fmt: skip
 
 
 def _all(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Of all recordings together, with standard errors."""
-    written = [one.as_written_rms_um for one in judged if one.as_written_rms_um is not None]
     return {
         "error": together([one.rms_um for one in judged])._asdict(),
-        "as_written": together(written)._asdict() if written else None,
+        "as_written": together([one.as_written_rms_um for one in judged])._asdict(),
     }
 
 
 def _held_out(rows: Sequence[dict[str, Any]], more: dict[str, Any]) -> list[str]:
     """Comments of what is written: the error on what was held out, and for which strokes the model is."""
-    worst = max(rows, key=lambda row: row["max_error_percent"])
+    worst = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
     lines = [
         f"held out: {worst['rms_error_um']:.3g} µm rms, at most {worst['max_error_percent']:.3g} % of "
-        f"{worst['range_um']:.4g} µm, in {Path(worst['recording']).name}; memory at the start: {worst['memory']}"
+        f"{worst['range_um']:.4g} µm, in {Path(worst['recording']).name}; memory at the start: {worst['memory']}, "
+        f"{worst['judged_percent']:.3g} % of it judged"
     ]
-    alone = [row["as_written_rms_um"] for row in rows if row["as_written_rms_um"] is not None]
+    alone = [row["as_written_rms_um"] for row in rows if np.isfinite(row["as_written_rms_um"])]
     if more.get("terms") and alone:
         lines.append(f"{' and '.join(more['terms'])} taken out; these plays alone leave up to {max(alone):.3g} µm rms")
     if more.get("missing"):

@@ -1,12 +1,14 @@
 """Play operators of an actuator that was driven before anybody looked: their memory at the first sample is not known.
 
-A play clips its last value to u ± r, and clips in succession are one clip. From a first value z, therefore,
+Let the drive have covered C = [min u, max u] so far. At the two ends of C a play was clipped to F_r ≥ max u − r and to
+F_r ≤ min u + r. Therefore
 
-    F_r[u]_k = min(max(z, low_k), high_k),     low, high: the plays that began at u_0 − r and at u_0 + r
+    2 r ≤ |C|:   F_r no longer depends on what it was at first: it is known
+    2 r ≥ |C|:   max u − r ≤ F_r ≤ min u + r, which no drive within C leaves: F_r stands still until C grows
 
-The two bounds meet once the drive has covered 2 r, and the play is known from there on, whatever z was. Plays of one
-actuator share a memory curve λ(r) = F_r with λ(0) = u_0 and |λ(r′) − λ(r)| ≤ |r′ − r| (Brokate & Sprekels, Hysteresis
-and Phase Transitions, 1996, section 2.3): the first values of neighbours are apart by no more than their thresholds.
+While the drive stays within what it has covered, a sum of plays is thus the known ones and a constant, exactly. While
+it goes beyond, plays move of which nothing is known but the order of their thresholds: Σ p_i F_i then tells next to
+nothing of the weights (Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.3: memory curves).
 """
 
 from __future__ import annotations
@@ -15,12 +17,16 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs, turning_points
 
 LEAST_TURN = 1e-3
 """Part of the drive's range by which it must turn back for a stroke to end."""
+
+LEAST_WITHIN = 0.03
+"""Part of the drive's range that a stretch within what was covered has at least: noise makes small ones."""
 
 
 class Missing(NamedTuple):
@@ -30,6 +36,18 @@ class Missing(NamedTuple):
     turn_v: float
     reached_v: float
     goal_v: float
+
+
+def known_stretches(drive: Real) -> npt.NDArray[np.intp]:
+    """Number of the stretch within what was covered before that each sample (samples,) is in; −1 where in none."""
+    grown = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
+    beyond = np.concatenate([[True], grown, [True]])
+    found, number = np.full(drive.size, -1), 0
+    for start, end in np.flatnonzero(np.diff(beyond)).reshape(-1, 2):
+        if np.ptp(drive[start : end + 1]) >= LEAST_WITHIN * np.ptp(drive):
+            found[start + 1 : end + 1] = number
+            number += 1
+    return found
 
 
 def known_stroke_v(drive: Real) -> float:

@@ -37,21 +37,16 @@ def print_hysteresis(report: dict[str, Any]) -> None:
 def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     """What the model errs by on each recording when that has no part in it, and what was taken along."""
     shown = table(
-        "held out",
-        "error µm rms",
-        "at most µm",
-        "% of range",
-        "as written µm rms",
-        "offset µm",
-        "drift µm",
-        "memory at the start",
-    )
+        "held out", "error µm rms", "at most µm", "% of range", "in % of it", "% before that", "as written µm rms",
+        "offset µm", "drift µm", "memory at the start",
+    )  # fmt: skip
     for row in report["held_out"]:
-        memory = "from rest" if row["memory"] == "rest" else f"estimated; {_known(row['known_from_s'])}"
+        memory = "from rest" if row["memory"] == "rest" else f"unknown; {_known(row['known_from_s'])}"
+        errors = ("rms_error_um", "max_error_um", "max_error_percent", "judged_percent", "early_max_error_percent")
         shown.add_row(
-            Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"), f"{row['rms_error_um']:.3g}",
-            f"{row['max_error_um']:.3g}", f"{row['max_error_percent']:.3g}",
-            _number(row["as_written_rms_um"], "{:.3g}"), f"{row['offset_um']:.4g}", f"{row['drift_um']:.3g}",
+            Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"),
+            *(_number(row[key], "{:.3g}") for key in errors),
+            _number(row["as_written_rms_um"], "{:.3g}"), _number(row["offset_um"], "{:.4g}"), f"{row['drift_um']:.3g}",
             memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
         )  # fmt: skip
     out.print(shown)
@@ -68,8 +63,7 @@ def _print_all(out: Console, found: dict[str, Any]) -> None:
     """Of several recordings together."""
     error, written = found["error"], found["as_written"]
     if error["std_um"] is not None:
-        said = f"; the plays as written, where their memory is known, {_with_std(written)}" if written else ""
-        out.print(f"together, held out: {_with_std(error)} µm rms{said}")
+        out.print(f"together, held out: {_with_std(error)} µm rms; the plays as written {_with_std(written)}")
 
 
 def _with_std(found: dict[str, Any]) -> str:

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, placed_thresholds
+from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
+from rtloop.design.identification.hysteresis.thresholds import placed_thresholds
 from rtloop.design.identification.identified import feedforward_of, feedforward_section
 from rtloop.design.identification.measured import Measured, UnsuitableData, require_usable
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V

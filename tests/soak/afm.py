@@ -65,8 +65,13 @@ def shown(path: Path, folder: Path) -> float:
         print(f"{name:48} refused: {found['error']}")
         return 0.0
     for i, row in enumerate(found["held_out"]):
-        share = 100 * row["rms_error_um"] / row["range_um"]
-        remarks = ["unsettled"] if row["unsettled"] else []
+        if not row["judged_percent"]:
+            print(f"{name if i == 0 else '':48}{i:6}  not judged: its memory is never known")
+            continue
+        share, apart = (100 * row[key] / row["range_um"] for key in ("rms_error_um", "unsettled_um"))
+        remarks = [f"{row['judged_percent']:.0f} % of it", f"the rest {row['early_max_error_percent']:.2f} %"]
+        remarks += [f"{apart:.2f} % from a settled loop"]
+        remarks += ["unsettled"] if row["unsettled"] else []
         remarks += [f"for strokes up to {found['stroke_v']:.3g}"] if i == 0 else []
         kind = "fitted" if row["fitted"] else "held out"
         print(
@@ -74,7 +79,8 @@ def shown(path: Path, folder: Path) -> float:
             f"{', '.join(remarks)}",
             flush=True,
         )
-    return max((row["max_error_percent"] for row in found["held_out"][1:]), default=0.0)
+    keys = ("max_error_percent", "early_max_error_percent")
+    return max((row[key] or 0.0 for row in found["held_out"][1:] for key in keys), default=0.0)
 
 
 def recordings(path: Path, folder: Path) -> list[Path]:

@@ -47,10 +47,11 @@ def main() -> None:
     """A row for each rig; 1 where an error is above what is allowed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
     given = parser.parse_args()
     print(" rig  files  noise nm  reported µm  known µm  ratio  true ratio  terms")
     ratios, true_ratios, refused = [], [], 0
-    for seed in range(given.draws):
+    for seed in range(given.first, given.first + given.draws):
         rig = drawn(seed)
         try:
             found, known = both(rig)
@@ -59,7 +60,7 @@ def main() -> None:
             print(f"{seed:4}{len(rig.drives_v):7}{1e3 * rig.noise_um:10.0f}  refused: {reason}", flush=True)
             continue
         reported, best = reported_um(found), reported_um(known)
-        true = true_um(found, rig) / true_um(known, rig)
+        true = true_um(found, rig, found.stroke_v) / true_um(known, rig, found.stroke_v)
         ratios.append(reported / best)
         true_ratios.append(true)
         print(
@@ -95,10 +96,12 @@ def drawn(seed: int) -> Rig:
 
 
 def both(rig: Rig) -> tuple[PartsFit, PartsFit]:
-    """With the memory unknown; and known, with plays at the same thresholds."""
+    """With the memory unknown; and known, with the same plays and as dense ones up to the largest that may move."""
     found = identify_from_parts(rig.runs())
-    thresholds = found.shape.model.thresholds.tolist()
-    return found, identify_from_parts(rig.runs(), thresholds_v=thresholds, before_v=rig.past_v)
+    thresholds, half_v = found.shape.model.thresholds, 0.5 * found.stroke_v
+    largest_v = max(float(np.abs(np.append(*one)).max()) for one in zip(rig.past_v, rig.drives_v, strict=True))
+    more = np.arange(half_v, largest_v, half_v / thresholds.size)
+    return found, identify_from_parts(rig.runs(), thresholds_v=[*thresholds, *more], before_v=rig.past_v)
 
 
 def reported_um(found: PartsFit) -> float:
@@ -106,11 +109,11 @@ def reported_um(found: PartsFit) -> float:
     return float(np.sqrt(np.mean([one.rms_um**2 for one in found.judgements])))
 
 
-def true_um(found: PartsFit, rig: Rig) -> float:
-    """rms error of loops of the length that the model is for, and smaller ones, memory known, without noise."""
+def true_um(found: PartsFit, rig: Rig, stroke_v: float) -> float:
+    """rms error of loops of this length and smaller ones, memory known, without noise."""
     middle = 0.5 * (max(u.max() for u in rig.drives_v) + min(u.min() for u in rig.drives_v))
     sizes = np.interp(np.arange(1200), [0, 600, 1200], [1, 1, 0.3])
-    loops = middle + 0.5 * found.stroke_v * sizes * np.sin(2 * np.pi * np.arange(1200) / 300)
+    loops = middle + 0.5 * stroke_v * sizes * np.sin(2 * np.pi * np.arange(1200) / 300)
     truth = stepped(loops, PLAYS_V, middle - PLAYS_V) @ rig.weights
     model = found.shape.model
     error = (stepped(loops, model.thresholds, middle - model.thresholds) @ model.weights - truth)[300:]

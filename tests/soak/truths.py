@@ -16,7 +16,7 @@ import numpy as np
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.hysteresis.judgement import together
 from tests.design.other_truths import bouc_wen, preisach
-from tests.design.test_identify_from_parts import recorded, true_um
+from tests.design.test_error_as_written import recorded, true_um
 
 TRUE_DRIVES, ALLOWED, SURELY = 32, 0.2, 2.5
 """Drives of the true error; what the reported one may be off by, and by how many of its standard errors at most where
@@ -39,7 +39,7 @@ def main() -> None:
             others = [recorded(truth, first + 1000 + i) for i in range(given.recordings)]
             found = identify_from_parts(runs, 8, "chebyshev-from-0", others=others)
             true = true_um(truth, found.shape.model, range(first + 2000, first + 2000 + TRUE_DRIVES))
-            written = together([one.as_written_rms_um or np.nan for one in found.judgements])
+            written = together([one.as_written_rms_um for one in found.judgements])
             error, later = (together([one.rms_um for one in group]) for group in (found.judgements, found.others))
             print(
                 f"{truth.__name__:9}{number:4}{written.rms_um:9.3f} ± {written.std_um:.3f}{true:11.3f}"

@@ -25,7 +25,7 @@ POINTS = 20_000
 
 def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output: Path) -> None:
     """Measured and modelled loops (Fig 4 of the paper), each held out of the model that is drawn with it, and the
-    errors.
+    errors; pale where memory was not known, and was estimated.
 
     Raises OutputError, MissingExtra.
     """
@@ -39,9 +39,10 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
         loop.plot(one.drive_v, position - one.error_um, color="0.15", linewidth=0.8, **model)
         in_time.plot(time_s, one.error_um, color=color, linewidth=0.8, **name)
         over_drive.plot(one.drive_v, one.error_um, color=color, linewidth=0.8)
+        in_time.plot(time_s, one.early_um, color=color, linewidth=0.8, alpha=0.3)
     label(loop, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
-    rms_um = float(np.sqrt(np.mean([one.rms_um**2 for one in judgements])))
+    rms_um = float(np.sqrt(np.mean([one.rms_um**2 for one in judgements if one.judged_part])))
     label(in_time, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1)
     label(over_drive, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
     save(figure, output)

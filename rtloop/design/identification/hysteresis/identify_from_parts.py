@@ -1,9 +1,8 @@
 """A Prandtl-Ishlinskii model from recordings as there are: any start, part of a loop, any rate, several at once.
 
-What the actuator remembered at the beginning of a recording is estimated along with the model (`memory_fit`). Plays
-larger than half of the longest stroke of known memory (`unknown_memory`) take part, for they move in the recordings,
-but nothing tells them from a memory that would have looked alike: they are not written. Drift and creep stay only
-where they lessen the error on data that was held out, creep more than the same lags by the drive's path do.
+Slopes come from the stretches in which the drive stays within what it has covered (`unknown_memory`): there the plays
+that move are known, and the others are an offset. Only plays of up to half of the longest such stroke show, and are
+written. Drift and creep stay only where they lessen the error on data that was held out.
 """
 
 from __future__ import annotations
@@ -14,23 +13,25 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.held_out import held_out
+from rtloop.design.identification.hysteresis.held_out import OTHERS, held_out
 from rtloop.design.identification.hysteresis.identify_hysteresis import (
     HysteresisFit,
-    Placed,
-    Placement,
     Weights,
-    placed_thresholds,
 )
 from rtloop.design.identification.hysteresis.judgement import (
     Judgement,
     Trial,
     Work,
     judgements_of,
-    prepared,
     prepared_work,
 )
-from rtloop.design.identification.hysteresis.stretches import Term
+from rtloop.design.identification.hysteresis.stretches import Kept, Term
+from rtloop.design.identification.hysteresis.thresholds import (
+    Placement,
+    placed_thresholds,
+    require_ascending,
+    tried,
+)
 from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import loop_shape
@@ -42,8 +43,6 @@ EARNED = 0.95
 """Drift or creep stays where it leaves less than this part of the held-out error."""
 SURELY = 1.0
 """Standard errors over the recordings that creep gains by at least."""
-LARGER = 6
-"""Plays beyond those that are written."""
 LEAST_KNOWN = 0.25
 """The longest stroke of known memory is at least this part of the drive's range."""
 WHOLE = 0.98
@@ -86,56 +85,33 @@ def identify_from_parts(
     """
     work = prepared_work(runs, weights, before_v)
     stroke_v, missing = _require_stroke(runs, work)
-    trials = [_trial(count, one, stroke_v, work.largest_v) for one in _placements(placement)]
+    trials = [Trial(placed_thresholds(count, 0.5 * stroke_v, one), one, ()) for one in tried(placement)]
     if thresholds_v is not None:
-        trials = [_given(np.array(thresholds_v, float), stroke_v, work.largest_v, missing)]
-    best, tried = _chosen(work, trials)
+        trials = [_given(np.array(thresholds_v, float), stroke_v, missing)]
+    best, errors_um = _chosen(work, trials)
     common, judgements, on_others = judgements_of(work, best, others)
     left = np.concatenate([one.left_um for one in judgements])
-    model = PlayModel(best.thresholds_v[: best.written], np.diff(common.slopes[: best.written], prepend=0.0))
-    creep_um = max(float(np.ptp(work.stretch(run, best).creep @ common.creep)) for run in work.runs)
+    model = PlayModel(best.thresholds_v, np.diff(common.slopes, prepend=0.0))
+    creep_um = max(float(np.ptp(work.equations(run, best).creep @ common.creep)) for run in work.runs)
     shape = _shape(runs, work, model, judgements, left, best.placed, weights)
-    return PartsFit(shape, judgements, on_others, best.terms, tried, stroke_v, creep_um, missing)
+    return PartsFit(shape, judgements, on_others, best.terms, errors_um, stroke_v, creep_um, missing)
 
 
-def _placements(placement: Placement) -> tuple[Placed, ...]:
-    return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
-
-
-def _trial(count: int, placed: Placed, stroke_v: float, largest_v: float) -> Trial:
-    return _with_larger(placed_thresholds(count, 0.5 * stroke_v, placed), placed, 0.5 * stroke_v, largest_v)
-
-
-def _with_larger(thresholds: Real, placed: str, from_v: float, largest_v: float) -> Trial:
-    larger = np.linspace(from_v, largest_v, LARGER, endpoint=False)
-    return Trial(np.append(thresholds, larger), thresholds.size, placed, ())
-
-
-def _given(thresholds: Real, stroke_v: float, largest_v: float, missing: str) -> Trial:
-    if (
-        thresholds.size == 0
-        or not np.all(np.isfinite(thresholds))
-        or thresholds[0] < 0
-        or np.any(np.diff(thresholds) <= 0)
-    ):
-        raise ValueError(f"thresholds: {thresholds.tolist()} must be at least 0 and ascend")
+def _given(thresholds: Real, stroke_v: float, missing: str) -> Trial:
+    require_ascending(thresholds)
     beyond = thresholds[thresholds >= 0.5 * stroke_v]
     if beyond.size:
         raise UnsuitableData(
             f"thresholds from {beyond[0]:g} V on cannot be told: the longest stroke of known memory has {stroke_v:.4g} "
             f"V and shows plays below {0.5 * stroke_v:.4g} V{f'; {missing}' if missing else ''}"
         )
-    return _with_larger(thresholds, "given", 0.5 * stroke_v, largest_v)
+    return Trial(thresholds, "given", ())
 
 
 def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
     """The longest stroke of known memory, and what is missing to the whole range. Raises UnsuitableData."""
-    known = [run.before_v is not None for run in work.runs]
-    strokes = [
-        2 * float(np.abs(run.full_v).max()) if rest else known_stroke_v(run.full_v)
-        for run, rest in zip(work.runs, known, strict=True)
-    ]
-    stroke_v = min(max(strokes), work.largest_v)
+    judged = [run for run in work.runs if np.any(run.stretch >= 0)]
+    stroke_v = max((_known_v(run) for run in judged), default=0.0)
     if stroke_v >= WHOLE * work.largest_v:
         return stroke_v, ""
     widest = max(work.runs, key=lambda run: float(np.ptp(run.full_v)))
@@ -151,6 +127,13 @@ def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
             f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN:g} % are needed; {missing}"
         )
     return stroke_v, missing
+
+
+def _known_v(run: Kept) -> float:
+    """Twice the largest threshold that may show in a recording."""
+    if run.before_v is None:
+        return known_stroke_v(run.full_v)
+    return 2 * float(np.abs(np.append(run.before_v, run.full_v)).max())
 
 
 def _chosen(work: Work, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:
@@ -186,17 +169,17 @@ def _takes_time(work: Work, trial: Trial, name: str, found: dict[str, Real], wit
 
 def _candidates(work: Work) -> tuple[Term, ...]:
     """Terms that data could tell: a drive that comes by once looks alike with drift and with other weights, and creep
-    takes the shape of one recording whatever it is held out of."""
+    takes the shape of a recording unless that is left out whole."""
     if len(work.runs) > 1:
-        return "drift", "creep"
+        return ("drift", "creep") if len(work.runs) > OTHERS else ("drift",)
     drive = work.runs[0].drive_v
     return ("drift",) if turning_points(drive, REPEATED * float(np.ptp(drive))).size >= LEAST_TURNS else ()
 
 
 def _squares(work: Work, trial: Trial) -> Real:
-    """Mean square of the errors held out of each recording (runs,)."""
-    found = held_out(*prepared(work, work.runs, trial), work.limits(trial))
-    return np.array([float(np.mean(one**2)) for one in found])
+    """Mean square of the errors held out of each recording that is judged (runs,)."""
+    found = held_out([work.equations(run, trial) for run in work.runs], work.limits)
+    return np.array([float(np.nanmean(one[:, 0] ** 2)) for one in found if np.any(np.isfinite(one))])
 
 
 def _shape(

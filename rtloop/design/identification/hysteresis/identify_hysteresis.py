@@ -16,27 +16,30 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from rtloop.design.identification.hysteresis.from_rest import require_loop
+from rtloop.design.identification.hysteresis.thresholds import (
+    Placement,
+    placed_thresholds,
+    require_ascending,
+    tried,
+)
 from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
-from rtloop.hysteresis.plays import model_output, play_outputs, turning_points
-from rtloop.laws.shipped.play_model import MAX_PLAYS, PlayModel
+from rtloop.hysteresis.plays import model_output, play_outputs
+from rtloop.laws.shipped.play_model import PlayModel
 
-Placed = Literal["chebyshev", "chebyshev-from-0", "uniform"]
-Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 Weights = Literal["invertible", "free"]
 
 BLOCKS = 20_000
 """At most so many averaged samples of each recording take part."""
 LEAST_SLOPE = 0.05
 """Of "invertible" weights: the least partial sum, as a part of the mean slope, so that the inverse stays moderate."""
-REST = 0.02
-"""A recording starts from rest where its first drive is below this part of the largest."""
 FINEST, STRUCTURE = 60, 2.5e-4
 """An actuator is no sum of plays where not even so many explain it: what they leave beside noise is more than this part
 of the range."""
@@ -75,22 +78,6 @@ class _Equations(NamedTuple):
     position_um: Real
 
 
-def placed_thresholds(count: int, largest_v: float, placement: Placed) -> Real:
-    """`count` thresholds in V below `largest_v`, the largest drive.
-
-    "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
-    give those of eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.
-    "uniform": R·i/n from 0 on.
-    """
-    if not 1 <= count <= MAX_PLAYS:
-        raise ValueError(f"number of operators: {count}; 1 to {MAX_PLAYS} are allowed")
-    if placement == "uniform":
-        return largest_v * np.arange(count) / count
-    if placement == "chebyshev":
-        return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(1, count + 1) / (count + 1)))
-    return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(count) / count))
-
-
 def identify_hysteresis(
     runs: Sequence[Measured],
     count: int = 15,
@@ -102,15 +89,13 @@ def identify_hysteresis(
 
     "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever leaves less of the recordings.
     """
-    if placement not in get_args(Placement):
-        raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
+    placements = tried(placement)
     for run in runs:
-        _require_loop(run)
+        require_loop(run)
     largest_v = max(float(np.abs(run.drive_v).max()) for run in runs)
     if thresholds_v is not None:
         return _fitted(runs, np.array(thresholds_v, float), "given", weights, largest_v)
-    tried: tuple[Placed, ...] = ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
-    fits = [_fitted(runs, placed_thresholds(count, largest_v, one), one, weights, largest_v) for one in tried]
+    fits = [_fitted(runs, placed_thresholds(count, largest_v, one), one, weights, largest_v) for one in placements]
     return min(fits, key=lambda fit: fit.rms_error_um)
 
 
@@ -127,6 +112,7 @@ def _fitted(
     runs: Sequence[Measured], thresholds: Real, placed: str, weights: Weights, largest_v: float
 ) -> HysteresisFit:
     """With plays at `thresholds` in V."""
+    require_ascending(thresholds)
     _require_reached(thresholds, largest_v)
     equations = [_equations(run, thresholds, i, len(runs)) for i, run in enumerate(runs)]
     columns = np.vstack([part.columns for part in equations])
@@ -189,33 +175,7 @@ def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Rea
     return solution[:plays], solution[plays:]
 
 
-def begins_at_rest(run: Measured) -> bool:
-    """Its first drive is next to 0 V, and it holds the major loop: what `identify_hysteresis` asks for."""
-    turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
-    return abs(run.drive_v[0]) <= REST * float(np.abs(run.drive_v).max()) and turns.size >= 2
-
-
-def _require_loop(run: Measured) -> None:
-    """Raise UnsuitableData for a drive that does not start at rest or makes no loop."""
-    drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
-    if abs(drive[0]) > REST * largest_v:
-        raise UnsuitableData(
-            f"{run.name}: it starts at {drive[0]:g} V, so that the actuator's memory is not known; a drive that starts "
-            "at 0 V from rest, with its initial loading curve, is needed"
-        )
-    turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
-    if turns.size < 2:
-        raise UnsuitableData(
-            f"{run.name}: too little excitation: the drive turns back {turns.size} times; at least 2 are needed "
-            "(one and a half periods of a sine make the major loop)"
-        )
-
-
 def _require_reached(thresholds: Real, largest_v: float) -> None:
-    if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
-        raise ValueError(f"thresholds: {thresholds.size} given; 1 to {MAX_PLAYS} are allowed")
-    if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):
-        raise ValueError(f"thresholds: {thresholds.tolist()} must be at least 0 and ascend")
     beyond = thresholds[thresholds >= largest_v]
     if beyond.size:
         raise UnsuitableData(

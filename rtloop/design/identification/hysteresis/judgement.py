@@ -9,41 +9,30 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.held_out import (
-    Held,
-    errors_as_written,
-    errors_held_out,
-    fits_held_out,
-    fitted,
-    judged,
-    nearest,
-    own_of,
-)
+from rtloop.design.identification.hysteresis.early_part import early_errors
+from rtloop.design.identification.hysteresis.held_out import held_out, judged
 from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
-from rtloop.design.identification.hysteresis.memory_fit import Common, Limits, Own, Stretch, errors, output
-from rtloop.design.identification.hysteresis.stretches import Clock, Kept, Term, kept, stretch
+from rtloop.design.identification.hysteresis.least_squares import Common, Equations, Limits, errors, fitted, own_of
+from rtloop.design.identification.hysteresis.stretches import Clock, Kept, Term, equations, kept
 from rtloop.design.identification.measured import Measured
 from rtloop.hil.modal import Real
-from rtloop.hysteresis.unknown_memory import known_from, settled_memory
+from rtloop.hysteresis.unknown_memory import known_from
 
 UNSETTLED = 0.08
 """Part of its range by which a recording's beginning may depart from a loop that repeats itself: scanners whose
 branches differ in shape, or creep, depart by half of it where their loops close."""
-
-LEAST_SHOWN = 0.25
-"""Part of a recording, of known memory, that the plays as written are judged on."""
 
 
 @dataclass(frozen=True)
 class Judgement:
     """A recording under a model that it had no part in: averaged samples (blocks,), and what was found of its own.
 
-    `error_um` is held out; `as_written_um` as well, of the plays that are written alone, without drift and creep, from
-    where their memory is known (fewer blocks, None where too few); `left_um` is what the model that is fitted to all
-    leaves of the recording. `from_rest` says that
-    its memory was given; else it was estimated. `known_from_s` is when the memory of all plays that are written is
-    known, None where never; `unsettled_um` how far its beginning departs from a loop that repeats itself; `drift_um`
-    the drift over its duration.
+    `error_um` is held out, NaN where the memory is not known, `as_written_um` the same of the plays that are written,
+    without drift and creep, and `early_um` is that of the other blocks, with a memory
+    estimated for these alone (`early_part`), NaN elsewhere; `left_um` is what the model that is written leaves of the
+    rest. `offset_um` is the last stretch's. `from_rest` says that the memory at the beginning was given; `known_from_s`
+    is when that of all plays that are written is known, None where never; `unsettled_um` how far the recording departs
+    from a loop that repeats itself where it is not; `drift_um` the drift over its duration.
     """
 
     name: str
@@ -51,7 +40,8 @@ class Judgement:
     drive_v: Real
     position_um: Real
     error_um: Real
-    as_written_um: Real | None
+    as_written_um: Real
+    early_um: Real
     left_um: Real
     offset_um: float
     drift_um: float
@@ -65,19 +55,29 @@ class Judgement:
         return float(np.ptp(self.position_um))
 
     @property
-    def rms_um(self) -> float:
-        """Of the errors as held out."""
-        return float(np.sqrt(np.mean(self.error_um**2)))
+    def judged_part(self) -> float:
+        """Part of the recording in which memory is known; nothing else is judged."""
+        return float(np.mean(np.isfinite(self.error_um)))
 
     @property
-    def as_written_rms_um(self) -> float | None:
-        """Of the plays that are written."""
-        return None if self.as_written_um is None else float(np.sqrt(np.mean(self.as_written_um**2)))
+    def rms_um(self) -> float:
+        """Of the errors as held out; NaN without any."""
+        return float(np.sqrt(np.nanmean(self.error_um**2))) if self.judged_part else np.nan
+
+    @property
+    def as_written_rms_um(self) -> float:
+        """Of the plays that are written, as held out; NaN without any."""
+        return float(np.sqrt(np.nanmean(self.as_written_um**2))) if self.judged_part else np.nan
 
     @property
     def max_um(self) -> float:
-        """The largest error as held out."""
-        return float(np.abs(self.error_um).max())
+        """The largest error as held out; NaN without any."""
+        return float(np.nanmax(np.abs(self.error_um))) if self.judged_part else np.nan
+
+    @property
+    def early_max_um(self) -> float:
+        """The largest error where the memory is not known; NaN without any."""
+        return float(np.nanmax(np.abs(self.early_um))) if np.isfinite(self.early_um).any() else np.nan
 
     @property
     def unsettled(self) -> bool:
@@ -97,19 +97,18 @@ class Spread(NamedTuple):
 
 
 def together(rms_um: Sequence[float]) -> Spread:
-    """Of the errors of several recordings."""
-    squares = np.square(rms_um)
-    rms = float(np.sqrt(squares.mean()))
-    if squares.size == 1:
+    """Of the errors of several recordings, NaN where one has none."""
+    squares = np.square([one for one in rms_um if np.isfinite(one)])
+    rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
+    if squares.size < 2:
         return Spread(rms, None)
     return Spread(rms, float(np.std(squares, ddof=1) / squares.size**0.5 / max(2 * rms, 1e-300)))
 
 
 class Trial(NamedTuple):
-    """Thresholds, those that are written first, and terms; how they were placed, what creep goes by."""
+    """Thresholds in V and terms; how the thresholds were placed, what creep goes by."""
 
     thresholds_v: Real
-    written: int
     placed: str
     terms: tuple[Term, ...]
     clock: Clock = "time"
@@ -126,13 +125,14 @@ class Work(NamedTuple):
     duration_s: float
     path_v: float
 
-    def limits(self, trial: Trial) -> Limits:
+    @property
+    def limits(self) -> Limits:
         """Of a fit."""
-        return Limits(trial.thresholds_v, self.least_slope, self.largest_v, self.range_um)
+        return Limits(self.least_slope, self.largest_v)
 
-    def stretch(self, run: Kept, trial: Trial) -> Stretch:
-        """The equations of one recording."""
-        return stretch(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
+    def equations(self, run: Kept, trial: Trial) -> Equations:
+        """Of one recording."""
+        return equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
 
 
 def judged_from_rest(
@@ -141,7 +141,7 @@ def judged_from_rest(
     """`runs`, each from rest and held out in turn, and `others`, of unknown memory, under plays placed as in
     `shape`."""
     work = prepared_work(runs, shape.weights, [np.zeros(1)] * len(runs))
-    trial = Trial(shape.model.thresholds, shape.model.thresholds.size, shape.placement, ())
+    trial = Trial(shape.model.thresholds, shape.placement, ())
     return judgements_of(work, trial, others)[1:]
 
 
@@ -156,45 +156,29 @@ def prepared_work(runs: Sequence[Measured], weights: Weights, before_v: Sequence
     return Work(parts, largest_v, range_um, least, duration_s, path_v)
 
 
-def prepared(
-    work: Work, runs: Sequence[Kept], trial: Trial, common: Common | None = None
-) -> tuple[list[Stretch], list[Real]]:
-    """Equations of every run, and the rises of its memory curve to begin at: settled, level, or half as steep as can
-    be."""
-    gaps, found = np.diff(trial.thresholds_v, prepend=0.0), []
-    stretches = [work.stretch(run, trial) for run in runs]
-    for run, one in zip(runs, stretches, strict=True):
-        settled = np.clip(np.diff(settled_memory(run.drive_v, trial.thresholds_v), prepend=run.full_v[0]), -gaps, gaps)
-        starts = [settled, np.zeros(gaps.size), 0.5 * gaps, -0.5 * gaps] if run.before_v is None else [settled]
-        found.append(nearest(one, starts, work.limits(trial), common))
-    return stretches, found
-
-
 def judgements_of(
     work: Work, trial: Trial, others: Sequence[Measured]
 ) -> tuple[Common, tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Of all recordings, by fits that each had no part in; what they share, and is their own, by a fit to all."""
-    stretches, memories = prepared(work, work.runs, trial)
-    limits = work.limits(trial)
-    common, owns = fitted(stretches, memories, limits)
-    found = fits_held_out(stretches, memories, limits)
-    first = tuple(_judgement(*one, common, trial) for one in zip(work.runs, stretches, owns, found, strict=True))
-    runs, then = [kept(run, len(others)) for run in others], []
-    for run, one, rises in zip(runs, *prepared(work, runs, trial, common), strict=True):
-        own, held = own_of(one, common, rises, limits), judged(one, common, rises, limits)
-        then.append(_judgement(run, one, own, held, common, trial))
+    """Of all recordings, by fits that each had no part in; what they share is by a fit to all."""
+    recordings = [work.equations(run, trial) for run in work.runs]
+    common, owns = fitted(recordings, work.limits)
+    found = held_out(recordings, work.limits)
+    first = tuple(_judgement(*one, common, trial) for one in zip(work.runs, recordings, owns, found, strict=True))
+    then = []
+    for run in (kept(run, len(others)) for run in others):
+        one = work.equations(run, trial)
+        then.append(_judgement(run, one, own_of(one, common), judged(one, common), common, trial))
     return common, first, tuple(then)
 
 
-def _judgement(run: Kept, one: Stretch, own: Own, held: Sequence[Held], common: Common, trial: Trial) -> Judgement:
-    settled = np.diff(settled_memory(run.drive_v, trial.thresholds_v), prepend=run.full_v[0])
-    apart = output(one, common, own) - output(one, common, own._replace(rises=settled))
-    known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[trial.written - 1]))
-    alone = None
-    if known is not None and known <= (1 - LEAST_SHOWN) * run.drive_v.size:
-        alone = errors_as_written(one, held, trial.written, known)
+def _judgement(run: Kept, one: Equations, own: Real, error: Real, common: Common, trial: Trial) -> Judgement:
+    left, offsets = errors(one, common, own), own[: one.offsets.shape[1]]
+    moved = (one.offsets @ offsets)[one.known] - offsets[-1:]
+    apart = np.concatenate([left[~one.known], moved, np.zeros(1)])
+    known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[-1]))
     return Judgement(
-        run.name, run.time_s, run.drive_v, run.position_um, errors_held_out(one, held), alone,
-        errors(one, common, own), float(own.terms[0]), float(own.terms[1:].sum()), run.before_v is not None,
-        None if known is None else float(run.time_s[known]), float(np.abs(apart - apart[-1]).max()),
+        run.name, run.time_s, run.drive_v, run.position_um, *error.T,
+        early_errors(run, one, common, own, trial.thresholds_v), left[one.known],
+        float(offsets[-1]) if offsets.size else np.nan, float(own[offsets.size :].sum()), run.before_v is not None,
+        None if known is None else float(run.time_s[known]), float(np.abs(apart).max()) if offsets.size else np.nan,
     )  # fmt: skip

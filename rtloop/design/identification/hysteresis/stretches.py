@@ -1,4 +1,4 @@
-"""Recordings as the equations of a sum of plays with unknown memory need them: averaged, with bounds of every play."""
+"""Recordings as the equations of a sum of plays need them: averaged, with the stretches whose memory is known."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.memory_fit import Stretch
+from rtloop.design.identification.hysteresis.held_out import PIECES
+from rtloop.design.identification.hysteresis.least_squares import Equations
 from rtloop.design.identification.measured import Measured
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
+from rtloop.hysteresis.unknown_memory import known_stretches, settled_memory
 
 Term = Literal["drift", "creep"]
 Clock = Literal["time", "path"]
@@ -29,8 +31,8 @@ class Kept(NamedTuple):
     """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, the path that
     the drive has gone in V, each (blocks,).
 
-    `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where
-    unknown.
+    `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; `full_v` the
+    drive of every tick, `size` the ticks of a block, `before_v` the drive since rest, None where unknown.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Kept(NamedTuple):
     drive_v: Real
     position_um: Real
     path_v: Real
+    stretch: npt.NDArray[np.intp]
     full_v: Real
     size: int
     before_v: Real | None
@@ -51,39 +54,62 @@ def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kep
     before = None if before_v is None else np.asarray(before_v, float)
     path_v = np.cumsum(np.abs(np.diff(drive, prepend=drive[0])))
     time_s, slow, position, path_v = averaged(np.column_stack([time_s, drive, run.position_um[1:], path_v]), size).T
-    return Kept(run.name, time_s, slow, position, path_v, drive, size, before)
+    stretch = np.zeros(slow.size, np.intp) if before is not None else _stretches(drive, size)
+    return Kept(run.name, time_s, slow, position, path_v, stretch, drive, size, before)
 
 
-def stretch(
+def equations(
     run: Kept, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
-) -> Stretch:
+) -> Equations:
     """With plays at these thresholds in V and these terms; `duration_s` and `path_v` are those of the longest
-    recordings."""
-    first_v = float(run.full_v[0])
+    recordings.
+
+    Where memory is not known, the plays are those of a drive that has gone before again and again.
+    """
     if run.before_v is None:
-        low, high = (_plays(run, thresholds, first_v + side * thresholds) for side in (-1.0, 1.0))
+        memory = settled_memory(run.full_v, thresholds)
     else:
-        low = high = _plays(run, thresholds, play_outputs(np.append(run.before_v, first_v), thresholds)[-1])
-    constant, since = np.ones(run.time_s.size), run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
-    own = np.column_stack([constant, since] if "drift" in terms else [constant])
+        memory = play_outputs(np.append(run.before_v, run.full_v[0]), thresholds)[-1]
+    plays = averaged_plays(run, thresholds, memory)
+    plays[:, :-1] -= plays[:, 1:].copy()
+    stretches = int(run.stretch.max()) + 1
+    offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
+    since = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
+    drift = [since] if "drift" in terms else []
     passed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
     creep = [_lag(run.drive_v, passed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
-    return Stretch(first_v, low, high, np.array(creep).reshape(-1, run.time_s.size).T, own, run.position_um)
+    return Equations(
+        plays,
+        np.array(creep).reshape(-1, since.size).T,
+        offsets.astype(float),
+        np.array(drift).reshape(-1, since.size).T,
+        run.position_um,
+        run.stretch >= 0,
+    )
 
 
-def averaged(rows: Real, size: int) -> Real:
-    """Means of `size` successive rows; an incomplete block at the end is left out."""
-    whole = rows[: rows.shape[0] // size * size]
-    return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
+def _stretches(drive: Real, size: int) -> npt.NDArray[np.intp]:
+    """Of every block; −1 for those that are not all in one, and where there are too few to judge any."""
+    numbers = known_stretches(drive)[: drive.size // size * size].reshape(-1, size)
+    found = np.where(np.all(numbers == numbers[:, :1], axis=1), numbers[:, 0], -1)
+    long = [number for number in range(found.max() + 1) if np.sum(found == number) >= PIECES]
+    return np.select([found == number for number in long], range(len(long)), -1) if long else np.full(found.size, -1)
 
 
-def _plays(run: Kept, thresholds: Real, state: Real) -> Real:
+def averaged_plays(run: Kept, thresholds: Real, state: Real) -> Real:
+    """(blocks, plays), of plays that stood at `state` (plays,) when the recording began."""
     parts, at_once = [], max(1, AT_ONCE // run.size) * run.size
     for start in range(0, run.full_v.size, at_once):
         outputs = play_outputs(run.full_v[start : start + at_once], thresholds, state)
         state = outputs[-1]
         parts.append(averaged(outputs, run.size))
     return np.concatenate(parts)
+
+
+def averaged(rows: Real, size: int) -> Real:
+    """Means of `size` successive rows; an incomplete block at the end is left out."""
+    whole = rows[: rows.shape[0] // size * size]
+    return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
 def _lag(drive_v: Real, passed: Real, constant: float) -> Real:

@@ -1,0 +1,105 @@
+"""Slopes of a sum of plays from stretches of recordings in which the plays that move are known, by least squares.
+
+    x_k = Σ s_i (F_i − F_{i+1})_k + creep_k·c + own_k·o
+
+s_i are the slopes of the initial loading curve, common to all recordings, as are c; o is each recording's own: an
+offset of every stretch, which holds the plays that stand still in it (`unknown_memory`), and drift. Linear, with
+s_i ≥ least as the only bounds.
+
+Slopes of neighbours are held together, and drift is held small, each as if it were a small error: that matters where
+the data leave them open, above all where one stroke looks alike with drift and with other slopes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
+from scipy.optimize import lsq_linear
+
+from rtloop.hil.modal import Real
+
+RIDGE = 1e-3
+"""Error in µm rms that a difference of two slopes counts as, per µm that it makes over the drive's range."""
+STILL = 1e-2
+"""Error in µm rms that a µm of drift over the recording counts as."""
+FLOOR = 1e-7
+"""Least weight of every unknown, so that one that does nothing stays 0."""
+
+
+class Equations(NamedTuple):
+    """One recording, averaged over blocks: columns of the slopes (blocks, plays), of creep (blocks, terms), of the
+    stretches' offsets (blocks, stretches) and of drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
+
+    `known` (blocks,) says where the memory is known; elsewhere the offset is that of the last stretch.
+    """
+
+    slopes: Real
+    creep: Real
+    offsets: Real
+    drift: Real
+    position_um: Real
+    known: npt.NDArray[np.bool_]
+
+    @property
+    def own(self) -> Real:
+        """Columns of what is the recording's own."""
+        return np.hstack([self.offsets, self.drift])
+
+    @property
+    def own_weights(self) -> Real:
+        """What its gains count as, in µm rms per unit."""
+        return np.repeat([FLOOR, STILL], [self.offsets.shape[1], self.drift.shape[1]])
+
+    def only(self, kept: npt.NDArray[np.bool_]) -> Equations:
+        """Of these blocks, a mask."""
+        return Equations(*(rows[kept] for rows in self))
+
+
+class Common(NamedTuple):
+    """What all recordings share: slopes in µm/V (plays,), gains of the creep (terms,)."""
+
+    slopes: Real
+    creep: Real
+
+
+class Limits(NamedTuple):
+    """Least slope in µm/V, and the largest range of drive in V."""
+
+    least_slope: float
+    drive_v: float
+
+
+def fitted(recordings: Sequence[Equations], limits: Limits) -> tuple[Common, list[Real]]:
+    """What all share, and the gains of what is each one's own, from the blocks whose memory is known."""
+    known = [one.only(one.known) for one in recordings]
+    plays, creep = known[0].slopes.shape[1], known[0].creep.shape[1]
+    shared = np.vstack([np.hstack([one.slopes, one.creep]) for one in known])
+    columns = np.hstack([shared, block_diag(*(one.own for one in known))])
+    weights = np.concatenate([np.full(plays + creep, FLOOR), *(one.own_weights for one in known)])
+    neighbours = np.zeros((plays - 1, weights.size))
+    neighbours[:, :plays] = RIDGE * limits.drive_v * np.diff(np.eye(plays), axis=0)
+    held = columns.shape[0] ** 0.5 * np.vstack([neighbours, np.diag(weights)])
+    position = np.concatenate([*(one.position_um for one in known), np.zeros(held.shape[0])])
+    least = np.full(weights.size, -np.inf)
+    least[:plays] = limits.least_slope
+    orthogonal, triangle = np.linalg.qr(np.vstack([columns, held]))
+    found = lsq_linear(triangle, orthogonal.T @ position, (least, np.inf), method="bvls").x
+    parts = np.split(found, np.cumsum([plays, creep, *(one.own_weights.size for one in known)])[:-1])
+    return Common(parts[0], parts[1]), parts[2:]
+
+
+def own_of(one: Equations, common: Common) -> Real:
+    """Gains of what is a recording's own, by a model that is given."""
+    known = one.only(one.known)
+    held = known.known.size**0.5 * np.diag(one.own_weights)
+    left = np.append(errors(known, common, np.zeros(one.own_weights.size)), np.zeros(one.own_weights.size))
+    return np.linalg.lstsq(np.vstack([known.own, held]), left, rcond=None)[0]
+
+
+def errors(one: Equations, common: Common, own: Real) -> Real:
+    """Measured − model in µm (blocks,)."""
+    return one.position_um - one.slopes @ common.slopes - one.creep @ common.creep - one.own @ own

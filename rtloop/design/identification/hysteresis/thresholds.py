@@ -1,0 +1,44 @@
+"""Where plays are placed: by a rule, or as given."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+from rtloop.laws.shipped.play_model import MAX_PLAYS
+
+Placed = Literal["chebyshev", "chebyshev-from-0", "uniform"]
+Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
+
+
+def tried(placement: Placement) -> tuple[Placed, ...]:
+    """Of "auto", with a dead band and without. Raises ValueError."""
+    if placement not in get_args(Placement):
+        raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
+    return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
+
+
+def placed_thresholds(count: int, largest_v: float, placement: Placed) -> Real:
+    """`count` thresholds in V below `largest_v`, the largest drive.
+
+    "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
+    give those of eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.
+    "uniform": R·i/n from 0 on.
+    """
+    if not 1 <= count <= MAX_PLAYS:
+        raise ValueError(f"number of operators: {count}; 1 to {MAX_PLAYS} are allowed")
+    if placement == "uniform":
+        return largest_v * np.arange(count) / count
+    if placement == "chebyshev":
+        return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(1, count + 1) / (count + 1)))
+    return 0.5 * largest_v * (1 - np.cos(np.pi * np.arange(count) / count))
+
+
+def require_ascending(thresholds: Real) -> None:
+    """Raise ValueError for thresholds in V that no model can have."""
+    if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
+        raise ValueError(f"thresholds: {thresholds.size} given; 1 to {MAX_PLAYS} are allowed")
+    if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):
+        raise ValueError(f"thresholds: {thresholds.tolist()} must be at least 0 and ascend")
