@@ -177,7 +177,7 @@ def _judgement(run: Kept, one: Equations, own: Real, error: Real, common: Common
     apart = np.concatenate([left[~one.known], moved, np.zeros(1)])
     known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[-1]))
     return Judgement(
-        run.name, run.time_s, run.drive_v, run.position_um, *error.T,
+        run.name, run.time_s, run.drive_v, run.position_um, error[:, 0], error[:, 1],
         early_errors(run, one, common, own, trial.thresholds_v), left[one.known],
         float(offsets[-1]) if offsets.size else np.nan, float(own[offsets.size :].sum()), run.before_v is not None,
         None if known is None else float(run.time_s[known]), float(np.abs(apart).max()) if offsets.size else np.nan,
