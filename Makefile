@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-preisach soak-afm soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -94,9 +94,9 @@ soak-identification: $(READY)
 soak-parts: $(READY)
 	$(BIN)/python -m tests.soak.parts --draws $(or $(DRAWS),50) --first $(or $(FIRST),0)
 
-# The error reported of a Preisach actuator, which no sum of plays is, beside the error on later recordings: a minute.
-soak-preisach: $(READY)
-	$(BIN)/python -m tests.soak.preisach
+# Bouc-Wen and Preisach actuators, six sets of recordings each: the error that is reported beside the true one: a minute.
+soak-truths: $(READY)
+	$(BIN)/python -m tests.soak.truths
 
 # Hysteresis of commercial AFMs' scanners, whose recordings are fetched from the package registry: two minutes of one core.
 soak-afm: $(READY)

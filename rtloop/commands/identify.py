@@ -24,7 +24,7 @@ from rtloop.design.identification.hysteresis.identify_hysteresis import (
     identify_hysteresis,
     unexplained_um,
 )
-from rtloop.design.identification.hysteresis.judgement import Judgement, judged_from_rest
+from rtloop.design.identification.hysteresis.judgement import Judgement, judged_from_rest, together
 from rtloop.design.identification.hysteresis.thresholds import Placement
 from rtloop.design.identification.identified import (
     dynamics_provenance,
@@ -83,7 +83,10 @@ def hysteresis_report(
 
         plot_hysteresis(fit, [*judged[0], *judged[1]], plot)
     return plain(
-        _hysteresis(runs, fit) | {"unexplained_um": None} | more | {"held_out": rows, "output": out, "plot": plot}
+        _hysteresis(runs, fit)
+        | {"unexplained_um": None}
+        | more
+        | {"held_out": rows, "held_out_all": _all(judged[0]), "output": out, "plot": plot}
     )
 
 
@@ -112,12 +115,21 @@ def _chosen(found: PartsFit) -> dict[str, Any]:
 def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
     """A row of the report."""
     return {
-        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "max_error_um": one.max_um,
+        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "as_written_rms_um": one.as_written_rms_um,
+        "max_error_um": one.max_um,
         "max_error_percent": 100 * one.max_um / one.range_um, "range_um": one.range_um, "offset_um": one.offset_um,
         "drift_um": one.drift_um, "memory": "rest" if one.from_rest else "unknown", "known_from_s": one.known_from_s,
         "unsettled": one.unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.judged_part,
         "early_max_error_percent": 100 * one.early_max_um / one.range_um,
     }  # fmt: skip
+
+
+def _all(judged: Sequence[Judgement]) -> dict[str, Any]:
+    """Of all recordings together, with standard errors."""
+    return {
+        "error": together([one.rms_um for one in judged])._asdict(),
+        "as_written": together([one.as_written_rms_um for one in judged])._asdict(),
+    }
 
 
 def _held_out(rows: Sequence[dict[str, Any]], more: dict[str, Any]) -> list[str]:
@@ -128,6 +140,9 @@ def _held_out(rows: Sequence[dict[str, Any]], more: dict[str, Any]) -> list[str]
         f"{worst['range_um']:.4g} µm, in {Path(worst['recording']).name}; memory at the start: {worst['memory']}, "
         f"{worst['judged_percent']:.3g} % of it judged"
     ]
+    alone = [row["as_written_rms_um"] for row in rows if np.isfinite(row["as_written_rms_um"])]
+    if more.get("terms") and alone:
+        lines.append(f"{' and '.join(more['terms'])} taken out; these plays alone leave up to {max(alone):.3g} µm rms")
     if more.get("missing"):
         lines.append(f"for strokes of up to {more['stroke_v']:.4g} V; {more['missing']}")
     return lines

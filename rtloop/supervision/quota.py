@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
 from rtloop.recording.file.around import Around
@@ -47,6 +47,22 @@ class Lying(NamedTuple):
     changed_ns: int
 
 
+class Removal(NamedTuple):
+    """A file that went."""
+
+    file: Path
+    size_bytes: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.file} was removed: {self.reason}"
+
+    @property
+    def what(self) -> dict[str, Any]:
+        """As an event says it."""
+        return {"file": self.file.name, "size_bytes": self.size_bytes, "reason": self.reason}
+
+
 class Quota:
     """Of the recordings of the configuration `name` in `folder`: `keep_bytes` in all, `min_free_bytes` on the disk."""
 
@@ -60,10 +76,13 @@ class Quota:
         self._strange: set[Lying] = set()
         self.bytes = self.removed = self.removed_bytes = 0
         """What all of them take now; how many were removed, and what these took."""
+        self.failure: str | None = None
+        """Why the last look could not do all that it should."""
 
-    def keep(self, budget_s: float = BUDGET_S) -> list[str]:
-        """Remove what is too much; what was removed, in words. `budget_s`: for opening files."""
-        said: list[str] = []
+    def keep(self, budget_s: float = BUDGET_S) -> list[Removal]:
+        """Remove what is too much, and say what that was. `budget_s`: for opening files."""
+        gone: list[Removal] = []
+        self.failure = None
         try:
             lying = self._lying()
             self._look(lying, budget_s)
@@ -75,10 +94,10 @@ class Quota:
                 (self._folder / one.name).unlink()
                 self.bytes -= one.bytes
                 self.removed, self.removed_bytes = self.removed + 1, self.removed_bytes + one.bytes
-                said.append(f"{self._folder / one.name} was removed: {reason}")
+                gone.append(Removal(self._folder / one.name, one.bytes, reason))
         except OSError as error:
-            said.append(f"{self._folder}: {error.strerror}")
-        return said
+            self.failure = f"{self._folder}: {error.strerror}"
+        return gone
 
     def _too_much(self) -> str | None:
         """Why something is to go."""

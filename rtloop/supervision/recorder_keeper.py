@@ -19,7 +19,7 @@ from rtloop.recording.capture.names import Names
 from rtloop.recording.file.parts import files_of_run
 from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
-from rtloop.supervision.quota import Quota
+from rtloop.supervision.quota import Quota, Removal
 from rtloop.supervision.stall import StallWatch
 from rtloop.values import counted
 
@@ -57,7 +57,8 @@ class RecorderKeeper:
         self.notes: list[str] = []
         self.quota: Quota | None = None
         self.removals: list[str] = []
-        """What the quota removed, in words."""
+        """What the quota removed, or could not, in words."""
+        self._untold: list[Removal] = []
         self._kept_s = 0.0
 
     @property
@@ -109,8 +110,23 @@ class RecorderKeeper:
 
     def _keep_quota(self) -> None:
         if self.quota is not None and time.monotonic() - self._kept_s >= QUOTA_S:
-            self.removals += self.quota.keep()
+            self._untold += self._apply(self.quota)
             self._kept_s = time.monotonic()
+            self._tell_recorder()
+
+    def _apply(self, quota: Quota, *budget_s: float) -> list[Removal]:
+        """What the quota removed; a failure is said once."""
+        failed = quota.failure
+        gone = quota.keep(*budget_s)
+        self.removals += [*map(str, gone), *([quota.failure] if quota.failure not in (None, failed) else [])]
+        return gone
+
+    def _tell_recorder(self) -> None:
+        """What was removed becomes events of the recording, once there is a recorder that has its orders."""
+        if self._untold and self._ordered and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
+            lines = [json.dumps({"removed": one.what}) + "\n" for one in self._untold]
+            self._child.send("".join(lines).encode())
+            self._untold.clear()
 
     def _open(self) -> None:
         """Give the recorder its orders and wait until the file is open. Raises OutputError."""
@@ -153,9 +169,10 @@ class RecorderKeeper:
         for part in self._files(".mcap.part"):
             self._repair(part)
         if self.quota is not None:
-            self.removals += self.quota.keep(LAST_LOOK_S)
-            files, mib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
-            self.notes += [f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib"] * bool(self.removals)
+            self._apply(self.quota, LAST_LOOK_S)
+            if self.quota.removed:
+                files, mib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
+                self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib")
         totals["paths"] = [str(path) for path in self._files(".mcap")]
         return totals
 

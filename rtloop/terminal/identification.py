@@ -37,8 +37,8 @@ def print_hysteresis(report: dict[str, Any]) -> None:
 def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     """What the model errs by on each recording when that has no part in it, and what was taken along."""
     shown = table(
-        "held out", "error µm rms", "at most µm", "% of range", "in % of it", "% before that", "offset µm", "drift µm",
-        "memory at the start",
+        "held out", "error µm rms", "at most µm", "% of range", "in % of it", "% before that", "as written µm rms",
+        "offset µm", "drift µm", "memory at the start",
     )  # fmt: skip
     for row in report["held_out"]:
         memory = "from rest" if row["memory"] == "rest" else f"unknown; {_known(row['known_from_s'])}"
@@ -46,16 +46,29 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
         shown.add_row(
             Path(row["recording"]).name + ("" if row["fitted"] else " (never fitted)"),
             *(_number(row[key], "{:.3g}") for key in errors),
-            _number(row["offset_um"], "{:.4g}"), f"{row['drift_um']:.3g}",
+            _number(row["as_written_rms_um"], "{:.3g}"), _number(row["offset_um"], "{:.4g}"), f"{row['drift_um']:.3g}",
             memory + ("; [yellow]unsettled[/]" if row["unsettled"] else ""),
         )  # fmt: skip
     out.print(shown)
+    _print_all(out, report["held_out_all"])
     if "tried_um" in report:
         tried = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
         out.print(f"held out, µm rms: {tried}; taken: {' + '.join(('plays', *report['terms']))}")
         out.print(
             f"for strokes of up to {report['stroke_v']:.4g} V" + (f"; {report['missing']}" if report["missing"] else "")
         )
+
+
+def _print_all(out: Console, found: dict[str, Any]) -> None:
+    """Of several recordings together."""
+    error, written = found["error"], found["as_written"]
+    if error["std_um"] is not None:
+        out.print(f"together, held out: {_with_std(error)} µm rms; the plays as written {_with_std(written)}")
+
+
+def _with_std(found: dict[str, Any]) -> str:
+    std_um = found["std_um"]
+    return f"{found['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
 
 
 def _known(from_s: float | None) -> str:

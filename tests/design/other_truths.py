@@ -13,11 +13,16 @@ WEIGHTS_UM_PER_V = np.array([2.4, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25])
 
 def sum_of_plays(drive_v: Array) -> Array:
     """µm, from rest."""
-    state, found = np.zeros(THRESHOLDS_V.size), []
+    return stepped_plays(drive_v, THRESHOLDS_V, WEIGHTS_UM_PER_V)
+
+
+def creeping_plays(drive_v: Array) -> Array:
+    """µm, from rest: half a micrometre more per volt, with a lag of 100 samples."""
+    lag, found = 0.0, []
     for u in drive_v:
-        state = np.maximum(u - THRESHOLDS_V, np.minimum(u + THRESHOLDS_V, state))
-        found.append(state @ WEIGHTS_UM_PER_V)
-    return np.array(found)
+        lag += (u - lag) / 100
+        found.append(0.5 * lag)
+    return sum_of_plays(drive_v) + np.array(found)
 
 
 def bouc_wen(drive_v: Array) -> Array:
@@ -45,10 +50,20 @@ def preisach(drive_v: Array) -> Array:
     return 40.0 * np.array(found) / density.sum()
 
 
-def part_of_a_drive(random: np.random.Generator, samples: int) -> tuple[Array, Array]:
-    """A past and a drive, in V: straight strokes between random turning points, ±9 V among those of the drive."""
+def stepped_plays(drive_v: Array, thresholds_v: Array, weights_um_per_v: Array) -> Array:
+    """µm, from rest."""
+    state, found = np.zeros(thresholds_v.size), []
+    for u in drive_v:
+        state = np.maximum(u - thresholds_v, np.minimum(u + thresholds_v, state))
+        found.append(state @ weights_um_per_v)
+    return np.array(found)
+
+
+def part_of_a_drive(random: np.random.Generator, samples: int, turns: int = 3) -> tuple[Array, Array]:
+    """A past and a drive, in V: straight strokes between random turning points, ±9 V among those of the drive, and so
+    many behind them."""
     past = _strokes(np.append(0.0, random.uniform(-9, 9, 4)), samples // 2)
-    corners = np.concatenate([past[-1:], random.uniform(-9, 9, 1), [-9.0, 9.0], random.uniform(-9, 9, 3)])
+    corners = np.concatenate([past[-1:], random.uniform(-9, 9, 1), [-9.0, 9.0], random.uniform(-9, 9, turns)])
     return past, _strokes(corners, samples)
 
 

@@ -13,8 +13,6 @@ from rtloop.hysteresis.unknown_memory import known_from, known_stretches, missin
 from tests.design.other_truths import (
     THRESHOLDS_V,
     WEIGHTS_UM_PER_V,
-    bouc_wen,
-    part_of_a_drive,
     sum_of_plays,
 )
 from tests.soak.parts import ALLOWED_RATIO, both, drawn, reported_um, stepped, true_um
@@ -27,15 +25,6 @@ def run_of(drive: Array, position: Array, name: str = "made") -> Measured:
     """A tick's position was measured before its drive was written."""
     shifted = np.append(position[0], position)
     return Measured(name, 0.01, np.append(drive, drive[-1]), shifted, shifted, True, "", "")
-
-
-def recorded(truth: Any, seed: int, noise_um: float = 0.02, drift_um: float = 0.0) -> tuple[Measured, Array]:
-    """A part of a drive after a past that is not recorded; and what it would be without noise."""
-    random = np.random.default_rng(seed)
-    past, drive = part_of_a_drive(random, SAMPLES)
-    clean = truth(np.concatenate([past, drive]))[past.size :] + random.uniform(-3, 3)
-    clean = clean + drift_um * np.linspace(-0.5, 0.5, SAMPLES)
-    return run_of(drive, clean + random.normal(0, noise_um, SAMPLES), f"part {seed}"), clean
 
 
 def test_one_part_of_a_loop_gives_the_weights_that_it_shows() -> None:
@@ -116,24 +105,3 @@ def test_drift_stays_where_it_lessens_the_error_held_out_and_only_there() -> Non
         found = identify_from_parts([run], 8, "chebyshev-from-0")
         assert found.terms == terms, found.tried
         assert found.judgements[0].drift_um == pytest.approx(drift_um, abs=0.1)
-
-
-@pytest.mark.parametrize("truth", [bouc_wen])
-def test_the_error_that_is_reported_is_that_on_fresh_data(truth: Any) -> None:
-    """No sum of plays: rms held out against rms on as many recordings that come later, noise aside."""
-    runs = [recorded(truth, seed)[0] for seed in range(4)]
-    fresh = [recorded(truth, seed) for seed in range(100, 104)]
-    found = identify_from_parts(runs, 8, "chebyshev-from-0", others=[run for run, _ in fresh])
-    reported = np.sqrt(np.mean([one.rms_um**2 for one in found.judgements]))
-    wrong = [one.position_um - one.error_um - averaged(clean, one.error_um.size)
-             for one, (_, clean) in zip(found.others, fresh, strict=True)]  # fmt: skip
-    true = np.sqrt(np.nanmean(np.square(wrong)))
-    print(f"{truth.__name__}: reported {reported:.4f}, true {true:.4f} µm, fit {found.shape.rms_error_um:.4f} µm")
-    assert true > 0.05
-    assert reported == pytest.approx(true, rel=0.2)
-
-
-def averaged(values: Array, blocks: int) -> Array:
-    """Means of as many blocks."""
-    size = values.size // blocks
-    return values[: blocks * size].reshape(blocks, size).mean(axis=1)

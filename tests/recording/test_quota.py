@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import json
 import os
+import queue
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from rtloop.configuration.file import RecordingOptions
+from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
+from rtloop.recording.capture.names import Names
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import Flag
+from rtloop.supervision import recorder_keeper
 from rtloop.supervision.quota import SPARE_BYTES, Quota
-from tests.recording.hand_made_loop import AXES, START_UNIX_NS, final_message, make_header, make_rows
+from rtloop.supervision.recorder_keeper import RecorderKeeper
+from tests.recording.hand_made_loop import AXES, START_UNIX_NS, HandMadeLoop, final_message, make_header, make_rows
 
 PART = 5_000
 """Ticks in a file: half a second."""
@@ -108,8 +115,9 @@ def test_a_disk_that_fills_counts_as_much(tmp_path: Path, disk: SimpleNamespace)
     quota = Quota(tmp_path, "test", 1 << 40, 10 << 20)
     assert quota.keep() == []
     disk.f_bavail = (10 << 20) + SPARE_BYTES - 1
-    said, *more = quota.keep(budget_s=60.0)
-    assert "less than 74 MiB are free" in said
+    gone, *more = quota.keep(budget_s=60.0)
+    assert "less than 74 MiB are free" in gone.reason
+    assert str(gone) == f"{files[1]} was removed: {gone.reason}"
     assert [name for name in left(tmp_path)] == [files[0].name, files[-1].name]
     assert len(more) == 1
 
@@ -121,8 +129,46 @@ def test_what_was_not_looked_at_yet_is_not_removed(tmp_path: Path):
 
 
 def test_a_folder_that_is_gone_is_said(tmp_path: Path):
-    (said,) = Quota(tmp_path / "gone", "test", 1, 0).keep()
-    assert said.endswith("No such file or directory")
+    quota = Quota(tmp_path / "gone", "test", 1, 0)
+    assert quota.keep() == []
+    assert quota.failure == f"{tmp_path / 'gone'}: No such file or directory"
+
+
+class Listener:
+    """A recorder that only listens."""
+
+    def __init__(self) -> None:
+        self.exit_code, self.heard = None, queue.SimpleQueue[bytes]()
+        self.send, self.reports = self.heard.put, list
+
+    def wait(self, timeout_s: float) -> int:
+        return 0
+
+
+def test_the_recorder_is_told_what_went_and_a_failure_is_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recorder_keeper, "QUOTA_S", 0.0)
+    folder, loop, child = tmp_path / "there", HandMadeLoop(), Listener()
+    folder.mkdir()
+    files = run_of(folder, "20260101T000001", 3)
+    loop.block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
+    options = RecordingOptions(keep_gib=1e-9)
+    keeper = RecorderKeeper(child, loop.block, Names.create(), folder / "test-now.mcap", options)  # pyright: ignore
+    keeper.start({"name": "test"})
+    assert set(json.loads(child.heard.get(timeout=60))) == {"path", "header", "options"}
+    lines = b""
+    while lines.count(b"\n") < 2:
+        lines += child.heard.get(timeout=60)
+    said = [json.loads(line)["removed"] for line in lines.splitlines()]
+    assert [one["file"] for one in said] == [path.name for path in files[:2]]
+    assert said[0]["reason"].endswith("(recording.keep_gib)")
+    assert said[0]["size_bytes"] > 1000
+    folder.rename(tmp_path / "gone")
+    while len(keeper.removals) < 3:
+        time.sleep(0.001)
+    keeper.finish()
+    while keeper.totals is None:  # it looks once more
+        time.sleep(0.001)
+    assert keeper.removals[2:] == [f"{folder}: No such file or directory"]
 
 
 def test_the_rows_that_are_written_here_can_be_read(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
@@ -126,6 +127,24 @@ def test_is_not_stopped_by_signals_and_ends_with_the_loop(loop, recorder, tmp_pa
     code, totals = recorder.result()
     assert (code, totals["ticks_logged"], totals["complete"]) == (0, 200, False)
     assert load(tmp_path / "run.mcap").events[-1]["what"]["result"] == "failed"
+
+
+def test_what_was_removed_meanwhile_is_in_the_recording(loop, recorder, tmp_path):
+    """Lines may come in pieces, and several at once."""
+    recorder.start(tmp_path / "run.mcap")
+    loop.run(make_rows(100))
+    recorder.wait_until(lambda: loop.cursor == 100)
+    gone = [{"file": f"old-{i}.mcap", "size_bytes": 7, "reason": "they may take 1 GiB"} for i in range(3)]
+    lines = "".join(json.dumps({"removed": one}) + "\n" for one in gone).encode()
+    for part in (lines[:30], lines[30:]):
+        recorder.process.stdin.write(part)
+        recorder.process.stdin.flush()
+    loop.end()
+    code, totals = recorder.result()
+    assert (code, totals["complete"], totals["events_lost"]) == (0, True, 0)
+    found = [event for event in load(tmp_path / "run.mcap").events if event["kind"] == "removed"]
+    assert [event["what"] for event in found] == gone
+    assert {(event["who"], event["tick"]) for event in found} == {("recorder", 100)}
 
 
 def test_ends_by_itself_when_everybody_else_is_gone(loop, recorder, tmp_path):

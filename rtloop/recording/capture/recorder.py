@@ -3,7 +3,8 @@
     python -m rtloop.recording.capture.recorder --fd N [--names M]
 
 N is the shared block, M the names of those who give commands. One JSON line on stdin starts it: {"path":
-".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. It ends when the loop has
+".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. Further lines say which
+files were removed meanwhile: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. It ends when the loop has
 and the rings are empty, and prints one JSON line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes,
 complete, error, cpu_s}. SIGINT and SIGTERM are ignored, for the loop's last ticks are to be recorded too.
 
@@ -37,6 +38,24 @@ ABANDONED_S = 5.0
 """With the supervisor gone and no new tick for this long, the loop is taken as gone too."""
 
 
+class Orders:
+    """JSON lines on stdin, read unbuffered, so that its end can be seen."""
+
+    def __init__(self) -> None:
+        self._read, self.closed = b"", False
+
+    def next(self, wait_s: float | None = 0.0) -> dict[str, Any] | None:
+        """The next line, where it is there or comes within `wait_s`; None: for ever."""
+        while b"\n" not in self._read:
+            if self.closed or not select.select([0], [], [], wait_s)[0]:
+                return None
+            part = os.read(0, 1 << 16)
+            self.closed = not part
+            self._read += part
+        line, _, self._read = self._read.partition(b"\n")
+        return json.loads(line)
+
+
 class Recorder:
     """Polls the rings of `block` into a Session until the loop has ended. Ready once constructed."""
 
@@ -46,12 +65,14 @@ class Recorder:
         for name in ("ticks", "snapshots", "events"):
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
 
-    def record(self, session: Session, pause_s: float) -> str:
+    def record(self, session: Session, orders: Orders, pause_s: float) -> str:
         """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned"."""
         last_tick_s = time.monotonic()
         while True:
             state = self.block.load(Word.LOOP_STATE)
             drained = session.drain()
+            while (order := orders.next()) is not None:
+                session.note_removed(order["removed"])
             self.block.store(Word.RECORDER_CURSOR, session.cursor)
             session.write_due()
             self.block.store(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
@@ -59,7 +80,7 @@ class Recorder:
                 last_tick_s = time.monotonic()
             elif state in (ProcessState.FINISHED, ProcessState.FAILED):
                 return ProcessState(state).name.lower()
-            elif time.monotonic() - last_tick_s > ABANDONED_S and _stdin_closed():
+            elif time.monotonic() - last_tick_s > ABANDONED_S and orders.closed:
                 return "abandoned"
             if drained < session.room:
                 time.sleep(pause_s)
@@ -72,22 +93,6 @@ def _supervisor_gone() -> bool:
     return bool(poll.poll(0))
 
 
-def _stdin_closed() -> bool:
-    readable, _, _ = select.select([0], [], [], 0)
-    return bool(readable) and os.read(0, 4096) == b""
-
-
-def _read_command() -> dict[str, Any]:
-    """The line that starts a recording; read unbuffered, so that a later end of stdin can be seen."""
-    line = b""
-    while not line.endswith(b"\n"):
-        part = os.read(0, 1 << 16)
-        if not part:
-            raise RecordingError("the recorder was given no file to write")
-        line += part
-    return json.loads(line)
-
-
 def run(fd: int, names: Names | None = None) -> int:
     """Record one run from the shared block at `fd`; returns the exit code."""
     try:
@@ -98,12 +103,14 @@ def run(fd: int, names: Names | None = None) -> int:
     block.store(Word.RECORDER_STATE, ProcessState.READY)
     totals: dict[str, Any]
     try:
-        command = _read_command()
+        orders = Orders()
+        if (command := orders.next(None)) is None:
+            raise RecordingError("the recorder was given no file to write")
         header = command["header"]
         kind = SelectiveSession if header.get("around") else Session
         session = kind(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
         block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
-        result = recorder.record(session, POLL_S if header["paced"] else UNPACED_POLL_S)
+        result = recorder.record(session, orders, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)
     except RtloopError as error:
         totals = {"complete": False, "error": str(error)}

@@ -28,6 +28,7 @@ from rtloop.recording.file.topics.events import (
     GAP,
     RECORDING_FAILED,
     RECORDING_RESUMED,
+    REMOVED,
     ROTATED,
     event_of,
     recorder_event,
@@ -96,6 +97,10 @@ class Session:
             self._meet_snapshot(tick)
             self._pending.add_snapshot(self._ahead.popleft())
         return ticks + len(snapshots) + len(events)
+
+    def note_removed(self, what: dict[str, Any]) -> None:
+        """A file, of this run or another, was removed for this one's sake."""
+        self._pending.add_event(recorder_event(REMOVED, *self._buffer.place(self.cursor), what))
 
     def write_due(self) -> None:
         """Write when a chunk is full or the last write is FLUSH_S ago."""

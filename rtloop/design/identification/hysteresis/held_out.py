@@ -25,8 +25,10 @@ SHOWN, OTHERS = 0.95, 2
 
 
 def held_out(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Errors in µm of every recording, (blocks,) each, by fits that they had no part in; NaN where memory is not
-    known."""
+    """Errors in µm of every recording, (blocks, 2) each, by fits without it; NaN where memory is not known.
+
+    First of all that is fitted, then of the plays alone, as they are written, offsets aside.
+    """
     found = _piece_by_piece(recordings, limits)
     for group in range(GROUPS):
         others = [one for i, one in enumerate(recordings) if i % GROUPS != group]
@@ -39,12 +41,12 @@ def held_out(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
 
 
 def judged(one: Equations, common: Common) -> Real:
-    """Errors in µm (blocks,) of a recording that the model knows nothing of; NaN where memory is not known."""
-    found, odd = np.full(one.known.size, np.nan), pieces(one) % 2 == 1
+    """Errors in µm (blocks, 2) of a recording that the model knows nothing of; NaN where memory is not known."""
+    found, odd = np.full((one.known.size, 2), np.nan), pieces(one) % 2 == 1
     for half in (one.known & odd, one.known & ~odd):
         rest = one.known & ~half
-        found[rest] = errors(one.only(rest), common, own_of(one.only(half), common))
-    return found
+        found[rest] = _left(one.only(rest), common, own_of(one.only(half), common))
+    return _offsets_aside(one, found)
 
 
 def pieces(one: Equations) -> npt.NDArray[np.intp]:
@@ -56,13 +58,24 @@ def pieces(one: Equations) -> npt.NDArray[np.intp]:
 
 
 def _piece_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    found = [np.full(one.known.size, np.nan) for one in recordings]
+    found = [np.full((one.known.size, 2), np.nan) for one in recordings]
     folds = [np.where(one.known, pieces(one) % FOLDS, -1) for one in recordings]
     for fold in range(FOLDS):
         rest = [one.only(among != fold) for one, among in zip(recordings, folds, strict=True)]
         common, owns = fitted(rest, limits)
         for one, among, own, left in zip(recordings, folds, owns, found, strict=True):
-            left[among == fold] = errors(one.only(among == fold), common, own)
+            left[among == fold] = _left(one.only(among == fold), common, own)
+    return [_offsets_aside(one, left) for one, left in zip(recordings, found, strict=True)]
+
+
+def _left(one: Equations, common: Common, own: Real) -> Real:
+    return np.column_stack([errors(one, common, own), one.position_um - one.slopes @ common.slopes])
+
+
+def _offsets_aside(one: Equations, found: Real) -> Real:
+    """The plays alone leave every stretch its offset: its mean."""
+    for part in (one.offsets.T > 0) & one.known:
+        found[part, 1] -= np.mean(found[part, 1])
     return found
 
 

@@ -13,7 +13,7 @@ from rtloop.design.identification.hysteresis.early_part import early_errors
 from rtloop.design.identification.hysteresis.held_out import held_out, judged
 from rtloop.design.identification.hysteresis.identify_hysteresis import LEAST_SLOPE, HysteresisFit, Weights
 from rtloop.design.identification.hysteresis.least_squares import Common, Equations, Limits, errors, fitted, own_of
-from rtloop.design.identification.hysteresis.stretches import Kept, Term, equations, kept
+from rtloop.design.identification.hysteresis.stretches import Clock, Kept, Term, equations, kept
 from rtloop.design.identification.measured import Measured
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.unknown_memory import known_from
@@ -27,7 +27,8 @@ branches differ in shape, or creep, depart by half of it where their loops close
 class Judgement:
     """A recording under a model that it had no part in: averaged samples (blocks,), and what was found of its own.
 
-    `error_um` is held out, NaN where the memory is not known, and `early_um` is that of the other blocks, with a memory
+    `error_um` is held out, NaN where the memory is not known, `as_written_um` the same of the plays that are written,
+    without drift and creep, and `early_um` is that of the other blocks, with a memory
     estimated for these alone (`early_part`), NaN elsewhere; `left_um` is what the model that is written leaves of the
     rest. `offset_um` is the last stretch's. `from_rest` says that the memory at the beginning was given; `known_from_s`
     is when that of all plays that are written is known, None where never; `unsettled_um` how far the recording departs
@@ -39,6 +40,7 @@ class Judgement:
     drive_v: Real
     position_um: Real
     error_um: Real
+    as_written_um: Real
     early_um: Real
     left_um: Real
     offset_um: float
@@ -63,6 +65,11 @@ class Judgement:
         return float(np.sqrt(np.nanmean(self.error_um**2))) if self.judged_part else np.nan
 
     @property
+    def as_written_rms_um(self) -> float:
+        """Of the plays that are written, as held out; NaN without any."""
+        return float(np.sqrt(np.nanmean(self.as_written_um**2))) if self.judged_part else np.nan
+
+    @property
     def max_um(self) -> float:
         """The largest error as held out; NaN without any."""
         return float(np.nanmax(np.abs(self.error_um))) if self.judged_part else np.nan
@@ -78,23 +85,45 @@ class Judgement:
         return not self.from_rest and self.unsettled_um > UNSETTLED * self.range_um
 
 
+class Spread(NamedTuple):
+    """An error in µm rms over recordings of equal weight, and its standard error by their spread; None of a single one.
+
+    Delta method: var(rms) = var(mean square)/(4 rms²). Recordings of few strokes spread so unevenly that it is too
+    small.
+    """
+
+    rms_um: float
+    std_um: float | None
+
+
+def together(rms_um: Sequence[float]) -> Spread:
+    """Of the errors of several recordings, NaN where one has none."""
+    squares = np.square([one for one in rms_um if np.isfinite(one)])
+    rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
+    if squares.size < 2:
+        return Spread(rms, None)
+    return Spread(rms, float(np.std(squares, ddof=1) / squares.size**0.5 / max(2 * rms, 1e-300)))
+
+
 class Trial(NamedTuple):
-    """Thresholds in V and terms; how the thresholds were placed."""
+    """Thresholds in V and terms; how the thresholds were placed, what creep goes by."""
 
     thresholds_v: Real
     placed: str
     terms: tuple[Term, ...]
+    clock: Clock = "time"
 
 
 class Work(NamedTuple):
     """Recordings that share a model, the largest ranges of drive and position among them, the least slope, the
-    longest."""
+    longest time and path of the drive."""
 
     runs: Sequence[Kept]
     largest_v: float
     range_um: float
     least_slope: float
     duration_s: float
+    path_v: float
 
     @property
     def limits(self) -> Limits:
@@ -103,7 +132,7 @@ class Work(NamedTuple):
 
     def equations(self, run: Kept, trial: Trial) -> Equations:
         """Of one recording."""
-        return equations(run, trial.thresholds_v, trial.terms, self.duration_s)
+        return equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
 
 
 def judged_from_rest(
@@ -123,7 +152,8 @@ def prepared_work(runs: Sequence[Measured], weights: Weights, before_v: Sequence
     largest_v = max(float(np.ptp(run.full_v)) for run in parts)
     range_um = max(float(np.ptp(run.position_um)) for run in parts)
     least = LEAST_SLOPE * range_um / largest_v if weights == "invertible" else -np.inf
-    return Work(parts, largest_v, range_um, least, max(float(run.time_s[-1]) for run in parts))
+    duration_s, path_v = np.max([(run.time_s[-1], run.path_v[-1]) for run in parts], axis=0).tolist()
+    return Work(parts, largest_v, range_um, least, duration_s, path_v)
 
 
 def judgements_of(
@@ -147,7 +177,7 @@ def _judgement(run: Kept, one: Equations, own: Real, error: Real, common: Common
     apart = np.concatenate([left[~one.known], moved, np.zeros(1)])
     known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[-1]))
     return Judgement(
-        run.name, run.time_s, run.drive_v, run.position_um, error,
+        run.name, run.time_s, run.drive_v, run.position_um, error[:, 0], error[:, 1],
         early_errors(run, one, common, own, trial.thresholds_v), left[one.known],
         float(offsets[-1]) if offsets.size else np.nan, float(own[offsets.size :].sum()), run.before_v is not None,
         None if known is None else float(run.time_s[known]), float(np.abs(apart).max()) if offsets.size else np.nan,

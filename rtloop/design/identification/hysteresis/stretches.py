@@ -16,6 +16,8 @@ from rtloop.hysteresis.plays import play_outputs
 from rtloop.hysteresis.unknown_memory import known_stretches, settled_memory
 
 Term = Literal["drift", "creep"]
+Clock = Literal["time", "path"]
+"""What creep goes by. By the drive's path it is a memory that fades, which no passing of time makes."""
 
 BLOCKS, LEAST_BLOCKS = 3000, 300
 """Averaged samples of all recordings together, and of each at least."""
@@ -26,7 +28,8 @@ AT_ONCE = 100_000
 
 
 class Kept(NamedTuple):
-    """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, each (blocks,).
+    """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, the path that
+    the drive has gone in V, each (blocks,).
 
     `stretch` (blocks,) is the number of that in which the block's memory is known, −1 where it is in none; plays of up
     to half of `stroke_v` show in them. `full_v` is the drive of every tick, `size` the ticks of a block, `before_v` the
@@ -37,6 +40,7 @@ class Kept(NamedTuple):
     time_s: Real
     drive_v: Real
     position_um: Real
+    path_v: Real
     stretch: npt.NDArray[np.intp]
     stroke_v: float
     full_v: Real
@@ -50,16 +54,20 @@ def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kep
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most)
     time_s = run.seconds[:-1] - run.seconds[0]
     before = None if before_v is None else np.asarray(before_v, float)
-    time_s, slow, position = averaged(np.column_stack([time_s, drive, run.position_um[1:]]), size).T
+    path_v = np.cumsum(np.abs(np.diff(drive, prepend=drive[0])))
+    time_s, slow, position, path_v = averaged(np.column_stack([time_s, drive, run.position_um[1:], path_v]), size).T
     if before is None:
         stretch, stroke_v = _stretches(drive, size)
     else:
         stretch, stroke_v = np.zeros(slow.size, np.intp), 2 * float(np.abs(np.append(before, drive)).max())
-    return Kept(run.name, time_s, slow, position, stretch, stroke_v, drive, size, before)
+    return Kept(run.name, time_s, slow, position, path_v, stretch, stroke_v, drive, size, before)
 
 
-def equations(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: float) -> Equations:
-    """With plays at these thresholds in V and these terms; `duration_s` is that of the longest recording.
+def equations(
+    run: Kept, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
+) -> Equations:
+    """With plays at these thresholds in V and these terms; `duration_s` and `path_v` are those of the longest
+    recordings.
 
     Where memory is not known, the plays are those of a drive that has gone before again and again.
     """
@@ -73,7 +81,8 @@ def equations(run: Kept, thresholds: Real, terms: Sequence[Term], duration_s: fl
     offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
     since = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
     drift = [since] if "drift" in terms else []
-    creep = [_lag(run, duration_s / part) for part in CREEP_PARTS] if "creep" in terms else []
+    passed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
+    creep = [_lag(run.drive_v, passed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
     return Equations(
         plays,
         np.array(creep).reshape(-1, since.size).T,
@@ -112,11 +121,11 @@ def averaged(rows: Real, size: int) -> Real:
     return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
-def _lag(run: Kept, time_constant_s: float) -> Real:
-    """Drive behind a first-order lag, which stood still at first: (blocks,)."""
-    shares = -np.expm1(-np.diff(run.time_s, prepend=run.time_s[0]) / time_constant_s)
-    found, last = np.empty(run.drive_v.size), float(run.drive_v[0])
+def _lag(drive_v: Real, passed: Real, constant: float) -> Real:
+    """Drive behind a first-order lag, which stood still at first: (blocks,). `passed` is what the constant is in."""
+    shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
+    found, last = np.empty(drive_v.size), float(drive_v[0])
     for k, share in enumerate(shares):
-        last += share * (run.drive_v[k] - last)
+        last += share * (drive_v[k] - last)
         found[k] = last
     return found

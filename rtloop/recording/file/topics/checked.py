@@ -25,6 +25,7 @@ from rtloop.recording.file.topics.events import (
     RECORDER,
     RECORDING_FAILED,
     RECORDING_RESUMED,
+    REMOVED,
     Event,
     known,
     name_fault,
@@ -186,9 +187,15 @@ class _Kept(_Checked):
     on: Text
 
 
+class _Removed(_Checked):
+    file: Text
+    size_bytes: Annotated[int, Field(ge=0)]
+    reason: Text
+
+
 _OF_RECORDER: dict[str, type[_Checked]] = {
     **dict.fromkeys(FINAL, _Totals), GAP: _Gap, RECORDING_FAILED: _Failure, RECORDING_RESUMED: _Resumed,
-    KEPT: _Kept
+    KEPT: _Kept, REMOVED: _Removed,
 }  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from rtloop.signals import Failure, Mode, trip_causes
 Event = dict[str, Any]
 GAP, FINISHED, ROTATED, RECOVERED, CUT = "gap", "finished", "rotated", "recovered", "cut"
 RECORDING_FAILED, RECORDING_RESUMED = "recording_failed", "recording_resumed"
-KEPT = "kept"
+KEPT, REMOVED = "kept", "removed"
 """Kinds that the recorder itself writes; `who` is RECORDER."""
 RECORDER = "recorder"
 COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
