@@ -14,7 +14,13 @@ import numpy as np
 from rtloop.design.identification.dynamics.dynamics_fit import Candidate, DynamicsFit, Mode, modes_of, transfer_of
 from rtloop.design.identification.dynamics.identify_delay import MOST_TICKS, delayed
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion, identify_dynamics
-from rtloop.design.identification.dynamics.instrumental import Instrumented, left_by, whitened, whitening_of
+from rtloop.design.identification.dynamics.instrumental import (
+    Instrumented,
+    left_by,
+    whitened,
+    whitening_of,
+    with_past,
+)
 from rtloop.design.identification.dynamics.markov import ARX_ORDER
 from rtloop.design.identification.dynamics.nested_models import Final, Judged, Search, late, preferred
 from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
@@ -152,14 +158,15 @@ def _described(name: str, chosen: Final, data: Instrumented, candidates: tuple[C
     modes = modes_of(model, chosen.estimate.covariance, noise=False)
     _require_known(name, modes)
     left = left_by(model, data.run)
-    errors = whitened(left, chosen.whitening)
+    whole = with_past(left.size)
+    errors = whitened(left, chosen.whitening)[whole]
     return DynamicsFit(
         transfer_of(model),
         model.static_gain,
         modes,
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(left) / np.std(data.run.position_um))),
-        residual_tests(data.driven[ARX_ORDER:], errors, ARX_ORDER),
+        residual_tests(data.driven[whole], errors, ARX_ORDER),
         candidates,
         model,
         chosen.judged.delay_ticks,

@@ -8,7 +8,7 @@ derivative behind the inverse of the noise model.) û is the part of the input t
 autoregression of what is left (Box-Jenkins), and where it is too short for the truth, the estimate has more variance
 and no bias.
 
-    cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1983, eq 4.13)
+    cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
 
 It begins with the two-stage method: least squares of x on û (Van den Hof & Schrama 1993).
 """
@@ -18,14 +18,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve
+import numpy.typing as npt
 from scipy.signal import lfilter
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
-from rtloop.design.identification.dynamics.prediction_error import ALL, Excitation, Kept, descended, has_counterpart
+from rtloop.design.identification.dynamics.prediction_error import Excitation, Kept, descended, has_counterpart
 from rtloop.hil.modal import Real
 
+NOISE_ORDER = 150
+"""Of A_n at most: light noise near a slow mode takes many samples to tell."""
 STEPS, HALVINGS = 40, 12
 FURTHEST = 0.3
 """Of its own size: so far a pole moves at once."""
@@ -51,21 +52,24 @@ class Estimate:
     settled: bool
 
 
-def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kept = ALL) -> Estimate | None:
-    """The model next to `start` by the samples `kept` of the whitened ones; None where there is none that decays."""
-    u, driven, x = (whitened(one, whitening) for one in (data.run.input, data.driven, data.run.position_um))
-    run = replace(data.run, input=driven, position_um=x)
-    first = descended(start, run, noise=False, kept=kept)
-    if not _decays(first):
-        return None
-    step, spread = _step(first, u, driven, x, kept)
+def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate | None:
+    """The model next to `start` by the samples `kept`, which all have their past; None where there is none that decays.
+    """
+    whole = whitened(data.driven, whitening), whitened(data.run.position_um, whitening)
+    first = descended(start, replace(data.run, input=whole[0], position_um=whole[1]), noise=False, kept=kept)
+    return settled(first, data, whitening, kept) if _decays(first) else None
+
+
+def settled(first: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate:
+    """From `first` to where Σ ψ ε = 0, or `first` where the steps do not settle."""
+    step, spread = _step(first, data, whitening, kept)
     without = Estimate(first, spread, settled=False)
     model = first
     for _ in range(STEPS):
         model = _moved(model, step)
         if not _decays(model):
             return without
-        step, covariance = _step(model, u, driven, x, kept)
+        step, covariance = _step(model, data, whitening, kept)
         if np.all(np.abs(step) <= NEAR * np.sqrt(np.diag(covariance))):
             return Estimate(model, covariance, settled=True)
     return without
@@ -79,16 +83,28 @@ def left_by(model: Innovations, run: Excitation) -> Real:
 
 
 def whitening_of(noise: Real) -> Real:
-    """A_n (ARX_ORDER + 1,) by least squares."""
-    past = lagged((noise,), ARX_ORDER)[:, ARX_ORDER:]
-    normal = past @ past.T
-    normal[np.diag_indices_from(normal)] *= 1 + 1e-12
-    return np.concatenate([[1.0], -solve(normal, past @ noise[ARX_ORDER:], assume_a="pos")])
+    """A_n (NOISE_ORDER + 1,), of the order that Akaike's criterion takes (Levinson's recursion)."""
+    spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
+    along = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
+    longer, power = np.eye(1, NOISE_ORDER + 1)[0], float(along[0])
+    found, least = longer, np.inf
+    for order in range(1, NOISE_ORDER + 1):
+        reflected = float(longer[:order] @ along[order:0:-1]) / power
+        longer = longer - reflected * np.pad(longer[order::-1], (0, NOISE_ORDER - order))
+        power *= 1 - reflected**2
+        if (criterion := noise.size * np.log(power) + 2 * order) < least:
+            found, least = longer, criterion
+    return found
 
 
-def whitened(signal: Real, whitening: Real) -> Real:
-    """A_n applied, from the first sample on that has its past: (samples − ARX_ORDER,)."""
-    return np.asarray(lfilter(whitening, 1.0, signal), dtype=float)[whitening.size - 1 :]
+def whitened(signals: Real, whitening: Real) -> Real:
+    """A_n applied to (…, samples), as if they were at rest before: the first NOISE_ORDER samples lack their past."""
+    return np.asarray(lfilter(whitening, 1.0, signals), dtype=float)
+
+
+def with_past(samples: int) -> npt.NDArray[np.bool_]:
+    """(samples,): which of the whitened ones have their past."""
+    return np.arange(samples) >= NOISE_ORDER
 
 
 def _ringing(model: Innovations, samples: int) -> Real:
@@ -100,19 +116,24 @@ def _ringing(model: Innovations, samples: int) -> Real:
     return np.array(rows)
 
 
-def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tuple[Real, Real]:
-    """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads; all signals are whitened."""
-    ringing, nothing = _ringing(model, u.size)[:, kept], np.zeros_like(u)
+def _step(model: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> tuple[Real, Real]:
+    """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads.
+
+    G works on what was recorded and A_n on what G makes of it: what G still rings of is whitened with it.
+    """
+    u, nothing = data.run.input, np.zeros_like(data.driven)
+    ringing = _ringing(model, u.size)
     slopes, instruments = (
-        np.vstack([-model.sensitivities(one, nothing, noise=False)[:-1][:, kept], ringing]) for one in (u, driven)
+        whitened(np.vstack([-model.sensitivities(one, nothing, noise=False)[:-1], ringing]), whitening)[:, kept]
+        for one in (u, data.driven)
     )
     scale = np.linalg.norm(instruments, axis=1)
     scale[scale == 0] = 1.0
     slopes, instruments = slopes / scale[:, None], instruments / scale[:, None]
-    left = (x - replace(model, offset=0.0).output(u))[kept]
+    left = whitened(data.run.position_um - replace(model, offset=0.0).output(u), whitening)[kept]
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
     step = inverse @ (instruments @ left)
-    variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - ARX_ORDER, 1)
+    variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - NOISE_ORDER, 1)
     covariance = variance * inverse @ (instruments @ instruments.T) @ inverse.T / np.outer(scale, scale)
     count = model.pack(noise=False).size - 1
     return (step / scale)[:count], covariance[:count, :count]

@@ -20,10 +20,12 @@ from rtloop.design.identification.dynamics.instrumental import (
     Instrumented,
     estimated,
     left_by,
+    settled,
     whitened,
     whitening_of,
+    with_past,
 )
-from rtloop.design.identification.dynamics.markov import ARX_ORDER, with_residues
+from rtloop.design.identification.dynamics.markov import with_residues
 from rtloop.design.identification.dynamics.mode_search import Spectra
 from rtloop.hil.modal import Complex, Real
 
@@ -59,7 +61,7 @@ class Judged:
 
 
 class Final(NamedTuple):
-    """The estimate, the whitening A_n (ARX_ORDER + 1,) that it was made with, and how it is judged beside others."""
+    """The estimate, the whitening A_n that it was made with, and how it is judged beside others."""
 
     estimate: Estimate
     whitening: Real
@@ -71,8 +73,9 @@ class Search:
 
     def __init__(self, data: Instrumented, whitening: Real) -> None:
         self._data, self._whitening, self._judging = data, whitening, whitening
-        blocks = np.arange(ARX_ORDER, data.run.input.size) // BLOCK
-        self._kept: npt.NDArray[np.bool_] = blocks % 2 == 0
+        whole, blocks = with_past(data.run.input.size), np.arange(data.run.input.size) // BLOCK
+        self._whole, self._kept = whole, whole & (blocks % 2 == 0)
+        self._held_out: npt.NDArray[np.bool_] = whole & (blocks % 2 == 1)
 
     def grown(self, start: Judged | None, delay_ticks: int, most: int, in_vain: int | None = None) -> list[Judged]:
         """From `start`, or from nothing, by a mode more each, up to `most` poles, or until `in_vain` in a row do not
@@ -109,10 +112,9 @@ class Search:
         data, estimate, whitening = late(self._data, judged.delay_ticks), judged.estimate, self._judging
         for _ in range(REWHITENED):
             whitening = whitening_of(left_by(estimate.model, data.run))
-            better = estimated(estimate.model, data, whitening)
-            if better is None or not better.settled:
+            estimate = settled(estimate.model, data, whitening, self._whole)
+            if not estimate.settled:
                 return None
-            estimate = better
         return Final(estimate, whitening, self._scored(estimate, judged.delay_ticks))
 
     def _next(self, model: Innovations, data: Instrumented, *, pair_allowed: bool) -> complex:
@@ -129,7 +131,7 @@ class Search:
 
     def _scored(self, estimate: Estimate, delay_ticks: int) -> Judged:
         errors = whitened(left_by(estimate.model, late(self._data, delay_ticks).run), self._judging)
-        return Judged(estimate, delay_ticks, errors[~self._kept] ** 2, float(np.sum(errors**2)))
+        return Judged(estimate, delay_ticks, errors[self._held_out] ** 2, float(np.sum(errors[self._whole] ** 2)))
 
 
 def preferred(found: list[Judged]) -> list[Judged]:
