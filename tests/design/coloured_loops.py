@@ -14,7 +14,7 @@ from scipy import signal
 
 PERIOD_S = 1e-4
 MOTIONS = ("multisine", "sweep", "steps")
-SHORTEST, LONGEST = 50, 300
+SHORTEST, LONGEST = 50, 150
 """Samples of a step: unequal ones leave no gaps in the spectrum."""
 
 

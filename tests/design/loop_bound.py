@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.design.coloured_loops import DRIFT, PERIOD_S, SENSOR_UM, SHAKEN, TrueLoop, added, colours, filtered
+from tests.design.coloured_loops import DRIFT, PERIOD_S, SENSOR_UM, SHAKEN, TrueLoop, colours, filtered
 
 
 def bounds_percent(loop: TrueLoop, driven_um: np.ndarray, near_hz: float, rms_um: float) -> np.ndarray:

@@ -32,6 +32,8 @@ METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER
 PATIENCE = 2
 """Modes in a row that do not pay, after which no more are tried."""
+SHORT = 4
+"""Order of A_n before there is a model: a long one takes for noise what light modes have left."""
 LARGEST_SPREAD = 0.1
 """A frequency with a larger standard deviation, relative to itself, is none that was found."""
 
@@ -70,7 +72,7 @@ def identify_in_loop(
     run = from_rest(run)
     driven, answer = from_outside(run), from_outside(replace(run, input=run.position_um))
     data = Instrumented(run, driven)
-    search = Search(data, whitening_of(run.position_um - answer))
+    search = Search(data, whitening_of(run.position_um - answer, SHORT))
     found, as_good = _searched(search, order, largest_order, delay_ticks)
     chosen = _final(search, found, as_good)
     if chosen is None:
@@ -120,7 +122,8 @@ def _searched(
 def _with_delays(search: Search, found: list[Judged]) -> list[Judged]:
     """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
     largest = preferred(found)[0].model.order
-    everything, row = list(found), [one for one in found if one.model.order <= largest]
+    small = [one for one in found if one.model.order <= largest]
+    everything, row = list(found), [one for one in small if one.estimate.settled] or small
     for _ in range(MOST_TICKS):
         pairs = [(one, later) for one in row if (later := search.later(one))]
         row = [later for _, later in pairs]

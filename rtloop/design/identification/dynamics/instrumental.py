@@ -10,7 +10,8 @@ and no bias.
 
     cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
 
-It begins with the two-stage method: least squares of x on û (Van den Hof & Schrama 1993).
+Where its steps do not settle they begin anew from the two-stage method: least squares of x on û (Van den Hof & Schrama
+1993).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
+from scipy.signal import oaconvolve
 
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation, Kept, descended, has_counterpart
@@ -27,7 +28,7 @@ from rtloop.hil.modal import Real
 
 NOISE_ORDER = 150
 """Of A_n at most: light noise near a slow mode takes many samples to tell."""
-STEPS, HALVINGS = 40, 12
+STEPS, HALVINGS = 12, 12
 FURTHEST = 0.3
 """Of its own size: so far a pole moves at once."""
 NEAR = 0.03
@@ -54,22 +55,27 @@ class Estimate:
 
 def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate | None:
     """The model next to `start` by the samples `kept`, which all have their past; None where there is none that decays.
+
+    Where no steps lead from `start` to Σ ψ ε = 0, they begin anew from the two-stage method's model.
     """
-    whole = whitened(data.driven, whitening), whitened(data.run.position_um, whitening)
-    first = descended(start, replace(data.run, input=whole[0], position_um=whole[1]), noise=False, kept=kept)
+    if (found := settled(start, data, whitening, kept)).settled:
+        return found
+    driven, x = whitened(data.driven, whitening), whitened(data.run.position_um, whitening)
+    first = descended(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
     return settled(first, data, whitening, kept) if _decays(first) else None
 
 
 def settled(first: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate:
     """From `first` to where Σ ψ ε = 0, or `first` where the steps do not settle."""
-    step, spread = _step(first, data, whitening, kept)
+    u, driven, x = (whitened(one, whitening) for one in (data.run.input, data.driven, data.run.position_um))
+    step, spread = _step(first, u, driven, x, kept)
     without = Estimate(first, spread, settled=False)
     model = first
     for _ in range(STEPS):
         model = _moved(model, step)
         if not _decays(model):
             return without
-        step, covariance = _step(model, data, whitening, kept)
+        step, covariance = _step(model, u, driven, x, kept)
         if np.all(np.abs(step) <= NEAR * np.sqrt(np.diag(covariance))):
             return Estimate(model, covariance, settled=True)
     return without
@@ -82,13 +88,13 @@ def left_by(model: Innovations, run: Excitation) -> Real:
     return left - np.linalg.lstsq(ringing.T, left, rcond=None)[0] @ ringing
 
 
-def whitening_of(noise: Real) -> Real:
-    """A_n (NOISE_ORDER + 1,), of the order that Akaike's criterion takes (Levinson's recursion)."""
+def whitening_of(noise: Real, most: int = NOISE_ORDER) -> Real:
+    """A_n (NOISE_ORDER + 1,), of the order up to `most` that Akaike's criterion takes (Levinson's recursion)."""
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
     along = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
     longer, power = np.eye(1, NOISE_ORDER + 1)[0], float(along[0])
     found, least = longer, np.inf
-    for order in range(1, NOISE_ORDER + 1):
+    for order in range(1, most + 1):
         reflected = float(longer[:order] @ along[order:0:-1]) / power
         longer = longer - reflected * np.pad(longer[order::-1], (0, NOISE_ORDER - order))
         power *= 1 - reflected**2
@@ -99,7 +105,8 @@ def whitening_of(noise: Real) -> Real:
 
 def whitened(signals: Real, whitening: Real) -> Real:
     """A_n applied to (…, samples), as if they were at rest before: the first NOISE_ORDER samples lack their past."""
-    return np.asarray(lfilter(whitening, 1.0, signals), dtype=float)
+    taps = whitening.reshape((1,) * (signals.ndim - 1) + (-1,))
+    return np.asarray(oaconvolve(signals, taps, axes=-1), dtype=float)[..., : signals.shape[-1]]
 
 
 def with_past(samples: int) -> npt.NDArray[np.bool_]:
@@ -116,21 +123,19 @@ def _ringing(model: Innovations, samples: int) -> Real:
     return np.array(rows)
 
 
-def _step(model: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> tuple[Real, Real]:
+def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tuple[Real, Real]:
     """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads.
 
-    G works on what was recorded and A_n on what G makes of it: what G still rings of is whitened with it.
+    All signals are whitened and whole: one that is cut begins with a jump, which rings in ψ and not in the position.
     """
-    u, nothing = data.run.input, np.zeros_like(data.driven)
-    ringing = _ringing(model, u.size)
+    ringing, nothing = _ringing(model, u.size)[:, kept], np.zeros_like(u)
     slopes, instruments = (
-        whitened(np.vstack([-model.sensitivities(one, nothing, noise=False)[:-1], ringing]), whitening)[:, kept]
-        for one in (u, data.driven)
+        np.vstack([-model.sensitivities(one, nothing, noise=False)[:-1][:, kept], ringing]) for one in (u, driven)
     )
     scale = np.linalg.norm(instruments, axis=1)
     scale[scale == 0] = 1.0
     slopes, instruments = slopes / scale[:, None], instruments / scale[:, None]
-    left = whitened(data.run.position_um - replace(model, offset=0.0).output(u), whitening)[kept]
+    left = (x - replace(model, offset=0.0).output(u))[kept]
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
     step = inverse @ (instruments @ left)
     variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - NOISE_ORDER, 1)

@@ -14,8 +14,10 @@ import numpy as np
 
 from rtloop.hil.modal import Complex, Real
 
-DAMPINGS = np.array([0.01, 0.05, 0.25, 0.8])
-FREQUENCIES, ZOOMED, ZOOMS = 90, 9, 2
+DAMPINGS = (0.01, 0.05, 0.25, 0.8)
+APART = 2.0
+"""Grid points of a pair, relative to its width: a light mode between two points farther apart is not seen."""
+REAL, ZOOMED, ZOOMS = 90, 9, 2
 HIGHEST = 0.9
 """Of half the sampling rate."""
 RESOLUTION_HZ = 0.25
@@ -43,12 +45,11 @@ class Spectra:
     def mode(self, *, pair_allowed: bool) -> complex:
         """The rate s of the best mode; a pair's with positive imaginary part where one is allowed and worth it."""
         top = HIGHEST * np.pi / self._period_s
-        rates = np.geomspace(self._slowest, top, FREQUENCIES)
-        real_gain, real = self._best((-rates).astype(complex))
+        real_gain, real = self._best((-np.geomspace(self._slowest, top, REAL)).astype(complex))
         if not pair_allowed:
             return real
-        pair_gain, pair = self._best(_pairs(rates, DAMPINGS))
-        step = (top / self._slowest) ** (1 / (FREQUENCIES - 1))
+        pair_gain, pair = self._best(np.concatenate([_row(self._slowest, top, damping) for damping in DAMPINGS]))
+        step = 1 - APART * pair.real / abs(pair)
         for _ in range(ZOOMS):
             near = abs(pair) * np.geomspace(1 / step, step, ZOOMED)
             dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
@@ -77,6 +78,11 @@ class Spectra:
         own, shared = weight.sum(), weight @ self._back.real
         sides = np.array([across.sum().real, (across @ np.conj(self._back)).real])
         return float(sides @ np.linalg.solve([[own * (1 + 1e-12), shared], [shared, own * (1 + 1e-12)]], sides))
+
+
+def _row(slowest: float, top: float, damping: float) -> Complex:
+    count = int(np.log(top / slowest) / np.log1p(APART * damping)) + 2
+    return _pairs(np.geomspace(slowest, top, count), np.array([damping]))
 
 
 def _pairs(sizes: Real, dampings: Real) -> Complex:
