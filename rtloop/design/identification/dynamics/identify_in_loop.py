@@ -32,6 +32,8 @@ METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER
 PATIENCE = 2
 """Modes in a row that do not pay, after which no more are tried."""
+SPARE = 4
+"""Poles beyond those asked for, that are tried where a mode in the way must be found before one that is asked for."""
 SHORT = 4
 """Order of A_n before there is a model: a long one takes for noise what light modes have left."""
 LARGEST_SPREAD = 0.1
@@ -103,6 +105,9 @@ def _searched(
     """All models that were tried, and those of the fewest poles that are as good as any; none where none is stable."""
     most, patience = order or largest_order, None if order else PATIENCE
     found = search.grown(None, delay_ticks or 0, most, patience)
+    if order and found and not any(one.model.order == order and one.estimate.settled for one in found):
+        larger = search.grown(found[-1], delay_ticks or 0, order + SPARE)
+        found += [search.pruned(one, order) for one in larger]
     found = [one for one in found if order in (None, one.model.order)]
     if not found:
         return [], []

@@ -3,7 +3,7 @@
     e = (b₁ z⁻¹ + b₂ z⁻²)/(1 − 2 Re λ z⁻¹ + |λ|² z⁻²) û        pair,     e = b z⁻¹/(1 − λ z⁻¹) û        real pole
 
 For each λ of a grid the residues are least squares in closed form over the spectra of e and û, both whitened; around
-the best the grid is made finer twice (a matching pursuit, Mallat & Zhang 1993).
+the best of each damping the grid is made finer twice (a matching pursuit, Mallat & Zhang 1993).
 """
 
 from __future__ import annotations
@@ -48,17 +48,21 @@ class Spectra:
         real_gain, real = self._best((-np.geomspace(self._slowest, top, REAL)).astype(complex))
         if not pair_allowed:
             return real
-        pair_gain, pair = self._best(np.concatenate([_row(self._slowest, top, damping) for damping in DAMPINGS]))
-        step = 1 - APART * pair.real / abs(pair)
+        pair_gain, pair = max((self._pair(damping, top) for damping in DAMPINGS), key=lambda found: found[0])
+        worth = {True: pair_gain, False: real_gain}
+        return pair if self._worth(worth, pair=True) >= self._worth(worth, pair=False) else real
+
+    def _pair(self, damping: float, top: float) -> tuple[float, complex]:
+        """The best near this damping: each has its own, because from a broad pair no way leads to a light one."""
+        count = int(np.log(top / self._slowest) / np.log1p(APART * damping)) + 2
+        gain, pair = self._best(_pairs(np.geomspace(self._slowest, top, count), np.array([damping])))
+        step = 1 + APART * damping
         for _ in range(ZOOMS):
             near = abs(pair) * np.geomspace(1 / step, step, ZOOMED)
             dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
-            pair_gain, pair = max(
-                (pair_gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda c: c[0]
-            )
+            gain, pair = max((gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda c: c[0])
             step **= 2 / (ZOOMED - 1)
-        worth = {True: pair_gain, False: real_gain}
-        return pair if self._worth(worth, pair=True) >= self._worth(worth, pair=False) else real
+        return gain, pair
 
     def _worth(self, gains: dict[bool, float], *, pair: bool) -> float:
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
@@ -78,11 +82,6 @@ class Spectra:
         own, shared = weight.sum(), weight @ self._back.real
         sides = np.array([across.sum().real, (across @ np.conj(self._back)).real])
         return float(sides @ np.linalg.solve([[own * (1 + 1e-12), shared], [shared, own * (1 + 1e-12)]], sides))
-
-
-def _row(slowest: float, top: float, damping: float) -> Complex:
-    count = int(np.log(top / slowest) / np.log1p(APART * damping)) + 2
-    return _pairs(np.geomspace(slowest, top, count), np.array([damping]))
 
 
 def _pairs(sizes: Real, dampings: Real) -> Complex:

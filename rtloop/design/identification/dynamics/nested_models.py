@@ -1,6 +1,7 @@
 """Models of growing order from a closed loop, the order and the delay by what predicts the part held out.
 
-Every second block of the recording is held out. There a model is judged by its prediction errors A_n (x − G u − x₀),
+Every second block of the recording is held out of the fits, though not of the search for where they begin: spectra of
+every second block have sidebands in which a light mode is lost. There a model is judged by its prediction errors A_n (x − G u − x₀),
 with one A_n for all models. Of two models the smaller is taken unless the larger one's squared errors are less by CLEAR
 standard errors of their difference (Diebold & Mariano 1995).
 """
@@ -100,12 +101,14 @@ class Search:
         start = replace(model, residues=model.residues * model.images)
         return self._judged(start, judged.delay_ticks + 1)
 
-    def pruned(self, judged: Judged) -> Judged:
-        """Without the modes that do not pay."""
+    def pruned(self, judged: Judged, order: int | None = None) -> Judged:
+        """Without the modes that do not pay; where an `order` is asked for, without those above it that pay least."""
+        if order and judged.model.order <= order:
+            return judged
         modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
         fewer = [self._judged(_without(judged.model, i), judged.delay_ticks) for i in modes]
         best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
-        return judged if best is None or best.worse_than(judged) else self.pruned(best)
+        return judged if best is None or not order and best.worse_than(judged) else self.pruned(best, order)
 
     def final(self, judged: Judged) -> Final | None:
         """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
@@ -119,7 +122,7 @@ class Search:
 
     def _next(self, model: Innovations, data: Instrumented, *, pair_allowed: bool) -> complex:
         left, driven = (whitened(one, self._whitening) for one in (left_by(model, data.run), data.driven))
-        left[~self._kept] = 0.0
+        left[~self._whole] = 0.0
         return Spectra(left, driven, data.run.period_s).mode(pair_allowed=pair_allowed)
 
     def _judged(self, start: Innovations, delay_ticks: int, *, fresh: bool = False) -> Judged | None:
