@@ -139,7 +139,8 @@ def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tup
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
     step = inverse @ (instruments @ left)
     variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - NOISE_ORDER, 1)
-    covariance = variance * inverse @ (instruments @ instruments.T) @ inverse.T / np.outer(scale, scale)
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance = variance * inverse @ (instruments @ instruments.T) @ inverse.T / np.outer(scale, scale)
     count = model.pack(noise=False).size - 1
     return (step / scale)[:count], covariance[:count, :count]
 

@@ -1,9 +1,9 @@
 """Models of growing order from a closed loop, the order and the delay by what predicts the part held out.
 
-Every second block of the recording is held out of the fits, though not of the search for where they begin: spectra of
-every second block have sidebands in which a light mode is lost. There a model is judged by its prediction errors A_n (x − G u − x₀),
-with one A_n for all models. Of two models the smaller is taken unless the larger one's squared errors are less by CLEAR
-standard errors of their difference (Diebold & Mariano 1995).
+Every second block of the recording is held out of the fits, though not of the search for where they begin: a spectrum
+of every second block has sidebands, in which a light mode is lost. There a model is judged by its prediction errors
+A_n (x − G u − x₀), with one A_n for all models. Of two models the smaller is taken unless the larger one's squared
+errors are less by CLEAR standard errors of their difference (Diebold & Mariano 1995).
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Search:
         modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
         fewer = [self._judged(_without(judged.model, i), judged.delay_ticks) for i in modes]
         best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
-        return judged if best is None or not order and best.worse_than(judged) else self.pruned(best, order)
+        return judged if best is None or (not order and best.worse_than(judged)) else self.pruned(best, order)
 
     def final(self, judged: Judged) -> Final | None:
         """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
