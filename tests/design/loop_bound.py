@@ -25,7 +25,7 @@ def bounds_percent(loop: TrueLoop, driven_um: np.ndarray, near_hz: float, rms_um
         residue = share * abs(rate) ** 2 / (2j * rate.imag) * (image - 1) / rate
         mode = filtered([0, 1], [1, -image], driven.astype(complex))
         for part in (PERIOD_S * image * residue * filtered([0, 1], [1, -image], mode), mode):
-            rows += [2 * part.real, -2 * part.imag]
+            rows += [2 * np.real(part), -2 * np.imag(part)]
     top, bottom, sigma = shape_of(near_hz, rms_um)
     seen = filtered(bottom, top, np.array(rows)) / sigma
     sizes = np.linalg.norm(seen, axis=1)
@@ -49,10 +49,10 @@ def shape_of(near_hz: float, rms_um: float) -> tuple[np.ndarray, np.ndarray, flo
         (DRIFT * rms_um / _spread(drift), shaken),
     ]
     spectra = [np.convolve(size * one, size * one[::-1]) for size, one in parts]
-    sides = [np.pad(one, (poles.size - 1 - one.size // 2,)) for one in spectra]
-    roots = np.roots(sum(sides))
+    spectrum = np.sum([np.pad(one, (poles.size - 1 - one.size // 2,)) for one in spectra], axis=0)
+    roots = np.roots(spectrum)
     top = np.poly(roots[np.abs(roots) < 1]).real
-    return top, poles, float(np.sqrt(sum(sides).sum()) / top.sum())
+    return top, poles, float(np.sqrt(spectrum.sum()) / top.sum())
 
 
 def _spread(poles: np.ndarray) -> float:

@@ -76,7 +76,7 @@ def settled(first: Innovations, data: Instrumented, whitening: Real, kept: Kept)
         if not _decays(model):
             return without
         step, covariance = _step(model, u, driven, x, kept)
-        if np.all(np.abs(step) <= NEAR * np.sqrt(np.diag(covariance))):
+        if np.all(np.abs(step) <= NEAR * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
             return Estimate(model, covariance, settled=True)
     return without
 
