@@ -269,9 +269,14 @@ def compensation_report(
 
 
 def _actuator(run: Measured, hysteresis: Path | None, axis: str | None) -> PlayModel:
-    """From the file given, else from the configuration that the recording was made with."""
+    """From the file given, else from the configuration that the recording was made with. Raises UnsuitableData."""
     if hysteresis is not None:
         return read_feedforward(hysteresis, axis).actuator()
+    if not run.configuration:
+        raise UnsuitableData(
+            f"{run.name}: it was imported, and says nothing of hysteresis: --hysteresis names a file that does, "
+            "--input drive takes the drive as it is"
+        )
     return feedforward_of(run.configuration, f"{run.name}: configuration", axis).actuator()
 
 

@@ -14,6 +14,8 @@ from scipy import signal
 
 PERIOD_S = 1e-4
 MOTIONS = ("multisine", "sweep", "steps")
+SHORTEST, LONGEST = 50, 150
+"""Samples of a step: unequal ones leave no gaps in the spectrum."""
 
 
 @dataclass(frozen=True)
@@ -98,16 +100,25 @@ def damping_controller(loop: TrueLoop, gain: float, ki_per_s: float) -> tuple[np
     return added(np.convolve(resonant, integral[1]), np.convolve(integral[0], bottom)), np.convolve(bottom, integral[1])
 
 
-def coloured(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
-    """Broad noise near `near_hz`, drift, and 10 nm of a sensor: a tenth of the power is drift."""
+SHAKEN, DRIFT, SENSOR_UM = 0.95, 0.3, 0.010
+"""Parts of the rms value (their squares add up to 1), and white noise beside them."""
+
+
+def colours(near_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Polynomials in 1/z behind which white noise is what shakes the plant near `near_hz`, and drift."""
     omega = 2 * np.pi * near_hz * PERIOD_S
-    shaken = filtered([1.0], np.poly(np.exp(omega * np.roots([1, 0.1, 1]))).real, random.normal(size=samples))
-    drift = filtered([1.0], [1.0, -0.9995], random.normal(size=samples))
-    return rms_um * (0.95 * shaken / shaken.std() + 0.3 * drift / drift.std()) + random.normal(0, 0.010, samples)
+    return np.poly(np.exp(omega * np.roots([1, 0.1, 1]))).real, np.array([1.0, -0.9995])
+
+
+def coloured(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
+    """Broad noise near `near_hz`, drift, and a sensor's."""
+    shaken, drift = (filtered([1.0], a, random.normal(size=samples)) for a in colours(near_hz))
+    parts = SHAKEN * shaken / shaken.std() + DRIFT * drift / drift.std()
+    return rms_um * parts + random.normal(0, SENSOR_UM, samples)
 
 
 def motion(kind: str, random: np.random.Generator, samples: int, amplitude_um: float) -> np.ndarray:
-    """A multisine of 1 s up to 3 kHz with random phases, a logarithmic sweep there and back, or steps."""
+    """A multisine of 1 s up to 3 kHz with random phases, a logarithmic sweep, or steps up and down."""
     time_s = PERIOD_S * np.arange(samples)
     if kind == "multisine":
         lines = np.arange(5, 3000, 5)
@@ -117,5 +128,6 @@ def motion(kind: str, random: np.random.Generator, samples: int, amplitude_um: f
         return np.resize(amplitude_um * period / np.abs(period).max(), samples)
     if kind == "sweep":
         return amplitude_um * signal.chirp(time_s, 5.0, time_s[-1], 3000.0, "logarithmic", -90)
-    levels = random.uniform(-amplitude_um, amplitude_um, samples // 1000 + 1)
-    return np.repeat(levels, 1000)[:samples]
+    most = samples // SHORTEST + 1
+    levels = amplitude_um * random.choice([-1.0, 1.0], most)
+    return np.repeat(levels, random.integers(SHORTEST, LONGEST, most))[:samples]

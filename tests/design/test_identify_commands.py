@@ -162,6 +162,10 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     assert found["loop"] == {"from_tick": 0, "to_tick": 10_000, "outside": ["x_reference_um", "x_feed_um"]}
     assert "instrumental variables" in found["method"]
     assert "instrumental variables" in (tmp_path / "model.toml").read_text()
+    assert command("export", path, "--to", "mat", "--out", tmp_path / "chirp.mat").exit_code == 0
+    assert command("import", tmp_path / "chirp.mat", "--out", tmp_path / "again.mcap").exit_code == 0
+    again = report("identify", "dynamics", tmp_path / "again.mcap", "--input", "drive", "--order", "2", "--delay", "2")
+    assert again["modes"][0]["frequency_hz"] == pytest.approx(mode["frequency_hz"], rel=1e-5)
     opened = command("identify", "dynamics", path, "--loop", "open", "--order", "2", "--delay", "1")
     assert "instrumental variables" not in opened.output
     at_rest = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
@@ -169,6 +173,7 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     for says, *arguments in (
         ("the command was limited at tick", limited, "--input", "command"),
         ("it holds no x_wobble", path, "--outside", "x_wobble"),
+        ("it was imported, and says nothing of hysteresis", tmp_path / "again.mcap"),
     ):
         result = command("identify", "dynamics", *arguments)
         assert (result.exit_code, says in result.stderr) == (1, True), result.output

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from rtloop.design.identification.dynamics.identify_in_loop import identified_dynamics, identify_in_loop
-from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside
+from rtloop.design.identification.dynamics.instrumental import Instrumented, whitening_of
+from rtloop.design.identification.dynamics.nested_models import Search
+from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
 from rtloop.design.identification.measured import UnsuitableData
 from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
+from tests.design.loop_bound import bounds_percent
 
 SAMPLES = 12_000
 HZ, DAMPING = 600.0, 0.01
@@ -53,6 +59,40 @@ def test_a_loop_that_moved_before_the_recording_began_is_as_good() -> None:
     assert abs(mode.frequency_hz - HZ) < 4 * mode.frequency_std_hz
     assert mode.frequency_hz == pytest.approx(HZ, rel=0.002)
     assert mode.damping == pytest.approx(DAMPING, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [20, 44])
+def test_standard_deviations_are_the_least_that_any_method_can_have(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    loop = drawn_loop(random)
+    near_hz = 1.05 * loop.modes[0][0]
+    reference, noise = motion("steps", random, SAMPLES, 20.0), coloured(random, SAMPLES, near_hz, 0.05)
+    modes = identify_in_loop(inside(loop, reference, noise), order=4, delay_ticks=loop.delay_ticks).modes
+    bounds = bounds_percent(loop, loop.in_loop(reference, 0 * noise)["command_um"], near_hz, 0.05)
+    for mode, (hz, damping, _), (of_hz, of_damping) in zip(modes, loop.modes, bounds, strict=True):
+        assert 100 * mode.frequency_std_hz / hz == pytest.approx(of_hz, rel=0.25)
+        assert 100 * mode.damping_std / damping == pytest.approx(of_damping, rel=0.25)
+        assert abs(100 * (mode.frequency_hz / hz - 1)) < 4 * of_hz
+        assert abs(100 * (mode.damping / damping - 1)) < 4 * of_damping
+
+
+def test_a_light_mode_is_found_first_beside_all_that_is_slow() -> None:
+    random, samples = np.random.default_rng(23), 60_000
+    loop = drawn_loop(random)
+    noise = coloured(random, samples, loop.modes[0][0] * random.uniform(0.9, 1.1), 0.05)
+    command = loop.in_loop(motion("steps", random, samples, 20.0), 0 * noise)["command_um"]
+    position = loop.open(command, noise)["position_um"]
+    run = from_rest(LoopExcitation("drawn", command, position, PERIOD_S, command[np.newaxis]))
+    left = run.position_um - from_outside(replace(run, input=run.position_um))
+    found = Search(Instrumented(run, run.input), whitening_of(left, 4)).grown(None, loop.delay_ticks, 2)
+    assert abs(found[0].model.rates[0]) / 2 / np.pi == pytest.approx(loop.modes[0][0], rel=0.005)
+
+
+def test_noise_is_whitened_by_the_autoregression_that_made_it() -> None:
+    made = np.array([1.0, -1.6, 0.9])
+    noise = np.asarray(lfilter([1.0], made, np.random.default_rng(1).normal(size=50_000)))
+    assert whitening_of(noise)[:3] == pytest.approx(made, abs=0.02)
+    assert np.count_nonzero(whitening_of(noise, 1)) == 2
 
 
 def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:

@@ -2,18 +2,22 @@
 
 Each draw is a plant of two light modes and a delay, a controller that damps the first of them, and noise far from
 white that the loop brings back, simulated by scipy alone (`tests.design.coloured_loops`); the reference is a multisine,
-a sweep or steps in turn. Side by side, with the same noise:
+a sweep or steps in turn, of 6 s. Side by side, with the same noise:
 
 - closed: what `identify dynamics` finds in the loop, order and delay and all;
 - open: what the same method finds where the plant is moved by the same command without a loop, order and delay given;
 - direct: ARMAX by prediction errors on the loop's input and output as if it were open, downhill from the true modes;
 - output error: least squares of the simulated output on the same data, downhill from the true modes.
 
+Each error is told in percent, and relative to the Cramér-Rao bound (`tests.design.loop_bound`): the least standard
+deviation that any unbiased method can have on such a recording, which is the same for the open loop.
+
 Then runs on the simulated rig in virtual time, recorded and identified as a user does it: eq (5) with its resonance
 moved, and rigs of one mode, 10 nm of noise.
 
 Ends with 1 where a frequency is off by more than 0.2 % or a damping by more than 10 %, where the mean over the draws is
-not that of nothing but chance, or where the standard deviations are not those of the errors.
+not that of nothing but chance, where the standard deviations are not those of the errors, or where the naive methods
+are no worse.
 """
 
 from __future__ import annotations
@@ -37,6 +41,7 @@ from rtloop.design.identification.dynamics.outside import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation, descended, refined
 from rtloop.design.identification.measured import UnsuitableData
 from tests.design.coloured_loops import MOTIONS, PERIOD_S, TrueLoop, coloured, drawn_loop, motion
+from tests.design.loop_bound import bounds_percent
 from tests.design.measured_loops import TrueLoop as ClosedLoop
 from tests.recording.real_loop import record
 from tests.soak.response import RESONANCE_HZ, of_eq_5, of_one_mode
@@ -51,35 +56,38 @@ offset = 5.0
 logarithmic = true"""
 STEPS = 'kind = "steps"\nlevels = [5.0, 15.0, -5.0, 10.0]\ndwell_s = 0.2\nrepeat = true'
 EQ_5_DAMPING = 55.0 / 2 / 1.4e7**0.5
-SAMPLES, NOISE_UM = 40_000, 0.05
-AMPLITUDES_UM = {"multisine": 6.0, "sweep": 3.0, "steps": 20.0}
+SAMPLES, NOISE_UM = 60_000, 0.05
+AMPLITUDES_UM = {"multisine": 20.0, "sweep": 8.0, "steps": 20.0}
 FREQUENCY_PERCENT, DAMPING_PERCENT = 0.2, 10.0
 METHODS = ("closed", "open", "direct", "output error")
 
 
 class Found(NamedTuple):
-    """Errors of the frequencies and dampings of both modes, %, and the same in standard deviations; NaN for none."""
+    """Errors of the frequencies and dampings of both modes, %; in standard deviations as told, NaN for none; in those
+    of the bound."""
 
     frequencies: tuple[float, float]
     dampings: tuple[float, float]
     normal_frequencies: tuple[float, float]
     normal_dampings: tuple[float, float]
+    bound_frequencies: tuple[float, float]
+    bound_dampings: tuple[float, float]
     order: int
     late: int
 
 
-def judged(loop: TrueLoop, modes: tuple[Mode, ...], order: int, late: int) -> Found:
-    """The nearest mode found beside each of the plant's."""
+def judged(loop: TrueLoop, bounds: np.ndarray, modes: tuple[Mode, ...], order: int, late: int) -> Found:
+    """The nearest mode found beside each of the plant's; `bounds` (modes, 2) in percent."""
     rows = []
-    for hz, damping, _ in loop.modes:
+    for (hz, damping, _), least in zip(loop.modes, bounds, strict=True):
         mode = min(modes, key=lambda one: abs(np.log(one.frequency_hz / hz)))
-        frequency, ratio = mode.frequency_hz - hz, mode.damping - damping
-        rows.append((100 * frequency / hz, 100 * ratio / damping, frequency / mode.frequency_std_hz,
-                     ratio / mode.damping_std))  # fmt: skip
+        off = 100 * (mode.frequency_hz / hz - 1), 100 * (mode.damping / damping - 1)
+        told = 100 * mode.frequency_std_hz / hz, 100 * mode.damping_std / damping
+        rows.append((*off, off[0] / told[0], off[1] / told[1], off[0] / least[0], off[1] / least[1]))
     return Found(*zip(*rows, strict=True), order, late)  # type: ignore[arg-type]
 
 
-def naive(loop: TrueLoop, run: Excitation, method: str) -> Found | None:
+def naive(loop: TrueLoop, bounds: np.ndarray, run: Excitation, method: str) -> Found | None:
     """As if the loop were open, from the true modes downhill, as nobody could begin: what is left is bias and noise."""
     rates = np.array([2 * np.pi * hz * (-z + 1j * np.sqrt(1 - z * z)) for hz, z, _ in loop.modes])
     run = delayed(run, loop.delay_ticks)
@@ -87,22 +95,26 @@ def naive(loop: TrueLoop, run: Excitation, method: str) -> Found | None:
     found = refined(start, run) if method == "direct" else descended(start, run, noise=False)
     if found is None:
         return None
-    return judged(loop, tuple(Mode(abs(s) / 2 / np.pi, np.nan, -s.real / abs(s), np.nan, 0) for s in found.rates), 4, 0)
+    modes = tuple(Mode(abs(s) / 2 / np.pi, np.nan, -s.real / abs(s), np.nan, 0) for s in found.rates)
+    return judged(loop, bounds, modes, 4, 0)
 
 
 def draw(seed: int) -> tuple[str, dict[str, Found | None]]:
     """One loop; None where there is no answer."""
     random = np.random.default_rng(seed)
     loop, kind = drawn_loop(random), MOTIONS[seed % len(MOTIONS)]
-    noise = coloured(random, SAMPLES, loop.modes[0][0] * random.uniform(0.9, 1.1), NOISE_UM)
+    near_hz = loop.modes[0][0] * random.uniform(0.9, 1.1)
+    noise = coloured(random, SAMPLES, near_hz, NOISE_UM)
     reference = motion(kind, random, SAMPLES, AMPLITUDES_UM[kind])
-    closed = loop.in_loop(reference, noise)
-    opened = loop.open(loop.in_loop(reference, 0 * noise)["command_um"], noise)
+    closed, quiet = loop.in_loop(reference, noise), loop.in_loop(reference, 0 * noise)
+    opened = loop.open(quiet["command_um"], noise)
+    bounds = bounds_percent(loop, quiet["command_um"], near_hz, NOISE_UM)
+    swings = [float(np.std(quiet[name]) / np.std(closed[name] - quiet[name])) for name in ("position_um", "command_um")]
     inside, alone = (
         LoopExcitation("drawn", one["command_um"], one["position_um"], PERIOD_S, one["reference_um"][None, :])
         for one in (closed, opened)
     )
-    found = {method: naive(loop, inside, method) for method in ("direct", "output error")}
+    found = {method: naive(loop, bounds, inside, method) for method in ("direct", "output error")}
     runs: tuple[tuple[str, LoopExcitation, dict[str, Any]], ...] = (
         ("closed", inside, {}),
         ("open", alone, {"order": 4, "delay_ticks": loop.delay_ticks}),
@@ -114,9 +126,12 @@ def draw(seed: int) -> tuple[str, dict[str, Found | None]]:
             print(f"draw {seed}, {kind}, {method}: refused: {refusal}", flush=True)
             found[method] = None
         else:
-            found[method] = judged(loop, fit.modes, fit.model.order, fit.delay_ticks - loop.delay_ticks)
+            found[method] = judged(loop, bounds, fit.modes, fit.model.order, fit.delay_ticks - loop.delay_ticks)
     told = "; ".join(f"{method} {_told(found[method])}" for method in METHODS)
-    print(f"draw {seed}, {kind}, {loop.modes[0][0]:.0f} and {loop.modes[1][0]:.0f} Hz: {told}", flush=True)
+    least = ", ".join(f"{f:.3f} % ζ {d:.1f} %" for f, d in bounds)
+    hz = " and ".join(f"{mode[0]:.0f}" for mode in loop.modes)
+    seen = f"{swings[0]:.0f} in x, {swings[1]:.0f} in v"
+    print(f"draw {seed}, {kind}, {hz} Hz, signal over noise {seen}, bound {least}: {told}", flush=True)
     return kind, found
 
 
@@ -129,26 +144,34 @@ def _told(found: Found | None) -> str:
 
 def show(found: list[dict[str, Found | None]]) -> bool:
     """The distributions; whether the closed loop's keep within what is asked."""
-    good = True
-    print(f"\n{'':14}{'':11}{'mean':>9}{'± of it':>9}{'rms':>9}{'largest':>9}{'rms in σ':>10}")
+    good, sizes = True, {}
+    print(f"\n{'':14}{'':11}{'mean':>9}{'± of it':>9}{'rms':>9}{'largest':>9}{'rms in σ':>10}{'/ bound':>9}")
     for method in METHODS:
         rows = [one[method] for one in found if one[method] is not None]
         for name, limit in (("frequencies", FREQUENCY_PERCENT), ("dampings", DAMPING_PERCENT)):
             values = np.array([getattr(one, name) for one in rows]).ravel()
             normal = np.array([getattr(one, f"normal_{name}") for one in rows]).ravel()
             mean, chance, spread = values.mean(), values.std() / np.sqrt(values.size), np.sqrt(np.mean(normal**2))
-            largest = np.abs(values).max()
+            largest, of_bound = np.abs(values).max(), np.array([getattr(one, f"bound_{name}") for one in rows])
             print(
                 f"{method:14}{name:11}{mean:9.4f}{chance:9.4f}{np.sqrt(np.mean(values**2)):9.4f}{largest:9.3f}"
-                f"{spread:10.2f}"
+                f"{spread:10.2f}{np.sqrt(np.mean(of_bound**2)):9.2f}"
             )
+            sizes[method, name] = np.sqrt(np.mean(values**2))
             if method == "closed":
                 good &= largest <= limit and abs(mean) <= 3 * chance and 0.7 <= spread <= 1.4
     refused = sum(one["closed"] is None for one in found)
     orders = sum(one["closed"] is not None and one["closed"].order == 4 for one in found)
     delays = sum(one["closed"] is not None and one["closed"].late == 0 for one in found)
     print(f"{len(found)} draws: {refused} refused, order found in {orders}, delay in {delays}")
-    return good and not refused
+    for name in ("frequencies", "dampings"):
+        pairs = [(one["closed"], one["open"]) for one in found if one["closed"] and one["open"]]
+        apart = np.array([np.subtract(getattr(a, name), getattr(b, name)) for a, b in pairs]).ravel()
+        chance = apart.std() / np.sqrt(apart.size)
+        print(f"{'closed − open':14}{name:11}{apart.mean():9.4f}{chance:9.4f}{np.sqrt(np.mean(apart**2)):9.4f}")
+        good &= abs(apart.mean()) <= 3 * chance
+    worse = all(sizes[one, name] > sizes["closed", name] for one, name in sizes if one in ("direct", "output error"))
+    return good and worse and not refused
 
 
 RIGS = {

@@ -14,7 +14,13 @@ import numpy as np
 from rtloop.design.identification.dynamics.dynamics_fit import Candidate, DynamicsFit, Mode, modes_of, transfer_of
 from rtloop.design.identification.dynamics.identify_delay import MOST_TICKS, delayed
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion, identify_dynamics
-from rtloop.design.identification.dynamics.instrumental import Instrumented, left_by, whitened, whitening_of
+from rtloop.design.identification.dynamics.instrumental import (
+    Instrumented,
+    left_by,
+    whitened,
+    whitening_of,
+    with_past,
+)
 from rtloop.design.identification.dynamics.markov import ARX_ORDER
 from rtloop.design.identification.dynamics.nested_models import Final, Judged, Search, late, preferred
 from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
@@ -26,6 +32,10 @@ METHOD = "refined instrumental variables, closed loop"
 LEAST_SAMPLES = 50 * ARX_ORDER
 PATIENCE = 2
 """Modes in a row that do not pay, after which no more are tried."""
+SPARE = 4
+"""Poles beyond those asked for, that are tried where a mode in the way must be found before one that is asked for."""
+SHORT = 4
+"""Order of A_n before there is a model: a long one takes for noise what light modes have left."""
 LARGEST_SPREAD = 0.1
 """A frequency with a larger standard deviation, relative to itself, is none that was found."""
 
@@ -64,7 +74,7 @@ def identify_in_loop(
     run = from_rest(run)
     driven, answer = from_outside(run), from_outside(replace(run, input=run.position_um))
     data = Instrumented(run, driven)
-    search = Search(data, whitening_of(run.position_um - answer))
+    search = Search(data, whitening_of(run.position_um - answer, SHORT))
     found, as_good = _searched(search, order, largest_order, delay_ticks)
     chosen = _final(search, found, as_good)
     if chosen is None:
@@ -95,6 +105,9 @@ def _searched(
     """All models that were tried, and those of the fewest poles that are as good as any; none where none is stable."""
     most, patience = order or largest_order, None if order else PATIENCE
     found = search.grown(None, delay_ticks or 0, most, patience)
+    if order and found and not any(one.model.order == order and one.estimate.settled for one in found):
+        larger = search.grown(found[-1], delay_ticks or 0, order + SPARE)
+        found += [search.pruned(one, order) for one in larger]
     found = [one for one in found if order in (None, one.model.order)]
     if not found:
         return [], []
@@ -114,7 +127,8 @@ def _searched(
 def _with_delays(search: Search, found: list[Judged]) -> list[Judged]:
     """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
     largest = preferred(found)[0].model.order
-    everything, row = list(found), [one for one in found if one.model.order <= largest]
+    small = [one for one in found if one.model.order <= largest]
+    everything, row = list(found), [one for one in small if one.estimate.settled] or small
     for _ in range(MOST_TICKS):
         pairs = [(one, later) for one in row if (later := search.later(one))]
         row = [later for _, later in pairs]
@@ -152,14 +166,15 @@ def _described(name: str, chosen: Final, data: Instrumented, candidates: tuple[C
     modes = modes_of(model, chosen.estimate.covariance, noise=False)
     _require_known(name, modes)
     left = left_by(model, data.run)
-    errors = whitened(left, chosen.whitening)
+    whole = with_past(left.size)
+    errors = whitened(left, chosen.whitening)[whole]
     return DynamicsFit(
         transfer_of(model),
         model.static_gain,
         modes,
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(left) / np.std(data.run.position_um))),
-        residual_tests(data.driven[ARX_ORDER:], errors, ARX_ORDER),
+        residual_tests(data.driven[whole], errors, ARX_ORDER),
         candidates,
         model,
         chosen.judged.delay_ticks,

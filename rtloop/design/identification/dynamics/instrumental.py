@@ -8,9 +8,10 @@ derivative behind the inverse of the noise model.) û is the part of the input t
 autoregression of what is left (Box-Jenkins), and where it is too short for the truth, the estimate has more variance
 and no bias.
 
-    cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1983, eq 4.13)
+    cov θ = σ² (ΨᵀΦ)⁻¹ ΨᵀΨ (ΦᵀΨ)⁻¹,     Φ = A_n ∂G/∂θ u        (Söderström & Stoica 1989, chapter 8)
 
-It begins with the two-stage method: least squares of x on û (Van den Hof & Schrama 1993).
+Where its steps do not settle they begin anew from the two-stage method: least squares of x on û (Van den Hof & Schrama
+1993).
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve
-from scipy.signal import lfilter
+import numpy.typing as npt
+from scipy.signal import oaconvolve
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
-from rtloop.design.identification.dynamics.prediction_error import ALL, Excitation, Kept, descended, has_counterpart
+from rtloop.design.identification.dynamics.prediction_error import Excitation, Kept, descended, has_counterpart
 from rtloop.hil.modal import Real
 
-STEPS, HALVINGS = 40, 12
+NOISE_ORDER = 150
+"""Of A_n at most: light noise near a slow mode takes many samples to tell."""
+STEPS, HALVINGS = 12, 12
 FURTHEST = 0.3
 """Of its own size: so far a pole moves at once."""
 NEAR = 0.03
@@ -51,13 +53,21 @@ class Estimate:
     settled: bool
 
 
-def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kept = ALL) -> Estimate | None:
-    """The model next to `start` by the samples `kept` of the whitened ones; None where there is none that decays."""
+def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate | None:
+    """The model next to `start` by the samples `kept`, which all have their past; None where there is none that decays.
+
+    Where no steps lead from `start` to Σ ψ ε = 0, they begin anew from the two-stage method's model.
+    """
+    if (found := settled(start, data, whitening, kept)).settled:
+        return found
+    driven, x = whitened(data.driven, whitening), whitened(data.run.position_um, whitening)
+    first = descended(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
+    return settled(first, data, whitening, kept) if _decays(first) else None
+
+
+def settled(first: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate:
+    """From `first` to where Σ ψ ε = 0, or `first` where the steps do not settle."""
     u, driven, x = (whitened(one, whitening) for one in (data.run.input, data.driven, data.run.position_um))
-    run = replace(data.run, input=driven, position_um=x)
-    first = descended(start, run, noise=False, kept=kept)
-    if not _decays(first):
-        return None
     step, spread = _step(first, u, driven, x, kept)
     without = Estimate(first, spread, settled=False)
     model = first
@@ -66,7 +76,7 @@ def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kep
         if not _decays(model):
             return without
         step, covariance = _step(model, u, driven, x, kept)
-        if np.all(np.abs(step) <= NEAR * np.sqrt(np.diag(covariance))):
+        if np.all(np.abs(step) <= NEAR * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
             return Estimate(model, covariance, settled=True)
     return without
 
@@ -78,17 +88,30 @@ def left_by(model: Innovations, run: Excitation) -> Real:
     return left - np.linalg.lstsq(ringing.T, left, rcond=None)[0] @ ringing
 
 
-def whitening_of(noise: Real) -> Real:
-    """A_n (ARX_ORDER + 1,) by least squares."""
-    past = lagged((noise,), ARX_ORDER)[:, ARX_ORDER:]
-    normal = past @ past.T
-    normal[np.diag_indices_from(normal)] *= 1 + 1e-12
-    return np.concatenate([[1.0], -solve(normal, past @ noise[ARX_ORDER:], assume_a="pos")])
+def whitening_of(noise: Real, most: int = NOISE_ORDER) -> Real:
+    """A_n (NOISE_ORDER + 1,), of the order up to `most` that Akaike's criterion takes (Levinson's recursion)."""
+    spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
+    along = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
+    longer, power = np.eye(1, NOISE_ORDER + 1)[0], float(along[0])
+    found, least = longer, np.inf
+    for order in range(1, most + 1):
+        reflected = float(longer[:order] @ along[order:0:-1]) / power
+        longer = longer - reflected * np.pad(longer[order::-1], (0, NOISE_ORDER - order))
+        power *= 1 - reflected**2
+        if (criterion := noise.size * np.log(power) + 2 * order) < least:
+            found, least = longer, criterion
+    return found
 
 
-def whitened(signal: Real, whitening: Real) -> Real:
-    """A_n applied, from the first sample on that has its past: (samples − ARX_ORDER,)."""
-    return np.asarray(lfilter(whitening, 1.0, signal), dtype=float)[whitening.size - 1 :]
+def whitened(signals: Real, whitening: Real) -> Real:
+    """A_n applied to (…, samples), as if they were at rest before: the first NOISE_ORDER samples lack their past."""
+    taps = whitening.reshape((1,) * (signals.ndim - 1) + (-1,))
+    return np.asarray(oaconvolve(signals, taps, axes=-1), dtype=float)[..., : signals.shape[-1]]
+
+
+def with_past(samples: int) -> npt.NDArray[np.bool_]:
+    """(samples,): which of the whitened ones have their past."""
+    return np.arange(samples) >= NOISE_ORDER
 
 
 def _ringing(model: Innovations, samples: int) -> Real:
@@ -101,7 +124,10 @@ def _ringing(model: Innovations, samples: int) -> Real:
 
 
 def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tuple[Real, Real]:
-    """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads; all signals are whitened."""
+    """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads.
+
+    All signals are whitened and whole: one that is cut begins with a jump, which rings in ψ and not in the position.
+    """
     ringing, nothing = _ringing(model, u.size)[:, kept], np.zeros_like(u)
     slopes, instruments = (
         np.vstack([-model.sensitivities(one, nothing, noise=False)[:-1][:, kept], ringing]) for one in (u, driven)
@@ -112,8 +138,9 @@ def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tup
     left = (x - replace(model, offset=0.0).output(u))[kept]
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
     step = inverse @ (instruments @ left)
-    variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - ARX_ORDER, 1)
-    covariance = variance * inverse @ (instruments @ instruments.T) @ inverse.T / np.outer(scale, scale)
+    variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - NOISE_ORDER, 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance = variance * inverse @ (instruments @ instruments.T) @ inverse.T / np.outer(scale, scale)
     count = model.pack(noise=False).size - 1
     return (step / scale)[:count], covariance[:count, :count]
 

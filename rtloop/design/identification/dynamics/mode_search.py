@@ -3,7 +3,7 @@
     e = (b₁ z⁻¹ + b₂ z⁻²)/(1 − 2 Re λ z⁻¹ + |λ|² z⁻²) û        pair,     e = b z⁻¹/(1 − λ z⁻¹) û        real pole
 
 For each λ of a grid the residues are least squares in closed form over the spectra of e and û, both whitened; around
-the best the grid is made finer twice (a matching pursuit, Mallat & Zhang 1993).
+the best of each damping the grid is made finer twice (a matching pursuit, Mallat & Zhang 1993).
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import numpy as np
 
 from rtloop.hil.modal import Complex, Real
 
-DAMPINGS = np.array([0.01, 0.05, 0.25, 0.8])
-FREQUENCIES, ZOOMED, ZOOMS = 90, 9, 2
+DAMPINGS = (0.01, 0.05, 0.25, 0.8)
+APART = 2.0
+"""Grid points of a pair, relative to its width: a light mode between two points farther apart is not seen."""
+REAL, ZOOMED, ZOOMS = 90, 9, 2
 HIGHEST = 0.9
 """Of half the sampling rate."""
 RESOLUTION_HZ = 0.25
@@ -43,21 +45,24 @@ class Spectra:
     def mode(self, *, pair_allowed: bool) -> complex:
         """The rate s of the best mode; a pair's with positive imaginary part where one is allowed and worth it."""
         top = HIGHEST * np.pi / self._period_s
-        rates = np.geomspace(self._slowest, top, FREQUENCIES)
-        real_gain, real = self._best((-rates).astype(complex))
+        real_gain, real = self._best((-np.geomspace(self._slowest, top, REAL)).astype(complex))
         if not pair_allowed:
             return real
-        pair_gain, pair = self._best(_pairs(rates, DAMPINGS))
-        step = (top / self._slowest) ** (1 / (FREQUENCIES - 1))
+        pair_gain, pair = max((self._pair(damping, top) for damping in DAMPINGS), key=lambda found: found[0])
+        worth = {True: pair_gain, False: real_gain}
+        return pair if self._worth(worth, pair=True) >= self._worth(worth, pair=False) else real
+
+    def _pair(self, damping: float, top: float) -> tuple[float, complex]:
+        """The best near this damping: each has its own, because from a broad pair no way leads to a light one."""
+        count = int(np.log(top / self._slowest) / np.log1p(APART * damping)) + 2
+        gain, pair = self._best(_pairs(np.geomspace(self._slowest, top, count), np.array([damping])))
+        step = 1 + APART * damping
         for _ in range(ZOOMS):
             near = abs(pair) * np.geomspace(1 / step, step, ZOOMED)
             dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
-            pair_gain, pair = max(
-                (pair_gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda c: c[0]
-            )
+            gain, pair = max((gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda c: c[0])
             step **= 2 / (ZOOMED - 1)
-        worth = {True: pair_gain, False: real_gain}
-        return pair if self._worth(worth, pair=True) >= self._worth(worth, pair=False) else real
+        return gain, pair
 
     def _worth(self, gains: dict[bool, float], *, pair: bool) -> float:
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance

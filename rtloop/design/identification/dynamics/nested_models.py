@@ -1,8 +1,9 @@
 """Models of growing order from a closed loop, the order and the delay by what predicts the part held out.
 
-Every second block of the recording is held out. There a model is judged by its prediction errors A_n (x − G u − x₀),
-with one A_n for all models. Of two models the smaller is taken unless the larger one's squared errors are less by CLEAR
-standard errors of their difference (Diebold & Mariano 1995).
+Every second block of the recording is held out of the fits, though not of the search for where they begin: a spectrum
+of every second block has sidebands, in which a light mode is lost. There a model is judged by its prediction errors
+A_n (x − G u − x₀), with one A_n for all models. Of two models the smaller is taken unless the larger one's squared
+errors are less by CLEAR standard errors of their difference (Diebold & Mariano 1995).
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from rtloop.design.identification.dynamics.instrumental import (
     Instrumented,
     estimated,
     left_by,
+    settled,
     whitened,
     whitening_of,
+    with_past,
 )
-from rtloop.design.identification.dynamics.markov import ARX_ORDER, with_residues
+from rtloop.design.identification.dynamics.markov import with_residues
 from rtloop.design.identification.dynamics.mode_search import Spectra
 from rtloop.hil.modal import Complex, Real
 
@@ -59,7 +62,7 @@ class Judged:
 
 
 class Final(NamedTuple):
-    """The estimate, the whitening A_n (ARX_ORDER + 1,) that it was made with, and how it is judged beside others."""
+    """The estimate, the whitening A_n that it was made with, and how it is judged beside others."""
 
     estimate: Estimate
     whitening: Real
@@ -71,8 +74,9 @@ class Search:
 
     def __init__(self, data: Instrumented, whitening: Real) -> None:
         self._data, self._whitening, self._judging = data, whitening, whitening
-        blocks = np.arange(ARX_ORDER, data.run.input.size) // BLOCK
-        self._kept: npt.NDArray[np.bool_] = blocks % 2 == 0
+        whole, blocks = with_past(data.run.input.size), np.arange(data.run.input.size) // BLOCK
+        self._whole, self._kept = whole, whole & (blocks % 2 == 0)
+        self._held_out: npt.NDArray[np.bool_] = whole & (blocks % 2 == 1)
 
     def grown(self, start: Judged | None, delay_ticks: int, most: int, in_vain: int | None = None) -> list[Judged]:
         """From `start`, or from nothing, by a mode more each, up to `most` poles, or until `in_vain` in a row do not
@@ -97,27 +101,28 @@ class Search:
         start = replace(model, residues=model.residues * model.images)
         return self._judged(start, judged.delay_ticks + 1)
 
-    def pruned(self, judged: Judged) -> Judged:
-        """Without the modes that do not pay."""
+    def pruned(self, judged: Judged, order: int | None = None) -> Judged:
+        """Without the modes that do not pay; where an `order` is asked for, without those above it that pay least."""
+        if order and judged.model.order <= order:
+            return judged
         modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
         fewer = [self._judged(_without(judged.model, i), judged.delay_ticks) for i in modes]
         best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
-        return judged if best is None or best.worse_than(judged) else self.pruned(best)
+        return judged if best is None or (not order and best.worse_than(judged)) else self.pruned(best, order)
 
     def final(self, judged: Judged) -> Final | None:
         """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
         data, estimate, whitening = late(self._data, judged.delay_ticks), judged.estimate, self._judging
         for _ in range(REWHITENED):
             whitening = whitening_of(left_by(estimate.model, data.run))
-            better = estimated(estimate.model, data, whitening)
-            if better is None or not better.settled:
+            estimate = settled(estimate.model, data, whitening, self._whole)
+            if not estimate.settled:
                 return None
-            estimate = better
         return Final(estimate, whitening, self._scored(estimate, judged.delay_ticks))
 
     def _next(self, model: Innovations, data: Instrumented, *, pair_allowed: bool) -> complex:
         left, driven = (whitened(one, self._whitening) for one in (left_by(model, data.run), data.driven))
-        left[~self._kept] = 0.0
+        left[~self._whole] = 0.0
         return Spectra(left, driven, data.run.period_s).mode(pair_allowed=pair_allowed)
 
     def _judged(self, start: Innovations, delay_ticks: int, *, fresh: bool = False) -> Judged | None:
@@ -129,7 +134,7 @@ class Search:
 
     def _scored(self, estimate: Estimate, delay_ticks: int) -> Judged:
         errors = whitened(left_by(estimate.model, late(self._data, delay_ticks).run), self._judging)
-        return Judged(estimate, delay_ticks, errors[~self._kept] ** 2, float(np.sum(errors**2)))
+        return Judged(estimate, delay_ticks, errors[self._held_out] ** 2, float(np.sum(errors[self._whole] ** 2)))
 
 
 def preferred(found: list[Judged]) -> list[Judged]:

@@ -4,7 +4,7 @@
 
 In a closed loop the input holds the noise of the past: C(z) puts it there. What is left in û owes nothing to the noise,
 because nobody who moved the reference knew it. û need not be the whole truth about u: as an instrument any function of
-the reference serves without bias, a poor one with more variance (Söderström & Stoica 1983, chapter 4).
+the reference serves without bias, a poor one with more variance (Söderström & Stoica 1989, chapter 8).
 """
 
 from __future__ import annotations
