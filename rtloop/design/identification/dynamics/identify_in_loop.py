@@ -126,9 +126,11 @@ def _searched(
 
 def _with_delays(search: Search, found: list[Judged]) -> list[Judged]:
     """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
-    largest = preferred(found)[0].model.order
+    best = preferred(found)[0]
+    largest = best.model.order
     small = [one for one in found if one.model.order <= largest]
     everything, row = list(found), [one for one in small if one.estimate.settled] or small
+    row = [*row, *(one for one in search.reduced(best) if one)]
     for _ in range(MOST_TICKS):
         pairs = [(one, later) for one in row if (later := search.later(one))]
         row = [later for _, later in pairs]

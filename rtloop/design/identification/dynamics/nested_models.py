@@ -105,10 +105,14 @@ class Search:
         """Without the modes that do not pay; where an `order` is asked for, without those above it that pay least."""
         if order and judged.model.order <= order:
             return judged
-        modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
-        fewer = [self._judged(_without(judged.model, i), judged.delay_ticks) for i in modes]
+        fewer = self.reduced(judged)
         best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
         return judged if best is None or (not order and best.worse_than(judged)) else self.pruned(best, order)
+
+    def reduced(self, judged: Judged) -> list[Judged | None]:
+        """Without each of its modes in turn, if it has more than one."""
+        modes = range(judged.model.rates.size if judged.model.rates.size > 1 else 0)
+        return [self._judged(_without(judged.model, i), judged.delay_ticks) for i in modes]
 
     def final(self, judged: Judged) -> Final | None:
         """By the whole recording, with A_n of what the model leaves; None where nothing settles."""
