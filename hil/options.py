@@ -6,7 +6,7 @@ dynamics, names of axes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
@@ -53,6 +53,13 @@ class Options(BaseModel):
             elif abs(number) > LARGEST or 0 < abs(number) < SMALLEST:
                 raise ValueError(f"{number:g}: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}, are allowed")
         return value
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """As pydantic's, but without what was computed from the fields as they were."""
+        copy = super().model_copy(update=update, deep=deep)
+        for name in copy.__dict__.keys() - type(self).model_fields.keys():
+            del copy.__dict__[name]
+        return copy
 
     def _only_with(self, name: str, value: str, *fields: str) -> None:
         """Raise ValueError for a field that is set although it would be ignored."""
