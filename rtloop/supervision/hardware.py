@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,9 +16,9 @@ from pydantic import TypeAdapter, ValidationError
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.plan import Plan
-from rtloop.errors import OutputError
-from rtloop.hil.trusted import Untrusted, open_file, open_folder
-from rtloop.supervision.paths import refusal
+from rtloop.errors import writing
+from rtloop.hil.trusted import Untrusted, open_file
+from rtloop.supervision.paths import new_file, refusal
 
 LARGEST_BYTES = 1 << 20
 
@@ -64,24 +63,11 @@ _AS_JSON = TypeAdapter(Hardware)
 
 
 def keep(path: Path, hardware: Hardware) -> None:
-    """Write it to `path`, whole or not at all. Raises OutputError, HostRefused for a folder others may write to."""
-    try:
-        folder = open_folder(path.parent)
-        try:
-            with suppress(FileNotFoundError):
-                os.unlink(path.name, dir_fd=folder)
-            with suppress(FileNotFoundError):
-                os.unlink(f"{path.name}.new", dir_fd=folder)
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-            with open(os.open(f"{path.name}.new", flags, 0o600, dir_fd=folder), "wb") as file:
-                file.write(_AS_JSON.dump_json(hardware))
-            os.rename(f"{path.name}.new", path.name, src_dir_fd=folder, dst_dir_fd=folder)
-        finally:
-            os.close(folder)
-    except Untrusted as error:
-        raise refusal(error) from None
-    except OSError as error:
-        raise OutputError(f"{path}: cannot note the hardware: {error.strerror}") from None
+    """Write it to `path`. Raises OutputError, HostRefused for a folder that others may write to."""
+    what = "the note of the hardware"
+    with open(new_file(path, what), "wb") as file, writing(f"{path}: cannot make {what}"):
+        file.write(_AS_JSON.dump_json(hardware))
+        file.flush()
 
 
 def noted(path: Path) -> Hardware | None:

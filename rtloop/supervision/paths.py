@@ -53,8 +53,8 @@ def hardware_path(name: str) -> Path:
     return runtime_folder() / f"{name}.hardware"
 
 
-def new_block(path: Path) -> int:
-    """An empty file in place of an old one, which a process that still has it mapped keeps.
+def new_file(path: Path, what: str = "the shared block") -> int:
+    """An empty file in place of an old one, which a process that still has it mapped keeps; `what` is for the message.
 
     Raises OutputError, HostRefused for a folder that is not ours alone to write.
     """
@@ -69,7 +69,7 @@ def new_block(path: Path) -> int:
     except Untrusted as error:
         raise refusal(error) from None
     except OSError as error:
-        raise OutputError(f"{path}: cannot make the shared block: {error.strerror}") from None
+        raise OutputError(f"{path}: cannot make {what}: {error.strerror}") from None
 
 
 def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:

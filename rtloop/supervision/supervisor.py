@@ -30,7 +30,7 @@ from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
 from rtloop.supervision.host_delay import require_margins
 from rtloop.supervision.parking import park
-from rtloop.supervision.paths import new_block
+from rtloop.supervision.paths import new_file
 from rtloop.supervision.recorder_keeper import MODULE as RECORDER
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from rtloop.supervision.stall import StallWatch, stall_limit_s
@@ -71,7 +71,7 @@ class Processes:
 
     def __init__(self, block: Path | None = None) -> None:
         """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
-        self.fd = SharedBlock.reserve() if block is None else new_block(block)
+        self.fd = SharedBlock.reserve() if block is None else new_file(block)
         self.names = Names.create()
         self.loop = Child("rtloop.engine.process", self.fd)
         self.recorder = Child(RECORDER, self.fd, names=self.names.fd)
