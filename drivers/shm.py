@@ -5,6 +5,7 @@ Codes are 16 bit over ±10 V. The age of a sample is the time since the board to
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,9 +26,10 @@ from rtloop.hil.options import BoardOptions
 from rtloop.hil.trusted import open_file
 
 CONTEXT = np.dtype(
-    [(name, np.int64) for name in ("channels", "words", "sample_ns", "dac_codes", "fifo", "adc_codes")]
+    [(name, np.int64) for name in ("channels", "words", "sample_ns", "fifo", "adc_codes")]
     + [(name, np.int64) for name in ("copied", "held", "held_ns", "timespec")]
 )
+_WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 TRIES = 1000
 NO_SAMPLE = 1
 
@@ -66,18 +68,19 @@ def shm_read(context, values):
 
 @cfunc(SIGNATURE)
 def shm_write(context, values):
-    """Codes nearest to the volts, at the converters and in the card's record of its writes."""
+    """Codes nearest to the volts, and when they were written: the newest write is what stands at the converters."""
     card = carray(context, 1, CONTEXT)[0]
-    codes = carray(address_pointer(card.dac_codes), MAX_CHANNELS, np.int64)
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
-    fifo = carray(address_pointer(card.fifo), (FIFO, MAX_CHANNELS), np.int64)
+    fifo = carray(address_pointer(card.fifo), FIFO, board.WRITE)
     out = carray(values, card.channels)
     number = load_acquire(words, WRITTEN)
+    write, before = fifo[np.int64(number % np.uint64(FIFO))], fifo[np.int64((number - np.uint64(1)) % np.uint64(FIFO))]
     for i in range(card.channels):
         code = np.int64(np.rint(out[i] / LSB_V))
-        code = LOWEST_CODE if code < LOWEST_CODE else (HIGHEST_CODE if code > HIGHEST_CODE else code)
-        fifo[np.int64(number % np.uint64(FIFO)), i] = code
-        codes[i] = code
+        write.codes[i] = LOWEST_CODE if code < LOWEST_CODE else (HIGHEST_CODE if code > HIGHEST_CODE else code)
+    for i in range(card.channels, MAX_CHANNELS):
+        write.codes[i] = before.codes[i]
+    write.ns = monotonic_ns(card.timespec)
     store_release(words, WRITTEN, number + np.uint64(1))
     return 0
 
@@ -130,9 +133,8 @@ class ShmDriver(Driver):
         )
         context = np.zeros(1, CONTEXT)
         context["channels"], context["held_ns"] = len(self.wiring), -1
-        arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "dac_codes": memory.dac_codes,
-                  "fifo": memory.fifo, "adc_codes": memory.adc_codes, "copied": copied, "timespec": timespec,
-                  "held": held}  # fmt: skip
+        arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "fifo": memory.fifo,
+                  "adc_codes": memory.adc_codes, "copied": copied, "timespec": timespec, "held": held}  # fmt: skip
         for name, array in arrays.items():
             context[name] = array.ctypes.data
         self._arrays = context, copied, held, timespec
@@ -146,7 +148,9 @@ class ShmDriver(Driver):
     def close(self) -> None:
         """All outputs to 0 V, and the board free for another."""
         if self._fd is not None and self._memory is not None:
-            self._memory.dac_codes[:] = 0
+            context, safe = self._arrays[0], np.zeros(MAX_CHANNELS)
+            context["channels"] = MAX_CHANNELS
+            _WRITE(shm_write.address)(context.ctypes.data, safe.ctypes.data)
             self._memory, self._arrays = None, ()
             os.close(self._fd)
             self._fd = None

@@ -2,8 +2,8 @@
 
 The controller's side writes DAC codes and reads ADC codes; the board moves the rig at its own rate whether or not
 anybody writes, and holds the last codes like a card does. Samples can be dropped or repeated at random, as a bad link
-does; a seed makes that the same in every run. What it saw at its outputs (lowest, highest, largest step)
-is kept here: evidence that does not come from the process that is judged.
+does; a seed makes that the same in every run. The board stores what it saw at its outputs (`witness.py`): evidence
+that does not come from the process that is judged.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +26,10 @@ from rtloop.hil.options import BoardOptions
 from rtloop.hil.rig import advance, build_rig, sample
 from rtloop.hil.stages.noise import seed_word
 from rtloop.hil.trusted import open_file
+from rtloop.hil.witness import LEVELS, PAST, SEEN, move, see_write
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
-VERSION = 2
+VERSION = 3
 MAX_CHANNELS = 16
 BITS = 16
 FULL_SCALE_V = 10.0
@@ -39,26 +41,16 @@ BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
 """First in the file, written once."""
-WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS, DROPPED, REPEATED, WRITTEN, TAKEN, UNSEEN = 8, *range(8)
+WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS, DROPPED, REPEATED, WRITTEN, TAKEN, UNSEEN, LOOKED_NS = 9, *range(9)
 """uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, how late the board's own
 clock ever was (between two looks at its outputs lay at most so much more than its period), how many samples were
-dropped and repeated, how many writes there were, how many of them the board has looked at, and how many it came too
-late to see."""
+dropped and repeated, how many writes there were, how many of them the board has looked at, how many it came too
+late to see, and when it began its newest look, in ns of CLOCK_MONOTONIC."""
 FIFO = 1 << 14
-"""Writes that the card keeps until the board has seen them."""
+"""Writes that the card keeps until the board has seen them; the newest of them is what stands at the converters."""
+WRITE = np.dtype([("ns", np.int64), ("codes", np.int64, (MAX_CHANNELS,))])
+"""A write: its date in ns of CLOCK_MONOTONIC, taken by the driver as it writes, and the code of each channel."""
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
-SEEN = np.dtype(
-    [("lowest_v", np.float64), ("highest_v", np.float64), ("largest_step_v", np.float64), ("last_v", np.float64),
-     ("true_position_um", np.float64), ("largest_position_um", np.float64), ("moved_ns", np.int64),
-     ("looked_ns", np.int64), ("largest_rate_v_per_s", np.float64), ("written_v", np.float64),
-     ("largest_write_step_v", np.float64)]
-)  # fmt: skip
-"""What an output did; `moved_ns`: CLOCK_MONOTONIC when it last changed.
-
-`largest_rate_v_per_s` is the largest step over the time since the board looked before and two periods more: a ramp
-that moves by its slew once a period never exceeds its slew here, however late board or controller are.
-`largest_write_step_v` is the largest step from one write to the next, of all writes, however late the board sees them.
-"""
 LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
 """How often samples are lost, and the state of the chance that decides."""
 _SHIFTS = np.uint64(13), np.uint64(7), np.uint64(17)
@@ -66,7 +58,7 @@ _UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
 class BoardMemory:
-    """Arrays over a board's file: `facts`, `words`, `dac_codes`, `fifo`, `adc_codes`, `sample_ns`, `seen`."""
+    """Arrays over a board's file: `facts`, `words`, `fifo`, `adc_codes`, `sample_ns`, `seen`."""
 
     def __init__(self, fd: int) -> None:
         self._map = mmap.mmap(fd, file_bytes())
@@ -76,10 +68,15 @@ class BoardMemory:
             arrays[name] = np.frombuffer(self._map, dtype, count, offset)
             offset += _aligned(dtype.itemsize * count)
         self.facts, self.words, self.sample_ns = arrays["facts"], arrays["words"], arrays["sample_ns"]
-        self.dac_codes, self.adc_codes = arrays["dac_codes"], arrays["adc_codes"]
-        self.fifo = arrays["fifo"].reshape(FIFO, MAX_CHANNELS)
-        self.seen = arrays["seen"].view(np.recarray)
+        self.adc_codes = arrays["adc_codes"]
+        self.fifo, self.seen = arrays["fifo"].view(np.recarray), arrays["seen"].view(np.recarray)
         self._arrays = tuple(arrays.values())
+
+    @property
+    def dac_codes(self) -> np.ndarray[Any, Any]:
+        """Codes at the converters (MAX_CHANNELS,): those of the newest write; zeros before the first."""
+        written = int(self.words[WRITTEN])
+        return self.fifo[(written - 1) % FIFO]["codes"].copy() if written else np.zeros(MAX_CHANNELS, np.int64)
 
     def reset(self) -> None:
         """As a card is after it was switched on: outputs at 0 V, nothing seen."""
@@ -91,10 +88,9 @@ _LAYOUT: dict[str, tuple[np.dtype, int]] = {
     "facts": (FACTS, 1),
     "words": (np.dtype(np.uint64), WORDS),
     "sample_ns": (np.dtype(np.int64), 1),
-    "dac_codes": (np.dtype(np.int64), MAX_CHANNELS),
     "adc_codes": (np.dtype(np.int64), MAX_CHANNELS),
     "seen": (SEEN, MAX_CHANNELS),
-    "fifo": (np.dtype(np.int64), FIFO * MAX_CHANNELS),
+    "fifo": (WRITE, FIFO),
 }
 
 
@@ -134,8 +130,9 @@ def serve(
         losses = np.zeros(1, LOSSES).view(np.recarray)
         losses.word = seed_word(options.seed, "losses")
         losses.dropped_share, losses.repeated_share = options.dropped_share, options.repeated_share
-        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.dac_codes, memory.fifo,
-                     memory.adc_codes, memory.seen, losses, timespec.ctypes.data)  # fmt: skip
+        past = np.zeros((MAX_CHANNELS, LEVELS), PAST).view(np.recarray)
+        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.fifo, memory.adc_codes, memory.seen,
+                     past, losses, timespec.ctypes.data)  # fmt: skip
         _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
@@ -169,10 +166,10 @@ def _run(
     state,
     words,
     sample_ns,
-    dac_codes,
     fifo,
     adc_codes,
     seen,
+    past,
     losses,
     timespec,
     start_ns,
@@ -203,12 +200,9 @@ def _run(
         if dated and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
-        _read_fifo(words, fifo, dac_codes, seen, coefficients.shape[0])
-        look_ns = monotonic_ns(timespec)
+        _look_at_outputs(words, fifo, seen, past, coefficients.shape[0], fault != STUCK_OUTPUT, timespec)
         for i in range(coefficients.shape[0]):
-            volts = seen[i].last_v if fault == STUCK_OUTPUT else dac_codes[i] * LSB_V
-            _witness(seen[i], volts, look_ns, period_ns)
-            actuator_v[i] = volts
+            actuator_v[i] = seen[i].last_v
         advance(coefficients, state, actuator_v)
         index += 1
     return index
@@ -241,46 +235,32 @@ def _look(seen, state, index):
 
 
 @jit
-def _read_fifo(words, fifo, dac_codes, seen, channels):
-    """See every write that was not seen yet, and then what stands at the converters."""
-    written, taken = load_acquire(words, WRITTEN), words[TAKEN]
+def _look_at_outputs(words, fifo, seen, past, channels, follow, timespec):
+    """See the writes since the look before, and what the outputs are at; stuck outputs do not `follow`."""
+    began_ns = monotonic_ns(timespec)
+    written = load_acquire(words, WRITTEN)
+    now_ns = monotonic_ns(timespec)
+    see_writes(words, fifo, seen, past, channels, written, now_ns, follow)
+    words[LOOKED_NS] = np.uint64(began_ns)  # what `written` did not count yet was written after this
+    for i in range(channels):
+        if follow:
+            move(seen[i], seen[i].written_v, now_ns)
+
+
+@jit
+def see_writes(words, fifo, seen, past, channels, written, now_ns, follow):
+    """See every write up to number `written` that was not seen yet; all of them were made before `now_ns`."""
+    taken = words[TAKEN]
     if written - taken > np.uint64(FIFO):
         words[UNSEEN] += written - taken - np.uint64(FIFO)
         taken = written - np.uint64(FIFO)
     while taken < written:
+        write = fifo[np.int64(taken % np.uint64(FIFO))]
+        written_ns = min(max(write.ns, np.int64(words[LOOKED_NS])), now_ns)
         for i in range(channels):
-            _written(seen[i], fifo[np.int64(taken % np.uint64(FIFO)), i] * LSB_V)
+            words[UNSEEN] += np.uint64(see_write(seen[i], past[i], write.codes[i] * LSB_V, written_ns, follow))
         taken += np.uint64(1)
     words[TAKEN] = taken
-    for i in range(channels):
-        _written(seen[i], dac_codes[i] * LSB_V)
-
-
-@jit
-def _written(seen, volts):
-    step_v = abs(volts - seen.written_v)
-    if step_v > seen.largest_write_step_v:
-        seen.largest_write_step_v = step_v
-    seen.written_v = volts
-
-
-@jit
-def _witness(seen, volts, now_ns, period_ns):
-    """What the output did."""
-    step_v = abs(volts - seen.last_v)
-    if step_v > 0.0:
-        seen.moved_ns = now_ns
-        rate_v_per_s = step_v / ((now_ns - seen.looked_ns) * 1e-9 + 2e-9 * period_ns)
-        if rate_v_per_s > seen.largest_rate_v_per_s:
-            seen.largest_rate_v_per_s = rate_v_per_s
-    seen.looked_ns = now_ns
-    if step_v > seen.largest_step_v:
-        seen.largest_step_v = step_v
-    if volts < seen.lowest_v:
-        seen.lowest_v = volts
-    if volts > seen.highest_v:
-        seen.highest_v = volts
-    seen.last_v = volts
 
 
 @jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 
 from rich.console import Console
@@ -15,7 +16,8 @@ FAULTS = (
     *(*processes.FAULTS, *hardware.FAULTS, *storage.FAULTS),
     *(*requests.FAULTS, *clock.FAULTS, *outputs.FAULTS, *laws.FAULTS),
 )
-COLUMNS = ("fault", "what must happen", "safe after", "lost / executed", "largest |drive|, step (allowed)", "verdict")
+COLUMNS = ("fault", "what must happen", "safe after (host stalled)", "lost / executed",
+           "largest |drive|; step, change in 1 ms (allowed)", "verdict")  # fmt: skip
 
 LONGEST = 120
 """Characters of a problem in the table; all of it goes to stderr."""
@@ -25,9 +27,10 @@ def cells(row: Row) -> tuple[str, ...]:
     """A row as text."""
     measured, ticks = row.measured, row.account
     safe = "—" if measured.safe_ms is None else (
-        f"{measured.safe_ms:.1f} ms, {measured.safe_ms * row.rate_hz / 1000:.0f} ticks"
+        f"{measured.safe_ms:.1f} ms, {measured.safe_ms * row.bounds.rate_hz / 1000:.0f} ticks ({row.stalled_ms:.1f} ms)"
     )  # fmt: skip
-    drive = f"{row.largest_v:.2f} V, {row.step_v:.3f} V ({row.bound_v:.3f})"
+    step, window = f"{row.step_v:.3f} V ({row.bounds.step_v:.3f})", f"{row.window_v:.3f} V ({row.bounds.window_v:.3f})"
+    drive = f"{row.largest_v:.2f} V; {step}, {window}"
     verdict = f"not possible here: {row.skipped}" if row.skipped else ("holds" if not row.problems else "FAILS")
     notes = filter(None, (measured.note,))
     return (row.fault.name, row.fault.must, safe, f"{ticks.lost} / {ticks.executed}", drive,
@@ -38,7 +41,9 @@ def main() -> int:
     """All faults, or those whose name contains one of the words given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*")
-    words = parser.parse_args().words
+    parser.add_argument("--json", action="store_true", help="print names and problems alone")
+    given = parser.parse_args()
+    words = given.words
     chosen = [fault for fault in FAULTS if not words or any(word in fault.name for word in words)]
     rows = []
     for number, fault in enumerate(chosen, start=1):
@@ -46,6 +51,9 @@ def main() -> int:
         rows.append(measure(fault))
         if rows[-1].problems:
             print("   " + "\n   ".join(rows[-1].problems), file=sys.stderr, flush=True)
+    if given.json:
+        print(json.dumps([{"fault": row.fault.name, "problems": row.problems} for row in rows]))
+        return int(any(row.problems for row in rows))
     table = Table(*COLUMNS, title=f"{len(rows)} faults")
     for row in rows:
         table.add_row(*cells(row))

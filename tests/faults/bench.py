@@ -15,10 +15,11 @@ from rtloop.errors import RtloopError
 from rtloop.hil import board
 from rtloop.service.client import Client
 from tests.faults import plain_card
-from tests.faults.configuration import ROOT, on_a_board, on_a_card
+from tests.faults.configuration import ROOT, Bounds, on_a_board, on_a_card
 from tests.faults.evidence import TIMEOUT_S, Evidence, wait_for
+from tests.faults.host import HostWitness
 
-START_TIMEOUT_S = 120.0
+START_TIMEOUT_S = 240.0
 
 
 class Bench(Evidence):
@@ -39,7 +40,7 @@ class Bench(Evidence):
         self._with_board = board and not card
         self.config.write_text(text or (on_a_card if card else on_a_board)(folder, *changes))
         self.environment = os.environ | {
-            "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}",
+            "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), str(folder), os.environ.get("PYTHONPATH")])),
             "RUNTIME_DIRECTORY": str(folder / "run"),
             **(environment or {}),
         }
@@ -54,6 +55,7 @@ class Bench(Evidence):
             plain_card.install(folder)
 
     def __enter__(self) -> Bench:
+        self._host = HostWitness(self.folder)
         try:
             if self._with_board:
                 self.start_board()
@@ -64,6 +66,8 @@ class Bench(Evidence):
         return self
 
     def __exit__(self, *_: object) -> None:
+        assert self._host is not None
+        self._host.end()
         for block in self.blocks:
             for word in (Word.LOOP_PID, Word.RECORDER_PID):
                 if pid := block.load(word):
@@ -113,6 +117,16 @@ class Bench(Evidence):
         if role == "service":
             return self.service.pid
         return self.blocks[-1].load(Word.LOOP_PID if role == "rt" else Word.RECORDER_PID)
+
+    def service_pids(self) -> list[int]:
+        """This process, which strikes, the service, and the present loop."""
+        loops = [pid for block in self.blocks[-1:] if (pid := block.load(Word.LOOP_PID))]
+        return [os.getpid(), *([self.service.pid] if self.service else []), *loops]
+
+    @property
+    def bounds(self) -> Bounds:
+        """What the configuration, as it is now, allows the output."""
+        return Bounds.of(self.config.read_text(), self.resolution_v)
 
     def _end_child(self, pid: int) -> None:
         """End a loop or recorder of ours that still lives; its number may belong to somebody else by now."""

@@ -1,16 +1,25 @@
-"""Configurations of the fault suite: the paper's law, slower, with slew limits that bound every step of the outputs."""
+"""Configurations of the fault suite: the paper's law, slower, with slew limits that bound every step of the outputs.
+
+The loop runs with the slew limit of the ramps, so that whatever moves an output is held against `trip_slew_v_per_s`.
+"""
 
 from __future__ import annotations
 
+import math
+import tomllib
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = (ROOT / "deploy" / "paper.toml").read_text(encoding="utf-8")
 LAW = PAPER[PAPER.index("[axis.feedforward]") : PAPER.index("# [axis.prefilter]")]
 """Feed-forward, controller and model."""
 CONTROLLER = LAW[LAW.index("[axis.controller]") : LAW.index("# Eq (5)")]
-BOARD_RATE_HZ, CARD_RATE_HZ = 4000.0, 2000.0
-SLEW_V_PER_S, TRIP_SLEW_V_PER_S = 1000.0, 500.0
+BOARD_RATE_HZ = 4000.0
+SLEW_V_PER_S = 500.0
+WINDOW_S = 1e-3
+HELD_UP_STEPS = 2
+"""A write may be held up until the next is due, and comes with it: so many more steps within a window."""
 
 BOARD = """
 [loop]
@@ -57,7 +66,7 @@ poles = [[-200.0, 0.0]]
 LIMITS = f"""
 [axis.limits]
 slew_v_per_s = {SLEW_V_PER_S}
-trip_slew_v_per_s = {TRIP_SLEW_V_PER_S}
+trip_slew_v_per_s = {SLEW_V_PER_S}
 [axis.interlocks]
 position_um = 60.0
 sample_age_us = 400000.0
@@ -74,6 +83,25 @@ frequency_hz = 5.0
 folder = "{{folder}}/recordings"
 min_free_mib = 0.0
 """
+
+
+class Bounds(NamedTuple):
+    """What a configuration allows its output: a step from one write to the next, and a change within WINDOW_S."""
+
+    rate_hz: float
+    step_v: float
+    window_v: float
+
+    @staticmethod
+    def of(text: str, resolution_v: float) -> Bounds:
+        """Bounds from a configuration's text; a voltage may be off by half of `resolution_v`."""
+        configuration = tomllib.loads(text)
+        (axis,), rate_hz = configuration["axis"], float(configuration["loop"]["rate_hz"])
+        limits = axis["limits"]
+        assert limits["slew_v_per_s"] <= limits["trip_slew_v_per_s"], "the running loop may move faster than a ramp"
+        step_v = limits["trip_slew_v_per_s"] / rate_hz
+        steps = math.ceil(WINDOW_S * rate_hz) + HELD_UP_STEPS
+        return Bounds(rate_hz, step_v + resolution_v, steps * step_v + resolution_v)
 
 
 def on_a_board(folder: Path, *changes: tuple[str, str]) -> str:

@@ -10,7 +10,7 @@ from rtloop.errors import RtloopError
 from tests.faults.bench import Bench
 from tests.faults.configuration import CONTROLLER
 from tests.faults.fault import Fault, Measured
-from tests.faults.hardware import STALL_MS
+from tests.faults.processes import STOPPED_SAFE_MS
 from tests.laws.failing import ENDLESS, ENDLESS_UM
 
 NAME = "endless.py"
@@ -33,7 +33,7 @@ def never_ends(bench: Bench) -> Measured:
             bench.client.post("/setpoint", {"axis": "x", "value": ENDLESS_UM + 1.0})
 
     bench.strike(ask)
-    took_ms = bench.await_safe(STALL_MS)
+    took_ms = bench.await_safe(STOPPED_SAFE_MS)
     bench.await_restart()
     assert bench.await_state("tripped")["faults"]
     assert bench.pid("rt") != loop

@@ -15,10 +15,14 @@ from rtloop.drivers.python import PythonDriver
 from rtloop.hil.options import Options
 
 NONE, NAN, RAISE_IN_READ, RAISE_IN_WRITE, BLOCK_50_MS, BLOCK, ENABLE_OPEN = range(7)
+LEVELS, WINDOW_NS = 64, 1_000_000
+RESOLUTION_V = 1e-9
 MEMORY = np.dtype(
     [("fault", np.int64), ("position_um", np.float64), ("last_v", np.float64), ("lowest_v", np.float64),
-     ("highest_v", np.float64), ("largest_step_v", np.float64), ("moved_ns", np.int64)]
+     ("highest_v", np.float64), ("largest_step_v", np.float64), ("largest_window_v", np.float64),
+     ("moved_ns", np.int64), ("levels", np.int64), ("level_v", np.float64, LEVELS), ("level_ns", np.int64, LEVELS)]
 )  # fmt: skip
+"""`level_v` and `level_ns`: voltages that the output had last, number i at i modulo LEVELS, and since when."""
 UM_PER_V, LAG = 4.3, 0.1
 
 
@@ -59,13 +63,24 @@ class PlainCard(PythonDriver):
         if memory["fault"] == RAISE_IN_WRITE:
             memory["fault"] = NONE
             raise OSError("the card refuses")
-        step_v = abs(volts[0] - memory["last_v"])
-        if step_v:
-            memory["moved_ns"] = time.monotonic_ns()
-        memory["largest_step_v"] = max(memory["largest_step_v"], step_v)
+        if volts[0] == memory["last_v"]:
+            return
+        memory["moved_ns"] = time.monotonic_ns()
+        self._judge(volts[0], int(memory["moved_ns"]))
         memory["lowest_v"] = min(memory["lowest_v"], volts[0])
         memory["highest_v"] = max(memory["highest_v"], volts[0])
         memory["last_v"] = volts[0]
+
+    def _judge(self, volts: float, now_ns: int) -> None:
+        """Compare with the voltages of the last millisecond; one is left when the next begins."""
+        memory, newest = self.memory, int(self.memory["levels"])
+        memory["largest_step_v"] = max(memory["largest_step_v"], abs(volts - memory["last_v"]))
+        for i in range(newest, max(newest - LEVELS, -1), -1):
+            memory["largest_window_v"] = max(memory["largest_window_v"], abs(volts - memory["level_v"][i % LEVELS]))
+            if now_ns - memory["level_ns"][i % LEVELS] > WINDOW_NS:
+                break
+        memory["levels"] = newest + 1
+        memory["level_v"][(newest + 1) % LEVELS], memory["level_ns"][(newest + 1) % LEVELS] = volts, now_ns
 
     def stop(self) -> None:
         pass

@@ -24,8 +24,6 @@ from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 
 SMALL, LARGE = "size=900k", "size=64m"
-SAID_S = 5.0
-"""A failure is found when a chunk is written, and a new file tried at every snapshot: both about once a second."""
 ROUNDS = 1.4
 
 
@@ -43,9 +41,9 @@ def small_disk(folder: Path) -> Iterator[None]:
         subprocess.run(["umount", "--lazy", str(recordings)], check=True)
 
 
-def await_recording(bench: Bench, state: str, timeout_s: float = SAID_S) -> dict[str, Any]:
+def await_recording(bench: Bench, state: str) -> dict[str, Any]:
     """What status says of the recording, once it is in `state`, for a second more; the metrics say the same."""
-    wait_for(lambda: bench.status()["recording"]["state"] == state, state, timeout_s)
+    wait_for(lambda: bench.status()["recording"]["state"] == state, state)
     ticks = bench.ticks
     wait_for(lambda: bench.ticks > ticks + 4000, "another second")
     families = {family.name: family for family in text_string_to_metric_families(bench.client.get("/metrics"))}
@@ -63,7 +61,7 @@ def await_recording(bench: Bench, state: str, timeout_s: float = SAID_S) -> dict
 
 def disk_full(bench: Bench) -> Measured:
     bench.strike()
-    said = await_recording(bench, "not recording", 60.0)
+    said = await_recording(bench, "not recording")
     assert said["reason"] == "No space left on device"
     return Measured(lost_allowed=True, exit_code=1, note="the loop goes on; said at once and at the end")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import grp
 import json
+import math
 import os
 import pwd
 import re
@@ -23,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.file import load
-from rtloop.hil.board import LSB_V, BoardMemory
+from rtloop.hil.board import LSB_V, UNSEEN, BoardMemory
+from rtloop.hil.witness import WINDOW_NS
 
 UNIT, BOARD, PANEL = "rtloop@board.service", "rtloop-board@board.service", "rtloop-panel@board.service"
 PAGE = "http://127.0.0.1:8321"
@@ -35,6 +37,7 @@ LOOP, RECORDER = "rtloop.engine.process", "rtloop.recording.capture.recorder"
 HOST_STALL_S = 2.0
 """What is allowed on top of every stated time."""
 EXPOSURE_LIMIT = 2.0
+TRIP_SLEW = "trip_slew_v_per_s = 1000.0"
 
 
 class Failed(Exception):
@@ -96,7 +99,8 @@ class Board:
     def __init__(self) -> None:
         options: Any = load(CONFIG).driver_options
         fd = os.open(options.file, os.O_RDWR)
-        self.seen = BoardMemory(fd).seen
+        self.memory = BoardMemory(fd)
+        self.seen = self.memory.seen
         os.close(fd)
 
     @property
@@ -185,6 +189,14 @@ def not_ready_without_ticks() -> str:
     run("systemctl", "reset-failed", UNIT, ok=False)
     require(done.returncode != 0 and state != "active", f"start returned {done.returncode}, the unit was {state}")
     return "start refused: " + journal.await_text(r"\S+: [^:\n]+; start the board with.*")
+
+
+def limited_slew() -> str:
+    """Let the loop move no faster than a ramp: without a limit it follows its controller, by half a volt a tick."""
+    text = CONFIG.read_text()
+    require(text.count(TRIP_SLEW) == 1 and "\nslew_v_per_s" not in text, f"{CONFIG} has other limits")
+    CONFIG.write_text(text.replace(TRIP_SLEW, f"{TRIP_SLEW}\nslew_v_per_s = 1000.0"))
+    return "1000 V/s, as the ramps have"
 
 
 def active_by_notify() -> str:
@@ -392,13 +404,20 @@ def replays() -> str:
 
 
 def outputs_seen() -> str:
-    seen, slew = Board().seen[0], load(CONFIG).axes[0].limits.trip_slew_v_per_s
-    rate = seen.largest_rate_v_per_s
+    """Every write of the session, whoever made it: `limited_slew` lets the running loop move no faster than a ramp."""
+    board, configuration = Board(), load(CONFIG)
+    seen, rate_hz = board.seen[0], configuration.loop.rate_hz
+    unseen = int(board.memory.words[UNSEEN])
+    require(unseen == 0, f"{unseen} writes that the board came too late to see")
     require(seen.lowest_v >= -10.0 and seen.highest_v <= 10.0, f"{seen.lowest_v} … {seen.highest_v} V")
-    # one code of the DAC within the two periods of grace
-    allowed = slew + LSB_V * load(CONFIG).loop.rate_hz / 2
-    require(rate <= allowed, f"{rate:.0f} V/s; {allowed:.0f} V/s are allowed (a step of {seen.largest_step_v:.3f} V)")
-    return f"{seen.lowest_v:.3f} … {seen.highest_v:.3f} V, at most {rate:.0f} V/s (allowed {allowed:.0f})"
+    step_v = configuration.axes[0].limits.trip_slew_v_per_s / rate_hz
+    steps = math.ceil(WINDOW_NS * 1e-9 * rate_hz) + 2  # a write may be held up until the next one, and come with it
+    moved = (seen.largest_step_v, 1, "from one write to the next"), (seen.largest_window_v, steps, "within 1 ms")
+    for change_v, count, where in moved:
+        allowed_v = count * step_v + LSB_V
+        require(change_v <= allowed_v, f"{change_v:.4f} V {where}; allowed: {allowed_v:.4f} V")
+    said = f"{seen.largest_step_v:.3f} V a write, {seen.largest_window_v:.3f} V within 1 ms"
+    return f"{seen.lowest_v:.3f} … {seen.highest_v:.3f} V, at most {said} (allowed {step_v:.3f}, {steps * step_v:.3f})"
 
 
 def exposure() -> str:
@@ -438,6 +457,7 @@ def _left_over() -> list[str]:
 
 CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
     ("not READY where no tick can run", not_ready_without_ticks),
+    ("running slew limited", limited_slew),
     ("active by notify", active_by_notify),
     ("own user, FIFO and mlock granted", user_and_realtime),
     ("control socket 0660", socket_permissions),

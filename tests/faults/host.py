@@ -1,0 +1,94 @@
+"""How long the host kept processes waiting: a witness beside the service, at its priority, one a processor.
+
+A bound on a time holds for a host that runs its processes. What the host took is measured, and allowed on top:
+
+    stolen     a witness that asked to sleep for PERIOD_S woke later, and had not been waiting for its processor:
+               the whole machine stood still. Spans of several processors that overlap count once.
+    waited     the kernel's own account (schedstat) of how long the threads of a process were ready and not run
+
+A process that sleeps, or waits for something else, adds to neither.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+PERIOD_S, LEAST_S = 0.005, 0.0005
+"""How often a witness wakes, and the shortest delay that it notes."""
+SPANS, SPAN_BYTES = 1 << 14, 16
+NS_PER_S, NS_PER_MS = 1e9, 1e6
+
+
+def waited_ns(pid: int) -> int:
+    """ns that the threads of a process were ready to run and not run; 0 of one that is gone."""
+    total = 0
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            with suppress(OSError):
+                total += int((task / "schedstat").read_text().split()[1])
+    return total
+
+
+def overlapping_ns(spans: list[tuple[int, int]], from_ns: int, to_ns: int) -> int:
+    """Length of the union of `spans`, as far as it lies between two times."""
+    total, reached = 0, from_ns
+    for begin_ns, end_ns in sorted(spans):
+        begin_ns, end_ns = max(begin_ns, reached), min(end_ns, to_ns)
+        if end_ns > begin_ns:
+            total, reached = total + end_ns - begin_ns, end_ns
+    return total
+
+
+class HostWitness:
+    """Witness processes, one for each processor that this process may use; `end` ends them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files, self._processes = [], []
+        for cpu in sorted(os.sched_getaffinity(0)):
+            path = folder / f"host-{cpu}"
+            path.write_bytes(bytes(SPAN_BYTES * (SPANS + 1)))
+            self._files.append(_numbers(path))
+            self._processes.append(subprocess.Popen([sys.executable, "-S", __file__, str(path), str(cpu)]))
+
+    def stolen_ms(self, from_ns: int, to_ns: int) -> float:
+        """ms within which the host stood still, between two times of CLOCK_MONOTONIC."""
+        spans = [(file[2 * i], file[2 * i + 1]) for file in self._files for i in range(1, file[0] + 1)]
+        return overlapping_ns(spans, from_ns, to_ns) / NS_PER_MS
+
+    def end(self) -> None:
+        """End the witnesses."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+
+def _numbers(path: Path) -> memoryview:
+    """A file as int64: how many spans, nothing, then the begin and the end of each in ns of CLOCK_MONOTONIC."""
+    with path.open("r+b") as file:
+        return memoryview(mmap.mmap(file.fileno(), 0)).cast("q")
+
+
+def watch(path: Path, cpu: int) -> None:
+    """Be the witness of one processor, as long as the process that asked for it lives."""
+    os.sched_setaffinity(0, {cpu})
+    file, parent = _numbers(path), os.getppid()
+    slept_ns, count, own = time.monotonic_ns(), 0, waited_ns(os.getpid())
+    while os.getppid() == parent and count < SPANS:
+        time.sleep(PERIOD_S)
+        now_ns, before, own = time.monotonic_ns(), own, waited_ns(os.getpid())
+        late_ns = now_ns - slept_ns - round(PERIOD_S * NS_PER_S) - (own - before)
+        if late_ns > LEAST_S * NS_PER_S:
+            count += 1
+            file[2 * count], file[2 * count + 1] = now_ns - late_ns, now_ns
+            file[0] = count
+        slept_ns = time.monotonic_ns()
+
+
+if __name__ == "__main__":
+    watch(Path(sys.argv[1]), int(sys.argv[2]))

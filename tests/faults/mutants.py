@@ -1,0 +1,89 @@
+"""Can the table of faults fail? `make faults-mutants` plants one mistake at a time and runs the rows that it concerns.
+
+Every mistake must make at least one of its rows fail, with a problem that names the mistake's effect; without one, none
+of these rows may fail. Exit code 0 if that is so. The mistakes are put in as the modules are loaded (`planting/`): the
+tree stays as it is, and nothing is compiled anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+PLANTING = Path(__file__).with_name("planting")
+PARKED, STUCK = "loop SIGKILL, no restart", "loop SIGSTOP"
+STOPPED, CARD = "SIGTERM under drive", "driver blocks for good"
+STEEP, LATE = r"a step of|within 1 ms", r"safe after"
+RAMP, SUPERVISOR = "rtloop.engine.ramp", "rtloop.supervision.supervisor"
+
+
+class Mutant(NamedTuple):
+    """A mistake: `old` text of `module` replaced by `new`; `effect` is a pattern of the problems that it causes."""
+
+    name: str
+    module: str
+    old: str
+    new: str
+    effect: str
+    rows: tuple[str, ...]
+
+
+MUTANTS = (
+    Mutant("a ramp that does not wait between its steps", RAMP,
+           "def _wait(until_s: float) -> None:\n", "def _wait(until_s: float) -> None:\n    return\n",
+           STEEP, (PARKED, CARD)),
+    Mutant("a ramp 2.1 times as steep, by larger steps", RAMP,
+           "slew_v_per_s * period_s)", "2.1 * slew_v_per_s * period_s)", STEEP, (PARKED, CARD)),
+    Mutant("a ramp 2.1 times as steep, by shorter waits", RAMP,
+           "_wait(time.monotonic() + period_s)", "_wait(time.monotonic() + period_s / 2.1)", STEEP, (PARKED,)),
+    Mutant("a loop's own ramp 2.1 times as steep", "rtloop.configuration.coefficients",
+           "options.trip_slew_v_per_s * period_s", "2.1 * options.trip_slew_v_per_s * period_s", STEEP, (STOPPED,)),
+    Mutant("a service that notices a dead or stuck loop 850 ms late", SUPERVISOR,
+           '    def _end(self) -> None:\n        """Park first, if the loop died; then let the recorder finish."""\n',
+           "    def _end(self) -> None:\n        time.sleep(0.85)\n", LATE, (PARKED, STUCK)),
+    Mutant("a parking that steps the last 0.2 V", RAMP,
+           "now_v = np.clip(safe_v, now_v - step_v, now_v + step_v)",
+           "now_v = np.where(np.abs(safe_v - now_v) <= 0.2, safe_v, np.clip(safe_v, now_v - step_v, now_v + step_v))",
+           STEEP, (PARKED, CARD)),
+    Mutant("a driver's close that writes 0 V at once in place of the ramp", RAMP,
+           "    write, period_s = _WRITE(", "    return\n    write, period_s = _WRITE(", STEEP, (PARKED, CARD)),
+)  # fmt: skip
+
+
+def failures(rows: tuple[str, ...], mutant: Mutant | None) -> dict[str, list[str]]:
+    """Rows that fail, and their problems, with a mistake planted or, for None, without one."""
+    environment = dict(os.environ)
+    if mutant is not None:
+        environment |= {"PYTHONPATH": os.pathsep.join([str(PLANTING), environment.get("PYTHONPATH", "")]),
+                        "RTLOOP_PLANTED_MODULE": mutant.module, "RTLOOP_PLANTED_OLD": mutant.old,
+                        "RTLOOP_PLANTED_NEW": mutant.new}  # fmt: skip
+    command = [sys.executable, "-m", "tests.faults", "--json", *rows]
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    measured = json.loads(done.stdout)
+    unlike = sorted(set(rows) ^ {row["fault"] for row in measured})
+    assert not unlike, f"rows {unlike} were asked for or measured, not both"
+    return {row["fault"]: row["problems"] for row in measured if row["problems"]}
+
+
+def main() -> int:
+    """Print which rows each mistake makes fail."""
+    every = tuple(dict.fromkeys(row for mutant in MUTANTS for row in mutant.rows))
+    found = failures(every, None)
+    print(f"without a mistake: {'; '.join(f'{row}: {problems}' for row, problems in found.items()) or 'all hold'}")
+    held = not found
+    for mutant in MUTANTS:
+        noticed = {row: [problem for problem in problems if re.search(mutant.effect, problem)]
+                   for row, problems in failures(mutant.rows, mutant).items()}  # fmt: skip
+        said = [f"{row}: {problems[0]}" for row, problems in noticed.items() if problems]
+        print(f"{mutant.name} → {'; '.join(said) or 'NOT NOTICED'}", flush=True)
+        held = held and bool(said)
+    return int(not held)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

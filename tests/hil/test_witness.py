@@ -1,0 +1,130 @@
+"""What a board says of its outputs, beside the same found by hand from all pairs of voltages and times.
+
+Times are made up: no process and no clock takes part. The writer's true times are known here and nowhere in the board.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtloop.hil.board import FIFO, LOOKED_NS, LSB_V, MAX_CHANNELS, TAKEN, UNSEEN, WORDS, WRITE, WRITTEN, see_writes
+from rtloop.hil.witness import LEVELS, PAST, SEEN
+
+WINDOW_NS, BEGIN_NS = 1_000_000, 10**12
+
+
+class Card:
+    """A card's memory, and a board that looks into it at times that a test names."""
+
+    def __init__(self) -> None:
+        self.words = np.zeros(WORDS, np.uint64)
+        self.fifo = np.zeros(FIFO, WRITE).view(np.recarray)
+        self.seen = np.zeros(MAX_CHANNELS, SEEN).view(np.recarray)
+        self.past = np.zeros((MAX_CHANNELS, LEVELS), PAST).view(np.recarray)
+
+    def write(self, code: int, stated_ns: int) -> None:
+        number = int(self.words[WRITTEN])
+        self.fifo[number % FIFO].ns, self.fifo[number % FIFO].codes[0] = stated_ns, code
+        self.words[WRITTEN] += np.uint64(1)
+
+    def look(self, now_ns: int) -> None:
+        see_writes(self.words, self.fifo, self.seen, self.past, 1, self.words[WRITTEN], now_ns, True)
+        self.words[LOOKED_NS] = now_ns
+
+    def run(self, codes: np.ndarray, true_ns: np.ndarray, look_ns: np.ndarray, stated_ns: np.ndarray) -> None:
+        """Writes and looks in the order of their true times; a last look after all."""
+        done = 0
+        for now_ns in (*look_ns, max(true_ns[-1], look_ns[-1]) + 1):
+            while done < len(codes) and true_ns[done] < now_ns:
+                self.write(codes[done], stated_ns[done])
+                done += 1
+            self.look(int(now_ns))
+
+    @property
+    def evidence(self) -> tuple[float, float, float, float]:
+        """Largest step, largest change within a window, lowest and highest voltage."""
+        seen = self.seen[0]
+        return seen.largest_step_v, seen.largest_window_v, seen.lowest_v, seen.highest_v
+
+
+def by_all_pairs(codes: np.ndarray, true_ns: np.ndarray) -> tuple[float, float, float, float]:
+    """The same by definition: 0 V for ever, then each voltage until the next; pairs that a window's length joins."""
+    moved = np.flatnonzero(np.diff(codes, prepend=0) != 0)  # a voltage that is written again is one voltage
+    volts = np.concatenate([[0.0], codes[moved] * LSB_V])
+    begin_ns, end_ns = np.concatenate([[0], true_ns[moved]]), np.concatenate([true_ns[moved], [2**62]])
+    apart_ns = begin_ns[None, :] - end_ns[:, None]  # of the later one's begin and the earlier one's end
+    joined = np.triu(np.ones((len(volts), len(volts)), bool), 1) & (apart_ns <= WINDOW_NS)
+    change_v = np.abs(volts[None, :] - volts[:, None])
+    return np.max(np.abs(np.diff(volts))), np.max(change_v[joined]), volts.min(), volts.max()
+
+
+def writes(chance: np.random.Generator, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Codes and times: ramps, noise and jumps, some in bursts and some after a pause, one in ten of no change."""
+    kinds = chance.integers(0, 3, count)
+    noise, jumps = chance.integers(-40, 41, count), chance.integers(-9000, 9001, count)
+    change = np.choose(kinds, [noise, np.full(count, -300), jumps])
+    change[chance.random(count) < 0.1] = 0
+    codes = np.clip(np.cumsum(change), -32768, 32767)
+    gaps_ns = np.choose(chance.integers(0, 3, count),
+                        [chance.integers(1, 3000, count), chance.integers(50_000, 500_000, count),
+                         chance.integers(900_000, 1_100_000, count)])  # fmt: skip
+    return codes, BEGIN_NS + np.cumsum(gaps_ns)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("look_period_ns", [125_000, 3_000_000, 50_000_000, 10**12])
+def test_steps_and_windows_are_right_however_rarely_the_board_looks(seed, look_period_ns):
+    chance = np.random.default_rng(seed)
+    codes, true_ns = writes(chance)
+    look_ns = np.arange(BEGIN_NS, true_ns[-1] + 2 * look_period_ns, look_period_ns)
+    card = Card()
+    card.run(codes, true_ns, look_ns, true_ns)
+    assert card.evidence == by_all_pairs(codes, true_ns)
+    assert card.words[UNSEEN] == 0
+    assert card.words[TAKEN] == len(codes)
+    assert card.seen[0].moved_ns == true_ns[np.flatnonzero(np.diff(codes))[-1] + 1]
+
+
+def test_a_controller_cannot_spread_its_writes_over_time_by_their_dates():
+    """Sixteen steps within 16 µs, dated a millisecond apart, before or after the truth: each look bounds the dates."""
+    codes, true_ns = -300 * np.arange(1, 17), BEGIN_NS + 1000 * np.arange(16)
+    for dates_ns in (BEGIN_NS + 2_000_000 * np.arange(16), BEGIN_NS - 2_000_000 * np.arange(16)[::-1], 0 * true_ns):
+        card = Card()
+        card.run(codes, true_ns, np.arange(BEGIN_NS - 250_000, BEGIN_NS + 250_000, 125_000), dates_ns)
+        assert card.evidence[1] == 16 * 300 * LSB_V
+
+
+def test_a_write_that_was_held_up_after_it_was_dated_is_no_steeper_for_it():
+    """A period of 250 µs between each write and the next date; one write takes effect 2 ms after its date."""
+    period_ns, held_up_ns = 250_000, 2_000_000
+    stated_ns = BEGIN_NS + period_ns * np.arange(40) + held_up_ns * (np.arange(40) > 20)
+    true_ns = stated_ns + 100
+    true_ns[20] += held_up_ns
+    card = Card()
+    card.run(-409 * np.arange(1, 41), true_ns, np.arange(BEGIN_NS, true_ns[-1], 125_000), stated_ns)
+    assert card.evidence[1] <= 5 * 409 * LSB_V + 1e-12
+
+
+def test_more_writes_within_a_window_than_are_remembered_are_said_to_be_unseen():
+    card = Card()
+    for number in range(LEVELS + 10):
+        card.write(number % 2 + 1, BEGIN_NS + 2_000_000 + number)
+    card.look(BEGIN_NS + 10_000_000)
+    assert card.words[UNSEEN] == 10
+
+
+def test_writes_that_the_card_could_not_keep_are_said_to_be_unseen():
+    card = Card()
+    for number in range(FIFO + 5):
+        card.write(number % 2, BEGIN_NS + number)
+    card.look(BEGIN_NS + FIFO + 10)
+    assert card.words[UNSEEN] >= 5
+
+
+def test_a_stuck_output_stays_while_its_writes_are_judged():
+    card = Card()
+    card.write(1000, BEGIN_NS + 5)
+    see_writes(card.words, card.fifo, card.seen, card.past, 1, card.words[WRITTEN], BEGIN_NS + 10, False)
+    assert (card.seen[0].last_v, card.seen[0].moved_ns) == (0.0, 0)
+    assert card.seen[0].largest_window_v == 1000 * LSB_V
