@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator
@@ -75,7 +76,7 @@ def measure(fault: Fault) -> Row:
                 _judge(row, bench)
         except NotPossible as reason:
             row.skipped = str(reason)
-        except (AssertionError, RtloopError) as error:
+        except (AssertionError, RtloopError, subprocess.TimeoutExpired) as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             row.problems.append(str(error) or f"{where.name}: {where.line}")
     return row

@@ -71,12 +71,14 @@ def failures(rows: tuple[str, ...], mutant: Mutant | None) -> dict[str, list[str
 
 
 def main() -> int:
-    """Print which rows each mistake makes fail."""
-    every = tuple(dict.fromkeys(row for mutant in MUTANTS for row in mutant.rows))
+    """Print which rows each mistake makes fail: all mistakes, or those whose name contains one of the words given."""
+    words = sys.argv[1:]
+    mutants = [mutant for mutant in MUTANTS if not words or any(word in mutant.name for word in words)]
+    every = tuple(dict.fromkeys(row for mutant in mutants for row in mutant.rows))
     found = failures(every, None)
     print(f"without a mistake: {'; '.join(f'{row}: {problems}' for row, problems in found.items()) or 'all hold'}")
     held = not found
-    for mutant in MUTANTS:
+    for mutant in mutants:
         noticed = {row: [problem for problem in problems if re.search(mutant.effect, problem)]
                    for row, problems in failures(mutant.rows, mutant).items()}  # fmt: skip
         said = [f"{row}: {problems[0]}" for row, problems in noticed.items() if problems]

@@ -21,7 +21,7 @@ from rtloop.engine.ramp import ramp
 from rtloop.hil.board import LSB_V
 from rtloop.supervision.parking import park
 from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
+from tests.faults.evidence import TIMEOUT_S, wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 from tests.faults.processes import KILLED_SAFE_MS
 from tests.faults.requests import is_refused
@@ -42,11 +42,11 @@ def parked_again(bench: Bench) -> Measured:
     bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
     assert bench.service is not None
     bench.service.wait()
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     took_ms = bench.await_safe()  # no bound: an interpreter must start
     moved_ns = bench.seen().moved_ns
     for _ in range(2):
-        assert bench.rtloop("park", bench.config).wait(60.0) == 0
+        assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     assert bench.seen().moved_ns == moved_ns, "the output moved again"
     bench.config.write_text(text)
     bench.start_service()
@@ -67,10 +67,10 @@ def forged_block(bench: Bench) -> Measured:
     with path.open("r+b") as file:
         SharedBlock(file.fileno())["last_drive_v"][0] = FORGED_V
     os.chown(path, STRANGER, STRANGER)
-    assert bench.rtloop("park", bench.config).wait(60.0) != 0, "the block of another user was believed"
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) != 0, "the block of another user was believed"
     assert bench.seen().last_v == before_v, "an output moved"
     path.unlink()
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     took_ms = bench.await_safe()  # no bound: an interpreter must start
     bench.start_service()
     bench.await_drive()
@@ -82,9 +82,9 @@ def parked_by_the_service_and_after_it(bench: Bench) -> Measured:
     bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
     took_ms = bench.await_safe(KILLED_SAFE_MS)
     assert bench.service is not None
-    bench.service.wait(60.0)
+    bench.service.wait(TIMEOUT_S)
     moved_ns = bench.seen().moved_ns
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     assert bench.seen().moved_ns == moved_ns, "the output moved again"
     return Measured(took_ms, exit_code=1)
 
@@ -96,8 +96,8 @@ def ended_while_it_parks(bench: Bench) -> Measured:
     )
     took_ms = bench.await_safe(KILLED_SAFE_MS)
     assert bench.service is not None
-    bench.service.wait(60.0)
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    bench.service.wait(TIMEOUT_S)
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     return Measured(took_ms, exit_code=1)
 
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 from rtloop.errors import RtloopError
 from rtloop.hil import board
 from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
+from tests.faults.evidence import TIMEOUT_S, wait_for
 
 WITHIN_S, UNDONE_S = 0.05, 0.5
 SAFE_MS = 8000.0
@@ -103,11 +103,11 @@ def sequence(bench: Bench, chance: random.Random) -> tuple[str, float]:
     assert bench.service is not None
     if bench.service.poll() is None:
         bench.service.terminate()
-        wait_for(lambda: bench.service is None or bench.service.poll() is not None, "the service's end", 60.0)
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0, bench.log()[-600:]
+        wait_for(lambda: bench.service is None or bench.service.poll() is not None, "the service's end")
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0, bench.log()[-600:]
     took_ms = bench.await_safe(SAFE_MS) if bench.seen().moved_ns > bench.struck_ns else 0.0
     moved_ns = bench.seen().moved_ns
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     assert bench.seen().moved_ns == moved_ns, "it moved again"
     assert bench.seen().last_v == 0.0, f"the output is at {bench.seen().last_v} V"
     return f"{first.name}, after {1000 * delay_s:.0f} ms {second.name}", took_ms

@@ -6,7 +6,7 @@ import os
 import signal
 
 from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
+from tests.faults.evidence import TIMEOUT_S, wait_for
 from tests.faults.fault import Fault, Measured
 
 KILLED_SAFE_MS = 100.0
@@ -35,7 +35,7 @@ def service_killed(bench: Bench) -> Measured:
     took_ms = bench.await_safe(ORPHAN_SAFE_MS)
     assert bench.service is not None
     bench.service.wait()
-    assert bench.rtloop("park", bench.config).wait(60.0) == 0
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     assert bench.seen().last_v == 0.0
     bench.start_service()
     bench.await_drive()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rtloop.errors import RtloopError
 from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
+from tests.faults.evidence import TIMEOUT_S, wait_for
 from tests.faults.fault import Fault, Measured
 from tests.service.hostile import EXPENSIVE, hostile
 from tests.service.http import exchange
@@ -132,11 +132,11 @@ def second_instance(bench: Bench) -> Measured:
     other.write_text(bench.config.read_text().replace("[recording]", "[service]\nrestarts = 0\n[recording]")
                      .replace("/recordings", "/others"))  # fmt: skip
     bench.strike()
-    codes = [bench.rtloop("serve", config).wait(120.0) for config in (bench.config, other)]
+    codes = [bench.rtloop("serve", config).wait(TIMEOUT_S) for config in (bench.config, other)]
     assert codes == [69, 69], codes
     assert "another service listens there" in bench.log()
     assert "another controller drives this board" in bench.log()
-    assert bench.rtloop("park", bench.config).wait(60.0) != 0
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) != 0
     assert bench.status()["state"] == "running"
     assert bench.status()["restarts"] == 0
     return Measured()
