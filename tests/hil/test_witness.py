@@ -48,10 +48,10 @@ class Card:
         return seen.largest_step_v, seen.largest_window_v, seen.lowest_v, seen.highest_v
 
 
-def by_all_pairs(codes: np.ndarray, true_ns: np.ndarray) -> tuple[float, float, float, float]:
+def by_all_pairs(written_v: np.ndarray, true_ns: np.ndarray) -> tuple[float, float, float, float]:
     """The same by definition: 0 V for ever, then each voltage until the next; pairs that a window's length joins."""
-    moved = np.flatnonzero(np.diff(codes, prepend=0) != 0)  # a voltage that is written again is one voltage
-    volts = np.concatenate([[0.0], codes[moved] * LSB_V])
+    moved = np.flatnonzero(np.diff(written_v, prepend=0.0) != 0)  # a voltage that is written again is one voltage
+    volts = np.concatenate([[0.0], written_v[moved]])
     begin_ns, end_ns = np.concatenate([[0], true_ns[moved]]), np.concatenate([true_ns[moved], [2**62]])
     apart_ns = begin_ns[None, :] - end_ns[:, None]  # of the later one's begin and the earlier one's end
     joined = np.triu(np.ones((len(volts), len(volts)), bool), 1) & (apart_ns <= WINDOW_NS)
@@ -80,7 +80,7 @@ def test_steps_and_windows_are_right_however_rarely_the_board_looks(seed, look_p
     look_ns = np.arange(BEGIN_NS, true_ns[-1] + 2 * look_period_ns, look_period_ns)
     card = Card()
     card.run(codes, true_ns, look_ns, true_ns)
-    assert card.evidence == by_all_pairs(codes, true_ns)
+    assert card.evidence == by_all_pairs(codes * LSB_V, true_ns)
     assert card.words[UNSEEN] == 0
     assert card.words[TAKEN] == len(codes)
     assert card.seen[0].moved_ns == true_ns[np.flatnonzero(np.diff(codes))[-1] + 1]
