@@ -120,10 +120,10 @@ class Bench(Evidence):
             return self.service.pid
         return self.blocks[-1].load(Word.LOOP_PID if role == "rt" else Word.RECORDER_PID)
 
-    def service_pids(self) -> list[int]:
-        """This process, which strikes, the service, and the present loop."""
+    def safe_pids(self) -> list[int]:
+        """The service and the present loop."""
         loops = [pid for block in self.blocks[-1:] if (pid := block.load(Word.LOOP_PID))]
-        return [os.getpid(), *([self.service.pid] if self.service else []), *loops]
+        return [*([self.service.pid] if self.service else []), *loops]
 
     @property
     def bounds(self) -> Bounds:

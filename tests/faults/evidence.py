@@ -20,6 +20,9 @@ TIMEOUT_S = 300.0
 """Nothing that works takes so long, on a host with little to spare; no bound on anything."""
 POLL_S = 0.002
 FULL_SCALE_V = 10.0
+UNSEEN_SHARE = 0.25
+"""Beside what is measured the host takes a little more: while another thread holds the interpreter's lock and is not
+run, nobody is ready. With thirty processes on two processors that was a seventh; without any, nothing is added."""
 
 
 class Seen(NamedTuple):
@@ -71,9 +74,10 @@ class Evidence:
         """What the host took between the newest fault and the safe output; see `await_safe`."""
         self._host: HostWitness | None = None
         self._waited_ns: dict[int, int] = {}
+        self._strike_waited_ns = 0
 
-    def service_pids(self) -> list[int]:
-        """Processes that bring the output to safe when the loop does not, or that pass a request on to it."""
+    def safe_pids(self) -> list[int]:
+        """Processes that bring the output to safe: the service and the present loop."""
         raise NotImplementedError
 
     @property
@@ -109,29 +113,43 @@ class Evidence:
 
     def strike(self, *faults: Callable[[], Any]) -> None:
         """Bring about a fault, and remember when."""
-        self._waited_ns = {pid: waited_ns(pid) for pid in self.service_pids()}
+        self._waited_ns = self._waited(every_thread=True)
+        own, before_ns = os.getpid(), waited_ns(os.getpid())
         self.struck_ns = time.monotonic_ns()
         for fault in faults:
             fault()
+        self._strike_waited_ns = waited_ns(own)[own] - before_ns[own]
 
-    def await_safe(self, bound_ms: float | None = None) -> float:
+    def _waited(self, every_thread: bool) -> dict[int, int]:
+        """ns that each thread waited for a processor, by its number."""
+        return {thread: ns for pid in self.safe_pids() for thread, ns in waited_ns(pid, every_thread).items()}
+
+    def await_safe(self, bound_ms: float | None = None, by_request: bool = False) -> float:
         """ms from the fault until the output was at 0 V for good, by the card's own clock.
 
-        That must take no longer than `bound_ms`, where there is one, and what the host took meanwhile.
+        That must take no longer than `bound_ms`, where there is one, and what the host took meanwhile. What came
+        `by_request` passed through several threads of the service, and perhaps another process.
         """
-        wait_for(lambda: self.seen().last_v == 0.0, "a safe output")
-        took_ms = self.safe_ms()
-        assert bound_ms is None or took_ms <= bound_ms + self.stalled_ms, (
-            f"safe after {took_ms:.0f} ms; allowed {bound_ms:g} ms and {self.stalled_ms:.0f} ms that the host stalled"
+        waited_ns = dict(self._waited_ns)
+
+        def is_safe() -> bool:
+            waited_ns.update(self._waited(by_request))  # a loop that was killed waits too, until it is gone
+            return self.seen().last_v == 0.0
+
+        wait_for(is_safe, "a safe output")
+        took_ms = self._safe_ms(waited_ns)
+        assert bound_ms is None or took_ms <= bound_ms + (1.0 + UNSEEN_SHARE) * self.stalled_ms, (
+            f"safe after {took_ms:.0f} ms; allowed {bound_ms:g} ms, and the host stalled {self.stalled_ms:.0f} ms"
         )
         return took_ms
 
-    def safe_ms(self) -> float:
+    def _safe_ms(self, thread_ns: dict[int, int]) -> float:
         """ms from the fault until the output moved last; notes what the host took of them."""
         moved_ns = self.seen().moved_ns
         assert self._host is not None
-        waited = sum(max(waited_ns(pid) - before_ns, 0) for pid, before_ns in self._waited_ns.items()) / NS_PER_MS
-        self.stalled_ms = waited + self._host.stolen_ms(self.struck_ns, moved_ns)
+        waited_ns = sum(ns - self._waited_ns.get(thread, 0) for thread, ns in thread_ns.items())
+        waited_ms = (self._strike_waited_ns + waited_ns) / NS_PER_MS
+        self.stalled_ms = waited_ms + self._host.stolen_ms(self.struck_ns, moved_ns)
         return (moved_ns - self.struck_ns) / NS_PER_MS
 
     def witness(self) -> None:

@@ -4,9 +4,10 @@ A bound on a time holds for a host that runs its processes. What the host took i
 
     stolen     a witness that asked to sleep for PERIOD_S woke later, and had not been waiting for its processor:
                the whole machine stood still. Spans of several processors that overlap count once.
-    waited     the kernel's own account (schedstat) of how long the threads of a process were ready and not run
+    waited     the kernel's own account (schedstat) of how long a thread was ready and not run: that thread on whose
+               work the output depends, for others wait beside it and delay nothing
 
-A process that sleeps, or waits for something else, adds to neither.
+A thread that sleeps, or waits for something else, adds to neither.
 """
 
 from __future__ import annotations
@@ -26,14 +27,30 @@ ACCOUNT_BYTES = 100
 NS_PER_S, NS_PER_MS = 1e9, 1e6
 
 
-def waited_ns(pid: int) -> int:
-    """ns that the threads of a process were ready to run and not run; 0 of one that is gone."""
-    total = 0
+def waited_ns(pid: int, every_thread: bool = False) -> dict[int, int]:
+    """ns that the first thread of a process, by its number, was ready to run and not run; empty of one that is gone.
+
+    With `every_thread`, all of its threads and those of its children.
+    """
+    tasks, found = {pid: Path(f"/proc/{pid}")}, dict[int, int]()
+    if every_thread:
+        for process in (pid, *_children(pid)):
+            with suppress(OSError):
+                tasks |= {int(task.name): task for task in Path(f"/proc/{process}/task").iterdir()}
+    for number, task in tasks.items():
+        with suppress(OSError):
+            found[number] = _waited_ns((task / "schedstat").read_bytes())
+    return found
+
+
+def _children(pid: int) -> list[int]:
+    """Processes that threads of a process started."""
+    found = list[int]()
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
             with suppress(OSError):
-                total += _waited_ns((task / "schedstat").read_bytes())
-    return total
+                found += map(int, (task / "children").read_text().split())
+    return found
 
 
 def _waited_ns(account: bytes) -> int:

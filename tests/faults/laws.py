@@ -33,7 +33,7 @@ def never_ends(bench: Bench) -> Measured:
             bench.client.post("/setpoint", {"axis": "x", "value": ENDLESS_UM + 1.0})
 
     bench.strike(ask)
-    took_ms = bench.await_safe(STOPPED_SAFE_MS)
+    took_ms = bench.await_safe(STOPPED_SAFE_MS, by_request=True)
     bench.await_restart()
     assert bench.await_state("tripped")["faults"]
     assert bench.pid("rt") != loop

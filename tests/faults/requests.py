@@ -119,7 +119,7 @@ def hostile_clients(bench: Bench) -> Measured:
         began_s = time.monotonic()
         bench.strike(lambda: bench.client.post("/stop"))
         answered_ms = 1e3 * (time.monotonic() - began_s)
-        bench.await_safe(STOPPED_MS)
+        bench.await_safe(STOPPED_MS, by_request=True)
         took_ms = max((bench.seen().moved_ns - bench.struck_ns) / 1e6, 0.0)  # a hostile one may have stopped it before
         for thread in threads:
             thread.join()
@@ -147,7 +147,7 @@ def trip_and_reset(bench: Bench) -> Measured:
     took_ms = 0.0
     for allowed_ms in (FIRST_BUILT_MS, BUILT_MS):
         bench.strike(lambda: tune(bench, position_um=5.0))
-        took_ms = max(took_ms, bench.await_safe(allowed_ms))
+        took_ms = max(took_ms, bench.await_safe(allowed_ms, by_request=True))
         bench.await_state("tripped", "position")
         for path, body in (("/start", {}), ("/mode", {"mode": "raw"}), ("/arm", {})):
             assert is_refused(bench, path, body), path
