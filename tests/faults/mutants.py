@@ -19,8 +19,8 @@ PLANTING = Path(__file__).with_name("planting")
 PARKED, STUCK = "loop SIGKILL, no restart", "loop SIGSTOP"
 STOPPED, CARD = "SIGTERM under drive", "driver blocks for good"
 DEATHS = "parking SIGKILL, again and again"
-"""Two hundred parkings. One alone may end with a step below 0.2 V that is no larger than the others, or have so little of
-a busy processor that it is no faster than a ramp although it does not wait."""
+"""Two hundred parkings. One alone may end with a step below 0.2 V that is no larger than the others, or have so little
+of a busy processor that it is no faster than a ramp although it does not wait."""
 STEEP, LATE = r"a step of|within 1 ms", r"safe after"
 RAMP, SUPERVISOR = "rtloop.engine.ramp", "rtloop.supervision.supervisor"
 
