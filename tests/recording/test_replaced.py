@@ -235,7 +235,7 @@ def left_by_two(folder: Path, *, killed: int = KILLED, missed: int = 100) -> Lef
     first.write_bytes((folder / "run.mcap.part").read_bytes())  # without the lock of this process
     run.loop.run(missed)
     run.begin(sequence=2)
-    run.run_to(max(END, run.loop.tick))
+    run.run_to(max(END, run.loop.tick + 1))
     run.end()
     return Left(first, folder / "run-0002.mcap", folder / "whole.mcap")
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import Place
+from rtloop.recording.file.mcap.chunkfile import NotOnDisk
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import Intervals
 from rtloop.recording.file.writer import Writer
@@ -118,13 +119,18 @@ class Files:
         self.next = end
 
     def finish(self, final: Callable[[int], Message]) -> OutputError | None:
-        """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again."""
+        """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again.
+
+        Ticks of a file that may not be on the disk count as lost.
+        """
         writer, self.writer = self.writer, None
         if writer is None:
             return None
         written, problem = writer.ticks + writer.skipped, None
         try:
             writer.finish(final)
+        except NotOnDisk as error:
+            return error
         except OutputError as error:
             problem = error
             if not writer.is_there():

@@ -192,6 +192,10 @@ class Session:
 
         if problem := self._files.finish(final):
             self.error = self.error or str(problem)
+            if kind == ROTATED:
+                what = {"error": str(problem)}
+                self._pending.add_event(recorder_event(RECORDING_FAILED, *self._place(said_tick), what))
+                self._block.store(Word.RECORDER_FAILURE, problem.number or errno.EIO)
 
     def _fail(self, error: OutputError) -> None:
         """Nothing is recorded from here on, until a file could be begun."""
@@ -272,6 +276,7 @@ class Session:
                 self._files.write(messages, rows, self._start_unix_ns(), end)
             else:
                 self._files.leave_out(messages, intervals, self._start_unix_ns(), end)
+        self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _waiting(self, channel: int) -> int:
         """Messages of a topic that were taken from the rings, and wait."""
