@@ -337,3 +337,16 @@ def test_recorders_that_die_before_they_have_repeated_everything_leave_each_tick
     assert found_in(files) == found_in([left.whole])
     assert replay(load(files)).identical
     assert replay(load(files[2])).identical
+
+
+def test_events_that_the_dead_recorder_wrote_ahead_of_their_ticks_stand_there_once(left: Left, tmp_path: Path):
+    run = Recorded(tmp_path / "run.mcap")
+    run.loop.run(KILLED)
+    run.session.drain()  # one chunk of ticks, and all events
+    run.session._write_all()
+    first = tmp_path / "first.mcap.part"
+    first.write_bytes((tmp_path / "run.mcap.part").read_bytes())
+    run.begin(sequence=2)
+    run.run_to(END)
+    run.end()
+    assert found_in([first, tmp_path / "run-0002.mcap"])[:3] == found_in([left.whole])[:3]
