@@ -81,6 +81,14 @@ class Run:
         ticks, snapshots = recording["tick"].tolist(), list(recording.snapshots())
         return Found(ticks, events, snapshots, recording.problems)
 
+    def first_ticks(self) -> list[int]:
+        """The first tick of each finished file, by its header."""
+        ticks = []
+        for path in self.folder.glob("*.mcap"):
+            with Reader(path) as reader:
+                ticks.append(reader.first_tick)
+        return ticks
+
 
 def step(session: Session) -> None:
     """Take what is there, and write it."""
@@ -188,6 +196,8 @@ def test_nothing_is_written_twice_or_lost(tmp_path: Path):
             break
         if differences := run.found().differences(expected):
             wrong[instant] = differences
+        if any(tick % SNAPSHOT_TICKS for tick in run.first_ticks()):
+            wrong[instant] = ["a file that does not begin at a snapshot"]
     assert wrong == {}
     assert instant > LEAST_INSTANTS
 
