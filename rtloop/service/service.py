@@ -177,6 +177,7 @@ class Service:
         try:
             return self._serve()
         finally:  # what grew at the start may lie there unfinished by now; never two recoveries at once
+            self.notifier.limit_watchdog(START_TIMEOUT_S)  # outputs are safe; the time limit is RECOVERY_S
             recovery.join(RECOVERY_S)
             if not recovery.is_alive():
                 self._aside(self._recover_leftovers).join(RECOVERY_S)

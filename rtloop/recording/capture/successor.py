@@ -1,7 +1,7 @@
 """Where a recorder begins that takes the place of a dead one: at a snapshot of the law, so that its file replays alone.
 
-The ticks, events and snapshots since that snapshot stand in the file of the dead recorder as well. The header says so
-(`repeats_before`), and readers of both files take them from the first.
+The ticks, events and snapshots since that snapshot stand in the file of the dead recorder as well. The header says up
+to which tick (`repeats_before`); a reader of both files takes what is before that tick from the dead recorder's.
 """
 
 from __future__ import annotations

@@ -199,6 +199,7 @@ class Reader:
 
     @cached_property
     def _events(self) -> list[Event]:
+        """All events that stand in the file, repeated ones too."""
         return [event_from(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
 
     @cached_property

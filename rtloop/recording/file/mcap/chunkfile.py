@@ -154,6 +154,7 @@ class ChunkFile:
             self.close()
 
     def _make_durable(self) -> None:
+        """Have the system put the file on the disk. Raises NotOnDisk; a second try would say nothing."""
         try:
             os.fsync(self._fd)
         except OSError as error:
