@@ -27,7 +27,12 @@ class Position(NamedTuple):
 
     def at_least(self, other: Position) -> Position:
         """This position, or `other` for the rings in which that one is further; `lost` stays."""
-        return Position(*map(max, self[:-1], other), self.lost)
+        return Position(
+            max(self.ticks, other.ticks),
+            max(self.snapshots, other.snapshots),
+            max(self.events, other.events),
+            self.lost,
+        )
 
 
 FLUSHED = (Word.FLUSHED_TICKS, Word.FLUSHED_SNAPSHOTS, Word.FLUSHED_EVENTS, Word.LOST_TICKS)
