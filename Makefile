@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -88,6 +88,11 @@ soak-recordings: $(READY)
 # Ten thousand forged recordings through every command: half an hour to an hour.
 soak-forged: $(READY)
 	$(BIN)/python -m tests.soak.forged
+
+# Some nine thousand variants of the files of the public MCAP conformance suite through `info` and `import`: about
+# half an hour; `MOST=1` for two hundred of them.
+soak-conformance: $(READY)
+	$(BIN)/python -m tests.soak.conformance $(MOST)
 
 # Identification on 50 rigs drawn at random, three times: about ten minutes.
 soak-identification: $(READY)

@@ -27,10 +27,14 @@ SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": 
 
 
 class Extent(NamedTuple):
-    """What a file says of its ticks: the first one, and what was counted at its end; None where it has none."""
+    """What a file says of its ticks: the first one, and what was counted at its end; None where it has none.
+
+    `repeated` ticks in front of the first one stand in an earlier file too, and are taken from there.
+    """
 
     first_tick: int
     totals: dict[str, Any] | None
+    repeated: int
 
 
 class Recording:
@@ -51,7 +55,7 @@ class Recording:
             self.header: dict[str, Any] = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
-            self.extents = tuple(Extent(reader.first_tick, reader.totals) for reader in readers)
+            self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated) for reader in readers)
             self.skipped: list[Range] = [one for reader in readers for one in reader.skipped]
             self.problems += absent_parts(readers)
             self._note_problems(readers)

@@ -49,6 +49,8 @@ STATUS_PERIOD_S = 1.0
 READY_TICKS = 10
 RESTART_PAUSE_S = 0.2
 SPARE_SAMPLES = 1 << 20
+RECOVERY_S = 10.0
+"""For completing what others left among the recordings, with the outputs safe; the next start goes on with it."""
 log = logging.getLogger("rtloop")
 
 
@@ -171,7 +173,17 @@ class Service:
     def run(self) -> int:
         """Serve until told to end, or until the loop died too often; the exit code."""
         log.info("starting %s", self.configuration.name)
-        self._aside(self._recover_leftovers)
+        recovery = self._aside(self._recover_leftovers)
+        try:
+            return self._serve()
+        finally:  # what grew at the start may lie there unfinished by now; never two recoveries at once
+            self.notifier.limit_watchdog(START_TIMEOUT_S)  # outputs are safe; the time limit is RECOVERY_S
+            recovery.join(RECOVERY_S)
+            if not recovery.is_alive():
+                self._aside(self._recover_leftovers).join(RECOVERY_S)
+
+    def _serve(self) -> int:
+        """One loop after the other; the exit code."""
         resting = self.configuration.service.arm
         while not self._ending.is_set():
             try:
@@ -292,9 +304,11 @@ class Service:
         time.sleep(RESTART_PAUSE_S)
         return True
 
-    def _aside(self, work: Callable[[], None]) -> None:
-        """Do slow work in a thread of its own: the watch goes on meanwhile."""
-        threading.Thread(target=work, daemon=True).start()
+    def _aside(self, work: Callable[[], None]) -> threading.Thread:
+        """Do slow work in a thread of its own, which is returned: the watch goes on meanwhile."""
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        return thread
 
     def _recover_leftovers(self) -> None:
         """Complete what killed services left among the recordings; what cannot be is said and stays."""

@@ -6,26 +6,18 @@ alone, by an hour, ten times a second.
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from pathlib import Path
 
 from rtloop.engine.memory import Word
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
-from tests.faults.fault import Fault, Measured, NotPossible
-
-SOURCE = Path(__file__).with_name("stepping_clock.c")
+from tests.faults.fault import Fault, Measured
+from tests.faults.preload import preloaded
 
 
 def stepping_clock(folder: Path) -> dict[str, str]:
     """The environment that makes the wall clock step. Raises NotPossible without a compiler."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        raise NotPossible("no C compiler for the library that steps the clock")
-    library = folder / "stepping_clock.so"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", library, SOURCE, "-ldl"], check=True)
-    return {"LD_PRELOAD": str(library)}
+    return preloaded(folder, "stepping_clock")
 
 
 def steps(bench: Bench) -> Measured:

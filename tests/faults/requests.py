@@ -22,6 +22,7 @@ RELOADS, CLIENTS, REQUESTS = 100, 8, 60
 AT_ONCE_MS, BUILT_MS, FIRST_BUILT_MS = 60.0, 1000.0, 4000.0
 """From a signal; from a request, whose coefficients must be built and verified first; from such a one that comes with
 the first ticks, while the process that builds is still starting."""
+STOPS_APART_S = 0.01
 SILENT, BODIES, SEED, STOPPED_MS = 600, 200, 14, 2000.0
 BAD = (
     b"",
@@ -178,6 +179,19 @@ def stopped_under_drive(bench: Bench) -> Measured:
     return Measured(took_ms)
 
 
+def stopped_again_and_again(bench: Bench) -> Measured:
+    """Stop signals in a row, while the loop ramps down and the recorder writes the end."""
+    assert bench.service is not None
+    service = bench.service
+    bench.strike(service.terminate)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGTERM):
+        time.sleep(STOPS_APART_S)
+        service.send_signal(number)
+    took_ms = bench.await_safe(2 * AT_ONCE_MS)
+    wait_for(lambda: service.poll() is not None, "an end")
+    return Measured(took_ms)
+
+
 FAULTS = (
     Fault("reload storm", "good ones taken, bad ones refused", reload_storm),
     Fault("API flood and nonsense", "answered or refused; the loop goes on", flood),
@@ -185,4 +199,5 @@ FAULTS = (
     Fault("two instances", "the second is refused, twice", second_instance),
     Fault("operator trips and resets", "refused until the reset", trip_and_reset),
     Fault("SIGTERM under drive", "ramp, whole recording, exit 0", stopped_under_drive),
+    Fault("stop signals in a row", "as one: ramp, whole recording, exit 0", stopped_again_and_again),
 )

@@ -22,9 +22,12 @@ from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ
 from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
+from tests.faults.preload import preloaded
 
 SMALL, LARGE = "size=900k", "size=64m"
 ROUNDS = 1.4
+STALLED, STALL_S = "stalled", 10.0
+"""File that tells of the stall; how long it takes, as stalling_disk.c has it."""
 
 
 @contextmanager
@@ -122,9 +125,28 @@ def ring_overrun(bench: Bench) -> Measured:
     return Measured(lost_allowed=True, exit_code=1, note=f"{len(stopped)} recorders stopped in a row")
 
 
+def stalling_disk(folder: Path) -> dict[str, str]:
+    """The environment in which the first recording that is finished waits ten seconds for its disk."""
+    return preloaded(folder, "stalling_disk") | {"STALLED_DISK": str(folder / STALLED)}
+
+
+def disk_stalls(bench: Bench) -> Measured:
+    """Ten seconds at a rotation: longer than a recorder may stand still, shorter than the ring holds."""
+    wait_for(lambda: (bench.folder / STALLED).exists(), "a rotation")
+    bench.strike()
+    ticks = bench.ticks
+    wait_for(lambda: bench.ticks > ticks + round((STALL_S + 3.0) * BOARD_RATE_HZ), "the end of the stall")
+    status = bench.status()
+    assert (status["state"], status["restarts"]) == ("running", 0), status
+    assert status["recording"]["ticks_lost"] == 0, status["recording"]
+    return Measured(note=f"{status['recorder_replacements']} recorder replaced")
+
+
 FAULTS = (
     Fault("disk full", "the loop goes on; lost ticks said at once", disk_full, around=small_disk),
     Fault("disk full, then room", "recorded again; the gap said", disk_full_then_room, around=small_disk),
     Fault("folder of recordings removed, then made", "recorded again; the gap said", folder_removed),
     Fault("ring overrun", "the loop goes on; the gap said", ring_overrun),
-)
+    Fault("disk stalls 10 s at a rotation", "the loop goes on, nothing is lost", disk_stalls,
+          changes=(("[recording]", "[recording]\nrotate_s = 4.0"),), environment=stalling_disk),
+)  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
@@ -20,15 +20,19 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Disk:
-    """Takes the place of `os.pwrite`, `os.open` and `os.statvfs`; `error` is an errno that every write ends with."""
+    """Takes the place of `os.pwrite`, `os.open`, `os.fsync` and `os.statvfs`.
+
+    `error` is an errno that every write ends with, `at_fsync` is called once, when next a file is brought to the disk.
+    """
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.error: int | None = None
+        self.at_fsync: Callable[[], object] | None = None
         self.longest_write_bytes = PLENTY_BYTES
         self.inodes = True
         self.free_bytes = PLENTY_BYTES
-        self._pwrite, self._open, self._statvfs = os.pwrite, os.open, os.statvfs
-        for name in ("pwrite", "open", "statvfs"):
+        self._pwrite, self._open, self._fsync, self._statvfs = os.pwrite, os.open, os.fsync, os.statvfs
+        for name in ("pwrite", "open", "fsync", "statvfs"):
             patch.setattr(os, name, getattr(self, name))
 
     def pwrite(self, fd: int, data: Any, offset: int) -> int:
@@ -43,6 +47,13 @@ class Disk:
         if flags & os.O_CREAT and not self.inodes:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return self._open(path, flags, *arguments, **options)
+
+    def fsync(self, fd: int) -> None:
+        """Call `at_fsync` before it."""
+        happens, self.at_fsync = self.at_fsync, None
+        if happens is not None:
+            happens()
+        self._fsync(fd)
 
     def statvfs(self, path: Any) -> Any:
         """`free_bytes`, where the folder is there."""

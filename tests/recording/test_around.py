@@ -10,7 +10,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from rtloop.engine.memory import Word
 from rtloop.recording.capture.conditions import Conditions, comparison_of, unknown_signal
+from rtloop.recording.capture.decimation import Decimation
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import layout
@@ -191,6 +193,7 @@ def test_another_recorder_goes_on(tmp_path: Path, expected: list[int], killed_at
     recover(left)
     files = [tmp_path / "left.mcap", tmp_path / "run-0002.mcap"]
     recording, report = load(files), replay(load(files))
+    assert replay(load(files[1])).identical
     assert on != ON or set(seconds_of(recording)) >= set(expected)
     assert (report.identical, report.gaps, report.ticks + report.skipped) == (True, [], TICKS)
     assert sum(event["kind"] == "tripped" for event in recording.events) == 1
@@ -274,3 +277,28 @@ def test_conditions_hold_where_they_say():
     for wrong in ("", "v", "v >", "abs(v > 1", "v > 1 > 2", "trips", "v > nan"):
         with pytest.raises(ValueError, match="no condition"):
             comparison_of(wrong)
+
+
+def test_a_replacement_keeps_what_follows_as_long_as_after_an_event(tmp_path: Path):
+    """Whatever happened before: the dead recorder may have been within a stretch."""
+    run = Selected(tmp_path / "run.mcap", around("x_drive_v > 100", before_s=0.5, after_s=3.0), paced=True)
+    run.run_to(25_000)
+    reached = run.loop.block.load(Word.FLUSHED_TICKS)
+    run.begin(sequence=2)
+    run.run_to(9 * SECOND)
+    run.session.finish("finished")
+    kept = load(tmp_path / "run-0002.mcap")
+    assert seconds_of(kept) == list(range(reached // SECOND, (reached + 3 * SECOND) // SECOND + 1))
+    assert replay(kept).identical
+
+
+def test_the_mean_over_an_interval_is_that_of_the_numbers_in_it():
+    rows = np.zeros((6, 3))
+    rows[:, 0] = np.arange(6)
+    rows[:, 1] = [4.0, np.nan, 8.0, np.nan, np.nan, np.nan]
+    rows[:, 2] = [1.0, 2.0, 6.0, 5.0, np.nan, 7.0]
+    decimation = Decimation(columns=3, every=3)
+    decimation.add(rows)
+    first, second = decimation.close()
+    np.testing.assert_array_equal(first, [[0.0, 2.0, 1.0], [4.0, 8.0, 6.0], [1.0, 6.0, 3.0]])
+    np.testing.assert_array_equal(second, [[3.0, 5.0, 4.0], [np.nan] * 3, [5.0, 7.0, 6.0]])

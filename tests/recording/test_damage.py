@@ -225,3 +225,21 @@ def test_an_unwritable_folder(tmp_path: Path):
         write_recording(tmp_path / "absent" / "run.mcap", ROWS[:10])
     assert caught.value.exit_code == 73
     shutil.rmtree(tmp_path)
+
+
+@pytest.mark.parametrize("place", [2, -2])
+def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_has_no_complete_end(tmp_path: Path, place: int):
+    """Every tick is there: what is missing is said by the chunk alone."""
+    path = write_recording(tmp_path / "run.mcap", ROWS)
+    with Reader(path) as reader:
+        slow = [entry for entry in reader.entries if entry.index and format.LAW in entry.index.message_index_offsets]
+    data = bytearray(path.read_bytes())
+    data[slow[place].offset + slow[place].length - 1] ^= 1
+    path.write_bytes(data)
+    report = recover(path)
+    assert (report["ticks"], report["gaps"], report["complete"]) == (COUNT, [], False)
+    (problem,) = report["problems"]
+    assert f"the chunk at byte {slow[place].offset} is damaged" in problem
+    with Reader(report["output"]) as reader:
+        assert (reader.totals["result"], reader.totals["complete"]) == ("recovered", False)
+        assert reader.totals["problems"] == [problem]

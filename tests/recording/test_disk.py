@@ -241,6 +241,59 @@ def test_a_run_that_cannot_begin_leaves_nothing(disk: Disk, tmp_path: Path):
     assert os.listdir(tmp_path) == []
 
 
+def not_brought_to_the_disk() -> None:
+    """What a failed fsync says, once."""
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def test_a_file_that_may_not_be_on_the_disk_is_not_counted_and_named(disk: Disk, tmp_path: Path):
+    """The system says so once, and may have given up what it could not write."""
+    run = Recorded(tmp_path / "run.mcap", rotate_s=1.0)
+    run.run_to(15_000)
+    disk.at_fsync = not_brought_to_the_disk
+    said = []
+    while run.loop.tick < 25_000:
+        run.run_to(run.loop.tick + 1_000)
+        said.append(run.loop.block.load(Word.RECORDER_FAILURE))
+    totals = run.end()
+    part = tmp_path / "run-0002.mcap.part"
+    assert (totals["ticks_logged"], totals["ticks_lost"], totals["complete"]) == (15_000, SECOND, False)
+    assert str(part) in totals["error"]
+    assert [Path(path).name for path in totals["paths"]] == ["run-0001.mcap", "run-0003.mcap"]
+    assert (errno.EIO in said, said[0], said[-1]) == (True, 0, 0)
+    assert run.loop.block.load(Word.LOST_TICKS) == SECOND
+    (failed,) = of_kind(load(totals["paths"][-1]).events, "recording_failed")
+    assert str(part) in failed["error"]
+    found = load([totals["paths"][0], recover(part)["output"], totals["paths"][1]])  # it is still there, as it happens
+    assert (replay(found).identical, len(found)) == (True, 25_000)
+
+
+def test_the_last_file_of_a_run_may_not_be_on_the_disk(disk: Disk, tmp_path: Path):
+    run = Recorded(tmp_path / "run.mcap")
+    run.run_to(15_000)
+    disk.at_fsync = not_brought_to_the_disk
+    totals = run.end()
+    assert (totals["paths"], totals["ticks_logged"], totals["ticks_lost"]) == ([], 0, 15_000)
+    assert f"{tmp_path / 'run.mcap.part'}: {os.strerror(errno.EIO)}" in totals["error"]
+
+
+@pytest.mark.parametrize(("stall_ticks", "lost"), [(8 * SECOND, False), (15 * SECOND, True)])
+def test_a_disk_that_stands_still_at_a_rotation(disk: Disk, tmp_path: Path, stall_ticks: int, lost: bool):
+    """What the ring holds meanwhile is recorded; what it does not hold is said."""
+    run = Recorded(tmp_path / "run.mcap", rotate_s=1.0)
+    run.run_to(5_000)
+    disk.at_fsync = lambda: run.loop.run(stall_ticks)
+    run.run_to(12_000)
+    executed = run.loop.tick + 2 * SECOND
+    run.run_to(executed)
+    totals = run.end()
+    recording = load(totals["paths"])
+    assert missing(recording["tick"], executed) == of_kind(recording.events, "gap")
+    assert (totals["ticks_lost"] > 0, totals["complete"]) == (lost, not lost)
+    assert totals["ticks_logged"] + totals["ticks_lost"] == executed
+    assert replay(recording).first_difference is None
+
+
 def test_rotates_at_the_right_tick_however_far_the_loop_is_ahead(tmp_path: Path):
     loop, rows = HandMadeLoop(), make_rows(50_000)
     loop.run(rows, snapshot_every=4_000)  # all of it before the first tick is drained

@@ -6,6 +6,7 @@ import json
 import os
 import queue
 import time
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +22,7 @@ from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import Flag
+from rtloop.supervision import quota as quota_module
 from rtloop.supervision import recorder_keeper
 from rtloop.supervision.quota import SPARE_BYTES, Quota
 from rtloop.supervision.recorder_keeper import RecorderKeeper
@@ -31,26 +33,30 @@ PART = 5_000
 AROUND = {"before_s": 0.1, "after_s": 0.2, "every_s": 1.0, "on": ["trip"]}
 
 
-def write(folder: Path, stem: str, number: int = 1, trip: int | None = None, **header: object) -> Path:
-    """File `number` of a run, in which it tripped at a tick."""
+def write(
+    folder: Path, stem: str, number: int = 1, trip: int | None = None, kind: Kind = Kind.TRIPPED, **header: object
+) -> Path:
+    """File `number` of a run, in which it tripped, or its driver failed, at a tick."""
     first = (number - 1) * PART
     said = make_header(sequence=number, first_tick=first, format=2, around=AROUND, **header)
     writer = Writer(folder / f"{stem}.mcap", said, START_UNIX_NS)
     if trip is not None:
-        record = message(Kind.TRIPPED, tick=trip, axis=0, values=[Flag.TRIP_POSITION])[0]
+        record = message(kind, tick=trip, axis=0, values=[Flag.TRIP_POSITION])[0]
         writer.write_messages([Message(EVENTS, START_UNIX_NS, json.dumps(event_of(record, AXES, 0)).encode())])
     writer.write_ticks(make_rows(1_000, first=first))
     writer.finish(lambda logged: final_message(first + PART, logged))
     return writer.path
 
 
-def run_of(folder: Path, stamp: str, count: int, trip: int | None = None, name: str = "test") -> list[Path]:
+def run_of(
+    folder: Path, stamp: str, files: int, trip: int | None = None, name: str = "test", kind: Kind = Kind.TRIPPED
+) -> list[Path]:
     """The files of one run, of which those that have it say at which tick it tripped."""
     at = {} if trip is None else {trip // PART + 1: trip}
     created = START_UNIX_NS + int(stamp[-1]) * 10**9
     return [
-        write(folder, f"{name}-{stamp}-{number:04d}", number, at.get(number), created_unix_ns=created, name=name)
-        for number in range(1, count + 1)
+        write(folder, f"{name}-{stamp}-{number:04d}", number, at.get(number), kind, created_unix_ns=created, name=name)
+        for number in range(1, files + 1)
     ]
 
 
@@ -176,3 +182,22 @@ def test_the_rows_that_are_written_here_can_be_read(tmp_path: Path):
 
     (path,) = run_of(tmp_path, "20260101T000001", 1, trip=20)
     assert np.array_equal(load(path)["tick"], np.arange(1_000))
+
+
+def test_a_driver_that_failed_protects_as_a_trip_does(tmp_path: Path):
+    files = run_of(tmp_path, "20260101T000001", 6, trip=2 * PART + 500, kind=Kind.DRIVER_FAILED)
+    keep(tmp_path, 1)
+    assert left(tmp_path) == [path.name for path in (*files[1:3], files[-1])]
+
+
+def test_nothing_of_a_run_goes_before_all_of_it_was_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A trip in a file that was not opened yet protects the one before it."""
+    files = run_of(tmp_path, "20260101T000001", 5, trip=2 * PART + 500)
+    ticking = count()
+    monkeypatch.setattr(quota_module, "time", SimpleNamespace(monotonic=lambda: float(next(ticking))))
+    quota = Quota(tmp_path, "test", 1, 0)
+    assert quota.keep(budget_s=2.5) == []  # time for two files
+    assert len(left(tmp_path)) == len(files)
+    quota.keep(budget_s=2.5)
+    quota.keep(budget_s=2.5)
+    assert left(tmp_path) == [path.name for path in (*files[1:3], files[-1])]

@@ -7,13 +7,17 @@ import os
 import resource
 import signal
 import subprocess
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import MESSAGE, Kind, Origin
+from rtloop.recording.capture import recorder as module
+from rtloop.recording.capture.recorder import Recorder
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
 from rtloop.recording.file.topics.events import message_of
@@ -283,3 +287,75 @@ def test_event_times_follow_the_deadlines_when_periods_were_missed(loop, recorde
     times = [event["time_ns"] for event in load(tmp_path / "run.mcap").events]
     assert times[:2] == [60 * 100_000 + 700_000, 110 * 100_000 + 700_000]
     assert RATE_HZ == 1e9 / 100_000
+
+
+POLLS = 100
+"""Far fewer than any time limit of the recorder takes, where the clock stands still."""
+
+
+class EndOfOrders:
+    """Orders of a service that is gone."""
+
+    closed = True
+
+    def next(self) -> None:
+        """No order."""
+
+
+class EmptyRings:
+    """A session whose rings hold nothing; raises StillPolling once it was asked POLLS times."""
+
+    room, cursor, failure = 1, 0, None
+
+    def __init__(self) -> None:
+        self.polls = 0
+
+    def drain(self) -> int:
+        self.polls += 1
+        if self.polls > POLLS:
+            raise StillPolling
+        return 0
+
+    def write_due(self) -> None:
+        """Nothing is due."""
+
+
+class StillPolling(Exception):
+    """The recorder goes on."""
+
+
+@pytest.fixture
+def no_time_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recorder's clock stands still, and its pauses last no time."""
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: 1_000.0, sleep=lambda _: None))
+
+
+@pytest.mark.usefixtures("no_time_passes")
+def test_a_recorder_without_service_and_loop_ends_at_once(loop):
+    assert Recorder(loop.block).record(EmptyRings(), EndOfOrders(), 0.1) == "abandoned"
+
+
+@pytest.mark.usefixtures("no_time_passes")
+def test_a_recorder_without_service_goes_on_while_a_loop_lives(loop):
+    """What the loop still does on its way to safe outputs is recorded too."""
+    (told, tell), (asked, ask) = os.pipe(), os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pid = os.fork()
+    if pid == 0:
+        try:
+            loop.block.claim()
+            os.write(tell, b".")
+            os.close(ask)
+            os.read(asked, 1)
+        finally:
+            os._exit(0)
+    os.read(told, 1)
+    recorder = Recorder(loop.block)
+    with pytest.raises(StillPolling):
+        recorder.record(EmptyRings(), EndOfOrders(), 0.1)
+    os.close(ask)
+    os.waitpid(pid, 0)
+    assert recorder.record(EmptyRings(), EndOfOrders(), 0.1) == "abandoned"
+    for end in (told, tell, asked):
+        os.close(end)

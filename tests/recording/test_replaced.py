@@ -10,13 +10,18 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
+
 from rtloop.engine.memory import SharedBlock, Word
+from rtloop.recording.capture import session
 from rtloop.recording.capture.session import Options, Session
-from rtloop.recording.file.reader import Snapshot
+from rtloop.recording.cutting.cut import cut
+from rtloop.recording.file.reader import Reader, Snapshot
 from rtloop.recording.file.recover import recover
 from rtloop.recording.file.topics.events import RECORDER
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
+from rtloop.recording.views.summary import summarise
 from rtloop.signals import Mode
 from tests.recording.disk import Recorded
 from tests.recording.hand_made_loop import HandMadeLoop, make_header, make_rows
@@ -24,6 +29,10 @@ from tests.recording.hand_made_loop import HandMadeLoop, make_header, make_rows
 TICKS, STEP, SNAPSHOT_TICKS, COMMAND_TICKS = 1_200, 400, 250, 100
 ROTATE_S = 0.05
 LEAST_INSTANTS = 50
+
+
+KILLED, END, SNAPSHOT = 15_722, 22_000, 10_000
+"""Ticks: up to which a recorder wrote, the last of the run, the last snapshot before the recorder's death."""
 
 
 class Found(NamedTuple):
@@ -71,6 +80,14 @@ class Run:
         events = [event for event in recording.events if event["who"] != RECORDER]
         ticks, snapshots = recording["tick"].tolist(), list(recording.snapshots())
         return Found(ticks, events, snapshots, recording.problems)
+
+    def first_ticks(self) -> list[int]:
+        """The first tick of each finished file, by its header."""
+        ticks = []
+        for path in self.folder.glob("*.mcap"):
+            with Reader(path) as reader:
+                ticks.append(reader.first_tick)
+        return ticks
 
 
 def step(session: Session) -> None:
@@ -166,10 +183,10 @@ def recorded_by_two(run: Run, instant: int) -> bool:
 def test_nothing_is_written_twice_or_lost(tmp_path: Path):
     """Ticks, events and snapshots are those of a recorder that lives, at whatever instant one is killed."""
     alone = Run(tmp_path / "alone")
-    session = alone.session()
+    recorder = alone.session()
     while alone.advance():
-        step(session)
-    session.finish("finished")
+        step(recorder)
+    recorder.finish("finished")
     expected, wrong = alone.found(), {}
     assert (expected.ticks, expected.problems) == (list(range(TICKS)), [])
     assert (len(expected.events), len(expected.snapshots)) == (2 * TICKS // COMMAND_TICKS, -(-TICKS // SNAPSHOT_TICKS))
@@ -179,12 +196,15 @@ def test_nothing_is_written_twice_or_lost(tmp_path: Path):
             break
         if differences := run.found().differences(expected):
             wrong[instant] = differences
+        if any(tick % SNAPSHOT_TICKS for tick in run.first_ticks()):
+            wrong[instant] = ["a file that does not begin at a snapshot"]
     assert wrong == {}
     assert instant > LEAST_INSTANTS
 
 
-def test_what_an_earlier_version_wrote_twice_is_said(tmp_path: Path):
+def test_what_an_earlier_version_wrote_twice_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A snapshot that stands in two files, where the recorder had died before its note of it."""
+    monkeypatch.setattr(session, "snapshot_before", lambda *_: None)  # as a replacement went on then
     run = Recorded(tmp_path / "run.mcap")
     run.run_to(12_000)
     for _ in "ab":
@@ -200,3 +220,143 @@ def test_what_an_earlier_version_wrote_twice_is_said(tmp_path: Path):
     report = replay(load([first, tmp_path / "run-0002.mcap"]))
     assert (report.identical, report.first_difference, report.ticks) == (False, None, 15_000)
     assert "snapshots of the law are out of order: that of tick 10000 comes after 10000" in report.problems
+
+
+class Left(NamedTuple):
+    """What two recorders of one run left: the unfinished file of the killed one, the next one's, and the whole run."""
+
+    first: Path
+    second: Path
+    whole: Path
+
+    def recovered(self, folder: Path, cut_bytes: int = 0) -> Path:
+        """The first file completed, without so many bytes at its end."""
+        part = folder / "first.mcap.part"
+        part.write_bytes(self.first.read_bytes()[: -cut_bytes or None])
+        return Path(recover(part)["output"])
+
+
+def left_by_two(folder: Path, *, killed: int = KILLED, missed: int = 100) -> Left:
+    """A recorder is killed at a tick, and another one comes `missed` ticks later."""
+    run = Recorded(folder / "run.mcap")
+    run.run_to(killed)
+    run.session._write_all()
+    first = folder / "left.mcap.part"
+    first.write_bytes((folder / "run.mcap.part").read_bytes())  # without the lock of this process
+    run.loop.run(missed)
+    run.begin(sequence=2)
+    run.run_to(max(END, run.loop.tick + 1))
+    run.end()
+    return Left(first, folder / "run-0002.mcap", folder / "whole.mcap")
+
+
+@pytest.fixture(scope="module")
+def left(tmp_path_factory: pytest.TempPathFactory) -> Left:
+    """Of a run whose recorder was killed between two snapshots, with commands behind the first of them."""
+    folder = tmp_path_factory.mktemp("replaced")
+    run = Recorded(folder / "whole.mcap")
+    run.run_to(END)
+    run.end()
+    return left_by_two(folder)
+
+
+def found_in(files: list[Path]) -> Found:
+    """What files hold together."""
+    recording = load(files)
+    events = [event for event in recording.events if event["who"] != RECORDER]
+    return Found(recording["tick"].tolist(), events, list(recording.snapshots()), recording.problems)
+
+
+def check_alone(second: Path, snapshot: int) -> None:
+    """A replacement's file begins with a snapshot, and replays from there."""
+    recording = load(second)
+    assert recording["tick"].tolist() == list(range(snapshot, END))
+    assert (next(recording.snapshots()).tick, recording.problems) == (snapshot, [])
+    report = replay(recording)
+    assert (report.identical, report.ticks, report.not_verified) == (True, END - snapshot, [])
+    summary = summarise(second)
+    assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (END - snapshot, 0, True)
+
+
+def test_the_file_of_a_replacement_replays_alone_from_its_first_tick(left: Left):
+    """Commands between the snapshot that it begins with and the death of the other recorder are in it."""
+    check_alone(left.second, SNAPSHOT)
+
+
+def test_a_replacement_at_a_snapshot_repeats_that_alone(tmp_path: Path):
+    left = left_by_two(tmp_path, killed=2 * SNAPSHOT)
+    check_alone(left.second, 2 * SNAPSHOT)
+    assert replay(load([left.recovered(tmp_path), left.second])).identical
+
+
+@pytest.mark.parametrize("recovered", [True, False])
+def test_both_files_of_a_replacement_hold_everything_once(left: Left, tmp_path: Path, recovered: bool):
+    files = [left.recovered(tmp_path) if recovered else left.first, left.second]
+    assert found_in(files)[:3] == found_in([left.whole])[:3]
+    report = replay(load(files))
+    assert (report.first_difference, report.ticks, report.gaps, report.not_verified) == (None, END, [], [])
+    summary = summarise(files)
+    assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (END, 0, recovered)
+    assert summary.commands == summarise(left.whole).commands
+
+
+def test_a_cut_across_a_replacement_holds_everything_once(left: Left, tmp_path: Path):
+    output = tmp_path / "cut.mcap"
+    cut([left.recovered(tmp_path), left.second], 12_000, 21_000, output)
+    found, expected = found_in([output]), found_in([left.whole])
+    assert found.ticks == list(range(SNAPSHOT, 21_000))
+    assert found.events == [event for event in expected.events if SNAPSHOT <= event["tick"] < 21_000]
+    assert found.snapshots == [one for one in expected.snapshots if SNAPSHOT <= one.tick < 21_000]
+    assert replay(load(output)).identical
+
+
+def test_what_is_damaged_before_a_replacement_is_taken_from_its_repetition(left: Left, tmp_path: Path):
+    short = left.recovered(tmp_path, cut_bytes=1_000)  # within its last chunk of ticks
+    assert SNAPSHOT < len(load(short)) < KILLED
+    assert load([short, left.second])["tick"].tolist() == list(range(END))
+    assert replay(load([short, left.second])).identical
+
+
+def test_a_replacement_that_comes_too_late_for_the_snapshot_goes_on_where_the_other_file_ends(tmp_path: Path):
+    left = left_by_two(tmp_path, missed=len(HandMadeLoop().block["ticks_slots"]) - 10)
+    with Reader(left.second) as reader:
+        assert (reader.header["first_tick"], reader.header.get("repeats_before")) == (KILLED, None)
+    report = replay(load([left.recovered(tmp_path), left.second]))
+    assert (report.identical, report.gaps) == (True, [])
+    (unverified,) = replay(load(left.second)).not_verified
+    assert (unverified["first_tick"], unverified["count"]) == (KILLED, 2 * SNAPSHOT - KILLED)
+
+
+def test_recorders_that_die_before_they_have_repeated_everything_leave_each_tick_once(left: Left, tmp_path: Path):
+    """Two replacements, of which the first writes less than it repeats."""
+    run = Recorded(tmp_path / "run.mcap")
+    run.run_to(KILLED)
+    run.session._write_all()
+    first = tmp_path / "first.mcap.part"
+    first.write_bytes((tmp_path / "run.mcap.part").read_bytes())
+    run.begin(sequence=2)
+    run.session.drain()  # one chunk, a part of what is to be repeated
+    run.session._write_all()
+    second = tmp_path / "second.mcap.part"
+    second.write_bytes((tmp_path / "run-0002.mcap.part").read_bytes())
+    run.begin(sequence=3)
+    run.run_to(END)
+    run.end()
+    files = [Path(recover(part)["output"]) for part in (first, second)] + [tmp_path / "run-0003.mcap"]
+    assert 0 < len(load(files[1])) < KILLED - SNAPSHOT
+    assert found_in(files) == found_in([left.whole])
+    assert replay(load(files)).identical
+    assert replay(load(files[2])).identical
+
+
+def test_events_that_the_dead_recorder_wrote_ahead_of_their_ticks_stand_there_once(left: Left, tmp_path: Path):
+    run = Recorded(tmp_path / "run.mcap")
+    run.loop.run(KILLED)
+    run.session.drain()  # one chunk of ticks, and all events
+    run.session._write_all()
+    first = tmp_path / "first.mcap.part"
+    first.write_bytes((tmp_path / "run.mcap.part").read_bytes())
+    run.begin(sequence=2)
+    run.run_to(END)
+    run.end()
+    assert found_in([first, tmp_path / "run-0002.mcap"])[:3] == found_in([left.whole])[:3]

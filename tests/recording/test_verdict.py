@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from mcap.records import ChunkIndex
 
 from rtloop.cli import main
 from rtloop.recording.file.topics import format
@@ -191,3 +193,23 @@ def with_gap(base: Base, gap: dict[str, Any], logged: int) -> Base:
     end["what"] |= {"ticks_logged": logged, "ticks_lost": TICKS - logged, "complete": False}
     messages = [last._replace(payload=json.dumps(event).encode()) for event in (gap, end)]
     return base.with_chunk(place, base.chunks[place].with_messages(messages))
+
+
+def test_an_index_with_a_chunk_that_begins_within_another_is_not_used(base: Base, path: Path):
+    def begin_earlier(index: list[ChunkIndex]) -> None:
+        index[3] = replace(index[3], chunk_start_offset=index[3].chunk_start_offset - 40)
+
+    path.write_bytes(packed(base, forge=begin_earlier))
+    report = replay(load(path))
+    assert any("chunk index" in problem for problem in report.problems)
+    assert (report.identical, report.ticks) == (True, TICKS)
+
+
+def test_a_hole_that_is_larger_than_the_gap_that_the_recorder_told_of_is_not_verified(base: Base, path: Path):
+    chunks = tick_chunks(base)
+    event = {"tick": 400, "time_ns": 0, "kind": "gap", "who": "recorder", "axis": None}
+    gap = {"first_tick": 300, "count": 100}
+    lacking = without(base, chunks[3], chunks[4])
+    path.write_bytes(packed(with_gap(lacking, {**event, "what": gap}, TICKS - 200)))
+    report = refused(path)
+    assert [ranges(one) for one in report.not_verified] == [{"first_tick": 300, "count": 200}]

@@ -106,11 +106,14 @@ def test_a_name_may_hold_what_patterns_and_markup_are_made_of(tmp_path: Path) ->
     assert err == ""
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ramps_down_and_completes_the_recording(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize("numbers", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT, signal.SIGTERM]])
+def test_signals_ramp_down_and_complete_the_recording(tmp_path: Path, numbers: list[signal.Signals]) -> None:
+    """However many come while the loop ramps down and the recorder writes the end."""
     process = start("run", PAPER, "--out", tmp_path, "--json")
     wait_for_ticks(tmp_path)
-    process.send_signal(number)
+    for number in numbers:
+        process.send_signal(number)
+        time.sleep(0.01)
     code, summary, _ = finish(process)
     assert code == 0
     assert summary["outcome"] == "stopped"

@@ -10,6 +10,7 @@ import numpy as np
 
 from rtloop.errors import OutputError
 from rtloop.recording.capture.buffer import Place
+from rtloop.recording.file.mcap.chunkfile import NotOnDisk
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import Intervals
 from rtloop.recording.file.writer import Writer
@@ -39,13 +40,23 @@ def left_by_another(path: Path, sequence: int) -> Path | None:
 
 
 class Files:
-    """`begin` is where the first file begins, `logged` the ticks that earlier recorders left in files.
+    """`begin` is where the first file begins, `logged` the ticks before it that earlier recorders left in files.
 
-    `next` is the tick behind the last one in a file, `first` the first one that the present file accounts for.
+    `next` is the tick behind the last one in a file, `first` the first one that the present file accounts for. What
+    is before `repeats_before` stands in an earlier recorder's file as well; None where nothing is repeated.
     """
 
-    def __init__(self, path: Path, header: dict[str, Any], options: Options, begin: Place, logged: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: dict[str, Any],
+        options: Options,
+        begin: Place,
+        logged: int,
+        repeats_before: Place | None,
+    ) -> None:
         self._path, self._header, self._options = path, header, options
+        self._repeats_before = repeats_before
         self._opened: list[Path] = []
         self._closed_ticks, self.closed_bytes, self._closed_skipped = logged, 0, 0
         self.next = self.first = begin
@@ -81,6 +92,8 @@ class Files:
         if options.rotate_bytes or options.rotate_s or sequence > 1:
             path = numbered(path, sequence)
             header = {**header, "sequence": sequence, "first_tick": self.next.tick}
+        if self._repeats_before is not None and self.next.tick <= self._repeats_before.tick:
+            header["repeats_before"] = self._repeats_before.tick
         index, least = options.message_index, options.min_free_bytes
         room_bytes += self.writer.end_bytes if room_bytes and self.writer else 0
         writer = Writer(path, header, log_time, message_index=index, min_free_bytes=least, room_bytes=room_bytes)
@@ -106,13 +119,18 @@ class Files:
         self.next = end
 
     def finish(self, final: Callable[[int], Message]) -> OutputError | None:
-        """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again."""
+        """End the file with `final(ticks in it)`; what prevented it. Ticks that it lost after all come `next` again.
+
+        Ticks of a file that may not be on the disk count as lost.
+        """
         writer, self.writer = self.writer, None
         if writer is None:
             return None
         written, problem = writer.ticks + writer.skipped, None
         try:
             writer.finish(final)
+        except NotOnDisk as error:
+            return error
         except OutputError as error:
             problem = error
             if not writer.is_there():
@@ -126,13 +144,19 @@ class Files:
         return problem
 
     def leave_what_is_useless(self) -> None:
-        """Give up a file that was removed, and with it its ticks; remove one without ticks."""
+        """Give up a file that was removed, and with it its ticks; remove one without ticks.
+
+        Ticks that were still to be repeated are left out: an earlier file holds them.
+        """
         if self.writer and not self.writer.is_there():
             self._lose(self.writer)
         elif self.writer and not self.writer.ticks:
             self.writer.discard()
             self.writer = None
             self._opened.pop()
+        if self._repeats_before is not None and (count := self._repeats_before.tick - self.next.tick) > 0:
+            self._closed_ticks += count
+            self.next = self._repeats_before
 
     def _lose(self, writer: Writer) -> None:
         writer.close()

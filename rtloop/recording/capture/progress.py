@@ -25,6 +25,15 @@ class Position(NamedTuple):
     events: int
     lost: int
 
+    def at_least(self, other: Position) -> Position:
+        """This position, or `other` for the rings in which that one is further; `lost` stays."""
+        return Position(
+            max(self.ticks, other.ticks),
+            max(self.snapshots, other.snapshots),
+            max(self.events, other.events),
+            self.lost,
+        )
+
 
 FLUSHED = (Word.FLUSHED_TICKS, Word.FLUSHED_SNAPSHOTS, Word.FLUSHED_EVENTS, Word.LOST_TICKS)
 ANNOUNCED = (Word.ANNOUNCED_TICKS, Word.ANNOUNCED_SNAPSHOTS, Word.ANNOUNCED_EVENTS, Word.ANNOUNCED_LOST)

@@ -4,9 +4,10 @@
 
 N is the shared block, M the names of those who give commands. One JSON line on stdin starts it: {"path":
 ".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. Further lines say which
-files were removed meanwhile: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. It ends when the loop has
-and the rings are empty, and prints one JSON line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes,
-complete, error, cpu_s}. SIGINT and SIGTERM are ignored, for the loop's last ticks are to be recorded too.
+files were removed meanwhile: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. It ends when the loop has,
+or when stdin is closed and no process drives the block, once the rings are empty, and prints one JSON line: {path,
+paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. SIGINT and SIGTERM are ignored, for the
+loop's last ticks are to be recorded too.
 
 RECORDER_STATE is FAILED while nothing can be written, and RUNNING again once that is over.
 """
@@ -35,7 +36,7 @@ from rtloop.recording.errors import RecordingError
 POLL_S = 0.1
 UNPACED_POLL_S = 0.0002
 ABANDONED_S = 5.0
-"""With the supervisor gone and no new tick for this long, the loop is taken as gone too."""
+"""With the supervisor gone and no new tick for this long, a loop that still lives is taken as gone too."""
 
 
 class Orders:
@@ -66,10 +67,14 @@ class Recorder:
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
 
     def record(self, session: Session, orders: Orders, pause_s: float) -> str:
-        """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned"."""
+        """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned".
+
+        "abandoned": the supervisor has closed the orders, or died, and no loop lives that could add a tick.
+        """
         last_tick_s = time.monotonic()
         while True:
             state = self.block.load(Word.LOOP_STATE)
+            alone = orders.closed and self.block.driven_by() is None
             drained = session.drain()
             while (order := orders.next()) is not None:
                 session.note_removed(order["removed"])
@@ -80,7 +85,7 @@ class Recorder:
                 last_tick_s = time.monotonic()
             elif state in (ProcessState.FINISHED, ProcessState.FAILED):
                 return ProcessState(state).name.lower()
-            elif time.monotonic() - last_tick_s > ABANDONED_S and orders.closed:
+            elif alone or (orders.closed and time.monotonic() - last_tick_s > ABANDONED_S):
                 return "abandoned"
             if drained < session.room:
                 time.sleep(pause_s)

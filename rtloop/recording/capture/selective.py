@@ -31,7 +31,7 @@ class SelectiveSession(Session):
         around, rate_hz = Around.of(header), header["rate_hz"]
         assert around is not None
         # nobody knows how long the one before was to go on
-        keep_until = -1 if options.sequence == 1 else self.cursor + round(around.after_s * rate_hz)
+        keep_until = -1 if options.sequence == 1 else self._reached.ticks + round(around.after_s * rate_hz)
         self._memory = Memory(around, header["columns"], rate_hz, self.cursor, keep_until)
 
     def _meet_snapshot(self, tick: int) -> None:

@@ -21,6 +21,7 @@ from rtloop.recording.capture.names import Names
 from rtloop.recording.capture.pending import Entry, Pending, tick_of
 from rtloop.recording.capture.progress import Position, Progress
 from rtloop.recording.capture.rings import RingReader
+from rtloop.recording.capture.successor import snapshot_before
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import (
@@ -56,23 +57,31 @@ class Session:
         self._buffer = TickBuffer(header["columns"], header["rate_hz"])
         self._written_s = time.monotonic()
         self._progress = Progress(block)
-        begin = self._progress.found(left_by_another(path, options.sequence))
-        self._progress.note(begin)
-        self._ticks = RingReader(block, "ticks", begin.ticks)
-        self._snapshots = RingReader(block, "snapshots", begin.snapshots)
-        self._events = RingReader(block, "events", begin.events)
+        self._reached = self._progress.found(left_by_another(path, options.sequence))
+        self._progress.note(self._reached)
         self._ahead: deque[bytes] = deque()
         self._pending = Pending(self._buffer, self._start_unix_ns)
         self.error: str | None = None
         self.failure: OutputError | None = None
-        self._cut_tick = self.cursor
-        self._files = Files(path, header, options, self._buffer.place(self.cursor), begin.ticks - begin.lost)
+        snapshot = snapshot_before(block, self._reached) if options.sequence > 1 else None
+        self._begin_at(snapshot or self._reached, repeats=snapshot is not None)
         try:
             self._files.begin(self._files.opened(header["created_unix_ns"] if header["paced"] else 0))
         except OutputError as error:
             if options.sequence == 1:
                 raise
+            self._begin_at(self._reached, repeats=False)
             self._fail(error)
+
+    def _begin_at(self, position: Position, *, repeats: bool) -> None:
+        """Read the rings from `position` on; `repeats`: what an earlier recorder's file has of it is written again."""
+        self._ticks = RingReader(self._block, "ticks", position.ticks)
+        self._snapshots = RingReader(self._block, "snapshots", position.snapshots)
+        self._events = RingReader(self._block, "events", position.events)
+        begin, end = (self._buffer.place(tick) for tick in (position.ticks, self._reached.ticks))
+        logged = position.ticks - position.lost
+        self._files = Files(self._path, self._header, self._options, begin, logged, end if repeats else None)
+        self._cut_tick = position.ticks
 
     @property
     def cursor(self) -> int:
@@ -183,6 +192,10 @@ class Session:
 
         if problem := self._files.finish(final):
             self.error = self.error or str(problem)
+            if kind == ROTATED:
+                what = {"error": str(problem)}
+                self._pending.add_event(recorder_event(RECORDING_FAILED, *self._place(said_tick), what))
+                self._block.store(Word.RECORDER_FAILURE, problem.number or errno.EIO)
 
     def _fail(self, error: OutputError) -> None:
         """Nothing is recorded from here on, until a file could be begun."""
@@ -258,11 +271,12 @@ class Session:
             self._events.position - self._waiting(format.EVENTS),
             end.tick - self._files.logged - self._files.skipped - spans.ticks,
         )
-        with self._progress.writing(self._files.size_bytes, reached):
+        with self._progress.writing(self._files.size_bytes, reached.at_least(self._reached)):
             if intervals is None:
                 self._files.write(messages, rows, self._start_unix_ns(), end)
             else:
                 self._files.leave_out(messages, intervals, self._start_unix_ns(), end)
+        self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _waiting(self, channel: int) -> int:
         """Messages of a topic that were taken from the rings, and wait."""

@@ -13,11 +13,11 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Rows, tick_of
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message, may_hold
-from rtloop.recording.file.topics.events import FINAL
+from rtloop.recording.file.topics.events import FINAL, RECORDER
 from rtloop.recording.file.topics.overview import LEAST, MEAN, MOST, OverviewLayout, Range, ranges
 from rtloop.signals import DEADLINE, TICK
 
-OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "cut")
+OF_THE_FILE = ("configuration_sha256", "sequence", "first_tick", "repeats_before", "cut")
 """What a header says of the one file that it stands in."""
 
 
@@ -134,7 +134,9 @@ class Source:
                 if place < ticks and not _may_be_slow(seeker, place):
                     continue
                 rows = seeker.rows(place, begin, stretch.end)
-                messages = [one for one in self._slow(seeker, place) if self._belongs(one, stretch)]
+                messages = [
+                    one for one in self._slow(seeker, place) if self._belongs(one, stretch) and _is_taken(one, seeker)
+                ]
                 self.problems += seeker.damage.get(place, [])
                 if len(rows):
                     begin = int(rows[-1, TICK]) + 1
@@ -156,6 +158,16 @@ class Source:
             return False
         event = json.loads(message.payload)
         return stretch.first <= event["tick"] < stretch.end and event["kind"] not in FINAL
+
+
+def _is_taken(message: Message, seeker: Seeker) -> bool:
+    """Whether a message is to be taken from this file, where another one of the run holds it as well."""
+    if message.channel == format.LAW:
+        return seeker.reader.owns(tick_of(message))
+    if message.channel != format.EVENTS:
+        return True
+    event = json.loads(message.payload)
+    return event["who"] == RECORDER or seeker.reader.owns(event["tick"])
 
 
 def _may_be_slow(seeker: Seeker, place: int) -> bool:

@@ -9,21 +9,29 @@ from rtloop.recording.file.topics.ticks import LARGEST, Ticks
 
 
 class Account:
-    """From `first_tick` on; `totals` are what was counted at the file's end, None where it has none."""
+    """From `first_tick` on; `totals` are what was counted at the file's end, None where it has none.
 
-    def __init__(self, first_tick: int, totals: dict[str, Any] | None) -> None:
-        self._next, self._count = first_tick, 0
+    Ticks before `repeated_before` are taken from another file, and only counted here.
+    """
+
+    def __init__(self, first_tick: int, totals: dict[str, Any] | None, repeated_before: int = 0) -> None:
+        self._next, self._count, self._repeated_before = first_tick, 0, repeated_before
         self._end = totals["ticks_executed"] if totals else LARGEST
         self._written = totals and totals["ticks_logged"]
 
-    def add(self, ticks: Ticks) -> None:
-        """Count a chunk. Raises DamagedChunk where it does not come next."""
+    def add(self, chunk: Ticks) -> Ticks | None:
+        """Count a chunk; returns the ticks to be taken from it. Raises DamagedChunk where it does not come next."""
+        ticks = chunk.since(self._repeated_before) if chunk.first < self._repeated_before else chunk
+        if ticks is None:
+            self._count += len(chunk.rows)
+            return None
         if ticks.first < self._next:
             raise DamagedChunk(f"out of order: tick {ticks.first}, where {self._next} or a later one comes next")
         if ticks.last >= self._end:
             raise DamagedChunk(f"out of order: tick {ticks.last}, but the run ended before tick {self._end}")
         self._next = ticks.last + 1
-        self._count += len(ticks.rows)
+        self._count += len(chunk.rows)
+        return ticks
 
     @property
     def shortage(self) -> str | None:

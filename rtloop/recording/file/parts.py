@@ -54,8 +54,7 @@ class Parts(ExitStack):
             readers = [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
             readers.sort(key=_sequence)
             _require_one_run(readers)
-            for before, reader in pairwise(readers):
-                reader.begin_behind(before)
+            _take_each_tick_once(readers)
             return readers
         except BaseException:
             self.close()
@@ -69,6 +68,22 @@ def absent_parts(readers: Sequence[Reader]) -> list[str]:
 
 def _sequence(reader: Reader) -> int:
     return int(reader.header.get("sequence", 1))
+
+
+def _take_each_tick_once(readers: Sequence[Reader]) -> None:
+    """Have each part begin where those before it end; what a part repeats is taken from the one before it.
+
+    A part that was not finished ends, by what the next one says, where that one's repetition does.
+    """
+    reached = 0
+    for number, (before, reader) in enumerate(pairwise(readers), start=1):
+        follows = _sequence(reader) == _sequence(before) + 1
+        repeats_before = reader.header.get("repeats_before") if follows else None
+        reached = max(reached, before.totals["ticks_executed"] if before.totals else repeats_before or 0)
+        reader.begin_at(reached)
+        if repeats_before is not None and (reader.totals is None or reader.totals["ticks_executed"] > reached):
+            for one in readers[:number]:
+                one.end_at(min(repeats_before, reached))
 
 
 def _require_one_run(readers: Sequence[Reader]) -> None:

@@ -33,7 +33,7 @@ from rtloop.recording.file.topics.contents import (
     overlaps,
     split_messages,
 )
-from rtloop.recording.file.topics.events import FINAL, Event
+from rtloop.recording.file.topics.events import FINAL, RECORDER, Event
 from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Range, plausible, ranges
 from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 
@@ -72,6 +72,7 @@ class Reader:
         self.columns: tuple[str, ...] = tuple(self.header["columns"])
         self._ticks, self._overview = TickLayout(self.columns), OverviewLayout(self.columns)
         self.first_tick: int = self.header.get("first_tick", 0)
+        self._repeated_before, self._end_tick = 0, round(LARGEST) + 1
 
     def __enter__(self) -> Self:
         return self
@@ -83,10 +84,23 @@ class Reader:
         """Close the file."""
         self._source.close()
 
-    def begin_behind(self, before: Reader) -> None:
-        """Take no tick that belongs in the part `before` this one."""
-        if before.totals:
-            self.first_tick = max(self.first_tick, before.totals["ticks_executed"])
+    def begin_at(self, tick: int) -> None:
+        """Take nothing before `tick`, which parts of the run before this one hold; some of it may stand here again."""
+        self._repeated_before = min(self.header.get("repeats_before", 0), tick)
+        self.first_tick = max(self.first_tick, tick)
+
+    def end_at(self, tick: int) -> None:
+        """Leave the events and snapshots from `tick` on to a later part, which holds them as well."""
+        self._end_tick = min(self._end_tick, tick)
+
+    def owns(self, tick: int) -> bool:
+        """Whether the loop's events and snapshots of a tick are to be taken from this part of the run."""
+        return self._repeated_before <= tick < self._end_tick
+
+    @property
+    def repeated(self) -> int:
+        """Ticks at the beginning of the file that are taken from a part before it."""
+        return max(self._repeated_before - self.header.get("first_tick", 0), 0)
 
     @property
     def size_bytes(self) -> int:
@@ -139,12 +153,11 @@ class Reader:
         `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
         """
         wanted = self._known(self.columns if names is None else names)
-        account = Account(self.first_tick, self.totals)
+        account = Account(self.first_tick, self.totals, self._repeated_before)
         for entry, future in self._ahead(self.tick_chunks if entries is None else entries, wanted):
             try:
                 ticks = future.result()
-                if ticks is not None:
-                    account.add(ticks)
+                if ticks is not None and (ticks := account.add(ticks)) is not None:
                     yield ticks.rows
             except DamagedChunk as reason:
                 self._leave_out(entry, reason)
@@ -155,6 +168,8 @@ class Reader:
         """The snapshots of the law behind tick `before`, in order, each verified by its digest."""
         for message in self._messages(format.LAW):
             tick, data = tick_of(message), message.payload[DIGEST_BYTES:]
+            if not self.owns(tick):
+                continue
             if tick > before:
                 yield Snapshot(tick, data)
             else:
@@ -177,9 +192,14 @@ class Reader:
                 self._leave_out(entry, reason)
         self._close(account)
 
-    @cached_property
+    @property
     def events(self) -> list[Event]:
         """The events, in the order of the file."""
+        return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
+
+    @cached_property
+    def _events(self) -> list[Event]:
+        """All events that stand in the file, repeated ones too."""
         return [event_from(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
 
     @cached_property
@@ -207,7 +227,7 @@ class Reader:
     @property
     def totals(self) -> dict[str, Any] | None:
         """What the recorder counted when it finished the file; None where it did not."""
-        last = [event for event in self.events if event["kind"] in FINAL]
+        last = [event for event in self._events if event["kind"] in FINAL]
         return last[-1]["what"] if last else None
 
     def _known(self, names: Sequence[str]) -> Sequence[str]:

@@ -151,8 +151,8 @@ class _Replay:
 
     def _end(self, expected: int) -> None:
         """Hold what was found against what the files say that they hold."""
-        totals = [extent.totals for extent in self._recording.extents]
-        last = totals[-1]
+        extents = self._recording.extents
+        last = extents[-1].totals
         for snapshot in [] if self._next is None else [self._next, *self._snapshots]:
             if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
                 self._report.pass_over(None, None, f"a snapshot of the law at tick {snapshot.tick}, behind the end")
@@ -160,7 +160,7 @@ class _Replay:
         if last is None:
             self._report.pass_over(expected, None, "the recording states no end; `rtloop recover` completes it")
             return
-        written = sum(one["ticks_logged"] for one in totals if one)
+        written = sum(one.totals["ticks_logged"] - one.repeated for one in extents if one.totals)
         if self._found == written and last["result"] != RECOVERED:  # what its disk had no room for was never recorded
             self._gaps.append({"first_tick": expected, "count": last["ticks_executed"] - expected})
         self._pass_gap(expected, last["ticks_executed"])

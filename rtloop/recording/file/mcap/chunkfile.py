@@ -33,6 +33,10 @@ LEVEL = 3
 """zstd: at 10 kHz and one axis 0.70 µs and 73 bytes a tick; level 1: 0.52 µs, 85 bytes; level 5: 1.7 µs, 71 bytes."""
 
 
+class NotOnDisk(OutputError):
+    """The system could not bring a written file to the disk: it may have given up any of it, and says so only once."""
+
+
 class Content(NamedTuple):
     """What a chunk holds: its records, the span of their log times, messages and index record by channel."""
 
@@ -131,9 +135,12 @@ class ChunkFile:
         self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), index))
 
     def publish(self) -> None:
-        """Make the file durable and give it its final name; never replaces a file."""
+        """Make the file durable and give it its final name; never replaces a file.
+
+        Raises NotOnDisk where it is not durable; it keeps the name of an unfinished file then.
+        """
         try:
-            os.fsync(self._fd)
+            self._make_durable()
             if self.path.exists():
                 message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
@@ -145,6 +152,16 @@ class ChunkFile:
             raise self._refused(error) from None
         finally:
             self.close()
+
+    def _make_durable(self) -> None:
+        """Have the system put the file on the disk. Raises NotOnDisk; a second try would say nothing."""
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            message = (
+                f"{self.part}: {error.strerror}: some of it may not be on the disk; `rtloop recover` keeps the rest"
+            )
+            raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
         """Give up the file as it is; idempotent."""

@@ -73,6 +73,9 @@ class Source:
 
 
 def _hint(path: Path) -> str:
+    """What lies there under the other name of the same recording."""
+    if path.suffix == ".part" and path.with_suffix("").exists():
+        return f", but there is {path.with_suffix('').name}, finished or recovered meanwhile"
     part = path.with_name(path.name + ".part")
     return f", but there is {part.name}, left from an unfinished run" if part.exists() else ""
 

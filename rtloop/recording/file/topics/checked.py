@@ -122,6 +122,7 @@ class _AnyHeader(_Checked):
     extras: _Extras = _Extras()
     sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
     first_tick: Tick = 0
+    repeats_before: Tick = 0
     cut: _Cut | None = None
     around: _Around | None = None
 

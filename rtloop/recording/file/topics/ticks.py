@@ -28,11 +28,19 @@ WHOLE = {
 
 
 class Ticks(NamedTuple):
-    """Columns of consecutive records, shape (n, columns), and the index of the first and of the last tick."""
+    """Columns of consecutive records, shape (n, columns), their ticks (n,), and the first and the last of these."""
 
     rows: np.ndarray[Any, Any]
+    numbers: np.ndarray[Any, Any]
     first: int
     last: int
+
+    def since(self, tick: int) -> Ticks | None:
+        """Those from `tick` on; None where all come before it."""
+        if self.last < tick:
+            return None
+        place = int(np.searchsorted(self.numbers, tick))
+        return Ticks(self.rows[place:], self.numbers[place:], int(self.numbers[place]), self.last)
 
 
 class TickLayout:
@@ -61,7 +69,7 @@ class TickLayout:
         _require_whole(records)
         _require_times(records)
         tick = records["tick"]
-        return Ticks(format.tick_rows(records, names), int(tick[0]), int(tick[-1]))
+        return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
 
     def start_ns(self, content: bytes) -> int:
         """Log time of the start of the run, in ns since the UNIX epoch, by a chunk of ticks. Raises DamagedChunk."""

@@ -1,0 +1,39 @@
+"""Where a recorder begins that takes the place of a dead one: at a snapshot of the law, so that its file replays alone.
+
+The ticks, events and snapshots since that snapshot stand in the file of the dead recorder as well. The header says up
+to which tick (`repeats_before`); a reader of both files takes what is before that tick from the dead recorder's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.engine.memory import SharedBlock
+from rtloop.recording.capture.pending import tick_of
+from rtloop.recording.capture.progress import Position
+from rtloop.recording.capture.rings import RingReader
+
+SPARE = 4
+"""This part of the ring of ticks is left to the loop, which runs on while the ticks are copied: one in SPARE."""
+
+
+def snapshot_before(block: SharedBlock, reached: Position) -> Position | None:
+    """The position of the newest snapshot at or before `reached`, with the events from its tick on.
+
+    None where the rings do not hold everything since that snapshot.
+    """
+    snapshots, events = RingReader(block, "snapshots"), RingReader(block, "events")
+    ticks = [tick_of(bytes(snapshot)) for snapshot in snapshots.take()]
+    places = [place for place, tick in enumerate(ticks) if tick <= reached.ticks]
+    if not places:
+        return None
+    tick, slots = ticks[places[-1]], len(block["ticks_slots"])
+    if int(block["ticks_head"][0]) - tick > slots - slots // SPARE:
+        return None
+    held = events.take()["tick"]
+    earlier, oldest = np.flatnonzero(held < tick), events.position - len(held)
+    if oldest and not len(earlier):
+        return None
+    event = oldest + int(earlier[-1]) + 1 if len(earlier) else 0
+    snapshot = snapshots.position - len(ticks) + places[-1]
+    return Position(tick, snapshot, min(event, reached.events), reached.lost)

@@ -1,0 +1,20 @@
+"""A small C library put in front of libc, for the processes of one bench alone."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from tests.faults.fault import NotPossible
+
+
+def preloaded(folder: Path, name: str) -> dict[str, str]:
+    """The environment that puts NAME.c of this folder in front of libc. Raises NotPossible without a compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise NotPossible(f"no C compiler for {name}.c")
+    library = folder / f"{name}.so"
+    source = Path(__file__).with_name(f"{name}.c")
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
+    return {"LD_PRELOAD": str(library)}

@@ -1,0 +1,104 @@
+"""Files like those of the public MCAP conformance suite: six contents, each with any set of ten features.
+
+The files are made here by the stock writer. Two kinds of messages are tried: bytes of an unknown encoding, as in the
+public suite, and JSON with numbers, which can be imported.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterable, Iterator
+from itertools import chain, combinations
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.writer import IndexType, Writer
+
+CONTENTS = ("NoData", "OneAttachment", "OneMetadata", "OneMessage", "OneSchemalessMessage", "TenMessages")
+CHUNKS, PADDING = "UseChunks", "AddExtraDataToRecords"
+INDEXES = {
+    "UseMessageIndex": IndexType.MESSAGE,
+    "UseChunkIndex": IndexType.CHUNK,
+    "UseAttachmentIndex": IndexType.ATTACHMENT,
+    "UseMetadataIndex": IndexType.METADATA,
+}
+REPEATED = ("UseStatistics", "UseRepeatedSchemas", "UseRepeatedChannelInfos", "UseSummaryOffset")
+FEATURES = (CHUNKS, *INDEXES, *REPEATED, PADDING)
+MAGIC = b"\x89MCAP0\r\n"
+EXTRA = b"\x01\x02\x03"
+EXTENSIBLE = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END)
+"""Records behind whose fields more data may stand; that of a message or a chunk reaches to the record's end."""
+STEP_NS = 1_000_000
+
+
+class Variant(NamedTuple):
+    """One file of the suite. `numbers`: its messages are JSON with a number, else three bytes of encoding "a"."""
+
+    content: str
+    features: frozenset[str]
+    numbers: bool
+
+    @property
+    def messages(self) -> int:
+        """How many the file holds."""
+        return 10 if self.content == "TenMessages" else int(self.content.endswith("Message"))
+
+    def __str__(self) -> str:
+        return "-".join([self.content, *sorted(self.features), "json" if self.numbers else "bytes"])
+
+    def data(self) -> bytes:
+        """The file."""
+        stream = io.BytesIO()
+        indexes = [index for name, index in INDEXES.items() if name in self.features]
+        writer = Writer(
+            stream,
+            index_types=IndexType(sum(index.value for index in indexes)),
+            use_chunking=CHUNKS in self.features,
+            use_statistics="UseStatistics" in self.features,
+            repeat_schemas="UseRepeatedSchemas" in self.features,
+            repeat_channels="UseRepeatedChannelInfos" in self.features,
+            use_summary_offsets="UseSummaryOffset" in self.features,
+            enable_crcs=PADDING not in self.features,
+        )
+        writer.start()
+        self._write(writer)
+        writer.finish()
+        return _padded(stream.getvalue()) if PADDING in self.features else stream.getvalue()
+
+    def _write(self, writer: Writer) -> None:
+        if self.content == "OneAttachment":
+            writer.add_attachment(2, 1, "myFile", "application/octet-stream", EXTRA)
+        if self.content == "OneMetadata":
+            writer.add_metadata("myMetadata", {"foo": "bar"})
+        if not self.messages:
+            return
+        encoding, kind = ("json", "jsonschema") if self.numbers else ("a", "c")
+        schema = 0 if self.content == "OneSchemalessMessage" else writer.register_schema("Example", kind, b"{}")
+        channel = writer.register_channel("example", encoding, schema, {"foo": "bar"})
+        for number in range(self.messages):
+            payload = b'{"value": %d}' % number if self.numbers else EXTRA
+            writer.add_message(channel, number * STEP_NS, payload, number * STEP_NS, number)
+
+
+def variants(most: int = len(FEATURES)) -> Iterator[Variant]:
+    """All variants with up to `most` features, or without up to so many of all."""
+    few: Iterable[tuple[str, ...]] = chain.from_iterable(combinations(FEATURES, n) for n in range(most + 1))
+    chosen = dict.fromkeys(chain.from_iterable((frozenset(one), frozenset(FEATURES) - set(one)) for one in few))
+    for content in CONTENTS:
+        for features in chosen:
+            for numbers in (False, True) if content.endswith(("Message", "Messages")) else (False,):
+                yield Variant(content, features, numbers)
+
+
+def _padded(data: bytes) -> bytes:
+    """The data section with more data behind the fields of records; without the summary, whose offsets were moved."""
+    out, position = bytearray(MAGIC), len(MAGIC)
+    while True:
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        record = data[position + 9 : position + 9 + length]
+        extra = EXTRA if opcode in EXTENSIBLE else b""
+        out += struct.pack("<BQ", opcode, length + len(extra)) + record + extra
+        position += 9 + length
+        if opcode == Opcode.DATA_END:
+            return bytes(out + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MAGIC)

@@ -1,0 +1,53 @@
+"""Every kind of valid MCAP file is opened, or refused with a reason: `make soak-conformance` tries all variants."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from rtloop.cli import main
+from rtloop.recording.load import load
+from tests.interchange.conformance import CONTENTS, Variant, variants
+
+NO_RECORDING, NOT_SUITABLE, LISTED = 66, 1, 2
+"""Exit codes: of `info`, and of `import` where it cannot read the messages, or waits to hear which columns to take."""
+REASONS = ("an MCAP file without messages", "its messages are a")
+
+
+def invoke(*arguments: str | Path) -> Result:
+    """The command in this process; nothing but an exit may come out of it."""
+    result = CliRunner().invoke(main, [*map(str, arguments)])
+    assert result.exception is None or isinstance(result.exception, SystemExit), (arguments, result.exc_info)
+    assert "Traceback" not in result.output
+    return result
+
+
+def check(variant: Variant, folder: Path) -> None:
+    """`info` and `import` of a variant say what it is."""
+    path, output = folder / "other.mcap", folder / "imported.mcap"
+    path.write_bytes(variant.data())
+    told = invoke("info", path)
+    assert told.exit_code == NO_RECORDING, (str(variant), told.output)
+    assert "an MCAP file, but not a recording of rtloop" in told.output, (str(variant), told.output)
+    assert ("'example'" in told.output) == (variant.messages > 0), (str(variant), told.output)
+    listed = invoke("import", path, "--out", output)
+    assert listed.exit_code == (LISTED if variant.numbers else NOT_SUITABLE), (str(variant), listed.output)
+    if not variant.numbers:
+        assert REASONS[variant.messages > 0] in listed.output, (str(variant), listed.output)
+        return
+    imported = invoke("import", path, "--all", "--out", output, "--json")
+    assert imported.exit_code == (0 if variant.messages > 1 else NOT_SUITABLE), (str(variant), imported.output)
+    if variant.messages > 1:
+        assert json.loads(imported.stdout)["ticks"] == variant.messages
+        assert load(output)["value"].tolist() == list(range(variant.messages))
+        output.unlink()
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+def test_a_file_of_the_conformance_suite_is_opened_or_refused_with_a_reason(content: str, tmp_path: Path):
+    for variant in variants(most=0):
+        if variant.content == content:
+            check(variant, tmp_path)

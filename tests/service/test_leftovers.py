@@ -1,0 +1,47 @@
+"""Unfinished recordings of others: completed as soon as nobody writes them any more."""
+
+from __future__ import annotations
+
+import fcntl
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtloop.service.service import Service
+from tests.paper_configuration import TEXT
+from tests.recording.hand_made_loop import make_rows, write_recording
+
+CUT_OFF_BYTES = 2_000
+"""Of the end of a file, with its index."""
+
+
+def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A recorder outlives its service, and dies while the next one runs."""
+    config = tmp_path / "lab.toml"
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    config.write_text(TEXT.replace('folder = "recordings"', f'folder = "{folder}"'))
+    whole = write_recording(tmp_path / "whole.mcap", make_rows(5_000))
+    part = folder / "lab-1.mcap.part"
+    part.write_bytes(whole.read_bytes()[:-CUT_OFF_BYTES])
+    recorder = part.open("rb")
+    fcntl.flock(recorder, fcntl.LOCK_EX)
+    service = Service(config)
+    aside, threads = service._aside, list[threading.Thread]()
+    looked_at: list[bool] = []
+
+    def episode(_: bool) -> Any:
+        threads[0].join()
+        looked_at.append((folder / "lab-1.mcap").exists())
+        recorder.close()
+        service.end()
+        return SimpleNamespace(exit_code=0)
+
+    monkeypatch.setattr(service, "_aside", lambda work: threads.append(aside(work)) or threads[-1])
+    monkeypatch.setattr(service, "_episode", episode)
+    assert service.run() == 0
+    assert looked_at == [False]
+    assert (folder / "lab-1.mcap").exists()
