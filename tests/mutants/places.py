@@ -31,6 +31,7 @@ OPERATORS = (
     *(f"ReplaceComparisonOperator_{change}" for change in COMPARISON),
     *OTHERS,
 )
+PUNCTUATION = frozenset("()[]{},.:=")
 LOGS = {"log", "logger", "logging", "warnings"}
 Position = tuple[int, int]
 """Line from 1 and column in characters from 0, as cosmic-ray counts."""
@@ -45,6 +46,8 @@ class _Positions(Visitor):
 
     def visit(self, node: Any) -> Any:
         """Note the positions in `node`, unchanged."""
+        if node.type in ("name", "string", "newline") or getattr(node, "value", "") in PUNCTUATION:
+            return node  # nothing acts on these, and they are most of a module
         for name, operator in self._operators:
             self.starts[name] += [start for start, _ in operator.mutation_positions(node)]
         return node
