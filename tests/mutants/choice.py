@@ -83,7 +83,7 @@ def _start(file: str, compiled: bool, tree: Tree, path: Path) -> int:
     """Number of a process that surveys one test file and writes what it found to `path`."""
 
     def run() -> int:
-        survey = Survey(tree.root)
+        survey = Survey(tree.root, compiled=compiled)
         pytest.main([*OPTIONS, f"--timeout={TEST_LIMIT_S}", file], plugins=[survey])
         _write(path, survey.result())
         return 0

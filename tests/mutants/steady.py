@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from hypothesis import Phase, settings
 
+from tests.mutants.uncompiled import install
+
 OPTIONS = (
     *("-q", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist"),
     *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # of plug-ins that the forking process has imported
@@ -16,8 +18,13 @@ EXAMPLES = 20
 class Steady:
     """Hypothesis draws the same examples each time, and does not look for the smallest that fails."""
 
+    def __init__(self, *, compiled: bool) -> None:
+        self._compiled = compiled
+
     def pytest_configure(self) -> None:
         """Before any test's module is imported."""
+        if not self._compiled:
+            install()
         settings.register_profile(
             "steady",
             settings(),

@@ -27,7 +27,8 @@ class TooLong(BaseException):
 class Survey(Steady):
     """Notes the seconds and the lines of every test that passes."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, compiled: bool) -> None:
+        super().__init__(compiled=compiled)
         self.root = root
         self.seconds: dict[str, float] = {}
         self.failed: dict[str, str] = {}

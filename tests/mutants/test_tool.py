@@ -37,7 +37,7 @@ class Scratch:
 
     def verdict(self, text: str, tests: tuple[str, ...]) -> Result:
         trial = Trial(
-            self.tree, mutant()._replace(file="rtloop/limits.py"), text, dict.fromkeys(tests, 1.0), compiled=False
+            self.tree, mutant()._replace(file="rtloop/limits.py"), text, dict.fromkeys(tests, 1.0), compiled=True
         )
         while (result := trial.result()) is None:
             time.sleep(0.01)

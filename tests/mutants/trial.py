@@ -33,7 +33,9 @@ class Trial:
         if tests:
             self._plant(text)
             arguments = [*OPTIONS, "-x", "-rfE", *tests]
-            self._child = tree.start(lambda: int(pytest.main(arguments, plugins=[Steady()])), compiled=compiled)
+            self._child = tree.start(
+                lambda: int(pytest.main(arguments, plugins=[Steady(compiled=compiled)])), compiled=compiled
+            )
 
     def _plant(self, text: str) -> None:
         """Write the module with its mistake."""
