@@ -55,7 +55,9 @@ def main() -> int:
     Console(width=120).print(shown)
     for mutant in survivors:
         print(f"{mutant.place} {results[mutant.key].verdict} {mutant.operator}\n- {mutant.before}\n+ {mutant.after}")
-    return int(score < ENOUGH)
+    if untried := sum(mutant.key not in results for mutant in mutants):
+        print(f"{untried} could not be tried")
+    return int(score < ENOUGH or untried > 0)
 
 
 def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -> None:
@@ -66,7 +68,13 @@ def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -
             tree, mutant = idle.pop(), left.pop()
             running[id(tree)] = tree, _started(tree, mutant, choice)
         for number, (_, trial) in list(running.items()):
-            if (result := trial.result()) is not None:
+            try:
+                result = trial.result()
+            except RuntimeError as error:  # it stays without a result, and is tried again by the next call
+                print(f"{trial.mutant.place}: {error}", file=sys.stderr, flush=True)
+                idle.append(running.pop(number)[0])
+                continue
+            if result is not None:
                 keep(path, trial.mutant, result)
                 _say(trial.mutant, result, len(left))
                 idle.append(running.pop(number)[0])

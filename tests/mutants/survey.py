@@ -35,24 +35,38 @@ class Survey(Steady):
         self._coverage = coverage.Coverage(
             data_file=None, config_file=False, include=[f"{root}/{place}/*" for place in ("rtloop", "hil", "drivers")]
         )
-        signal.signal(signal.SIGPROF, self._too_long)
+        self._too_long: set[str] = set()
+        """Functions of which one case was too long, so that the others need not be tried."""
+        signal.signal(signal.SIGPROF, _raise_too_long)
         self._coverage.start()
-
-    def _too_long(self, *_: Any) -> None:
-        raise TooLong(f"more than {CPU_LIMIT_S} s of the processor")
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        """Run one test under its own name, and for so long."""
+        """Run one test under its own name."""
         self._coverage.switch_context(item.nodeid)
         start = time.monotonic()
-        signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT_S, CPU_LIMIT_S / 10)  # again, where a callback swallowed it
         try:
             return (yield)
         finally:
-            signal.setitimer(signal.ITIMER_PROF, 0)
             self.seconds[item.nodeid] = time.monotonic() - start
             self._coverage.switch_context("")
+
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        """Leave a case out whose like was too long."""
+        if item.nodeid.partition("[")[0] in self._too_long:
+            pytest.skip("another case was too long")
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        """For so long and no longer."""
+        signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT_S, CPU_LIMIT_S / 10)  # again, where a callback swallowed it
+        try:
+            return (yield)
+        except TooLong:
+            self._too_long.add(item.nodeid.partition("[")[0])
+            pytest.fail("too long")
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[None]:
@@ -84,3 +98,7 @@ class Survey(Steady):
         passed = {name: seconds for name, seconds in self.seconds.items() if name not in self.failed}
         names = {name for name in lines if name in passed or name.endswith(f"::{SHARED}")}
         return {"seconds": passed, "failed": self.failed, "lines": {name: lines[name] for name in sorted(names)}}
+
+
+def _raise_too_long(*_: Any) -> None:
+    raise TooLong(f"more than {CPU_LIMIT_S} s of the processor")
