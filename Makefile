@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -75,6 +75,11 @@ soak-swaps: $(READY)
 
 soak-daemon: $(READY)
 	$(BIN)/python -m tests.soak.daemon
+
+# Mistakes planted at random in the rooms that must not fail, and whether the tests see them; results stay in build/mutants,
+# where it goes on when it is called again: about an hour for 400; `FLAGS="--rooms law engine"`, `FLAGS=--again` for survivors.
+mutants: $(VENV)/.mutants
+	$(BIN)/python -m tests.mutants --mutants $(or $(MUTANTS),400) --seed $(or $(SEED),1) --jobs $(or $(JOBS),2) $(FLAGS)
 
 # Every benchmark, about half an hour, as root for real-time scheduling; figures are kept in .benchmarks/, and
 # `.venv/bin/python -m tests.benchmarks --page docs/benchmarks.md` puts the newest into that page.
@@ -164,6 +169,10 @@ $(READY): pyproject.toml constraints.txt
 
 $(VENV)/.bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	touch $@
+
+$(VENV)/.mutants: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[mutants]'
 	touch $@
 
 # As root; PREFIX, DESTDIR and PIP_ARGS (such as "--no-index --find-links FOLDER") are explained in deploy/install.

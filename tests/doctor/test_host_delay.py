@@ -13,6 +13,7 @@ from rtloop.cli import main
 from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, HostRefused
+from rtloop.supervision import host_delay
 from rtloop.supervision.host_delay import measured_delay, note_host_delay, require_margins, spent_margin
 from tests.recording.real_loop import ROOT, changed
 
@@ -50,6 +51,29 @@ def test_what_cannot_be_read_counts_as_not_measured(folder: Path, content: str) 
     note_host_delay(configuration, lateness_us=40.0)
     (folder / "host-delay-test.host.json").write_text(content)
     assert measured_delay(configuration) is None
+
+
+def test_a_broken_file_does_not_hide_the_one_behind_it(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configuration = configured()
+    note_host_delay(configuration, lateness_us=40.0)
+    monkeypatch.setattr(host_delay, "client_folders", lambda: [folder])
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "first"))
+    note_host_delay(configuration, lateness_us=50.0)
+    (tmp_path / "first" / "host-delay-test.host.json").write_text("{")
+    found = measured_delay(configuration)
+    assert found is not None
+    assert found.lateness_us == 40.0
+
+
+def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Path) -> None:
+    before = os.umask(0)
+    try:
+        note_host_delay(configured(), lateness_us=40.0)
+    finally:
+        os.umask(before)
+    assert (folder / "host-delay-test.host.json").stat().st_mode & 0o777 == 0o640
 
 
 def test_nobody_elses_file_is_believed(folder: Path) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import carray
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
@@ -22,7 +21,7 @@ from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
 from rtloop.hil.native.compiled import cfunc
-from rtloop.hil.native.pointers import SIGNATURE, address_pointer
+from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 
 FOR_EVER = 1 << 40
 

@@ -18,6 +18,7 @@ def test_a_slow_loop_is_not_taken_for_one_that_stands_still(rate_hz, limit_s):
 
 def test_a_counter_that_stands_still_is_seen() -> None:
     watch = StallWatch(limit_s=5 / 64, longest_step_s=2 / 64)
+    assert watch.stalled_s == 0.0
     assert not watch.stalled(7, 100.0)  # seen for the first time
     assert [watch.stalled(7, 100.0 + k / 64) for k in range(1, 7)] == [False] * 4 + [True] * 2
 

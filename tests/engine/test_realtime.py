@@ -1,0 +1,57 @@
+"""What the host grants a loop's process: the report is what the kernel says of that process afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+PROGRAM = """
+import ctypes, json, os, sys
+from rtloop.engine.plan import Pacing
+from rtloop.engine.realtime import prepare_realtime
+report = prepare_realtime(Pacing(rate_hz=1000.0, **json.loads(sys.argv[1])))
+slack_ns = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK
+locked = [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck")]
+kernel = {"affinity": sorted(os.sched_getaffinity(0)), "slack_ns": slack_ns, "locked": locked[0] > 0,
+          "policy": os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, "priority": os.sched_getparam(0).sched_priority}
+print(json.dumps([report, kernel]))
+"""
+CPU = max(os.sched_getaffinity(0))
+
+
+def prepared(**pacing):
+    done = subprocess.run([sys.executable, "-c", PROGRAM, json.dumps(pacing)], capture_output=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_the_report_of_a_paced_loop_is_what_the_kernel_says():
+    report, kernel = prepared(cpu=CPU, priority=3)
+    assert report["affinity"] == kernel["affinity"] == [CPU]
+    assert report["mlock"] is kernel["locked"]
+    granted = report["scheduler"] == "SCHED_FIFO"
+    assert report["timer_slack_ns"] == 1
+    assert kernel["slack_ns"] in ((0, 1) if granted else (1,))  # newer kernels show none for a real-time thread
+    assert (report["priority"], kernel["priority"]) == ((3, 3) if granted else (0, 0))
+    assert kernel["policy"] == (os.SCHED_FIFO if granted else os.SCHED_OTHER)
+    refused = {entry.partition(":")[0] for entry in report["refused"]}
+    assert refused == {
+        *(["mlock"] if not kernel["locked"] else []),
+        *(["priority"] if not granted else []),
+        *(["pm_qos"] if not report["pm_qos"] else []),
+    }
+
+
+def test_a_processor_that_is_not_there_is_refused_and_nothing_else_for_it():
+    report, kernel = prepared(cpu=1023)
+    assert report["affinity"] == kernel["affinity"] == sorted(os.sched_getaffinity(0))
+    assert "affinity: Invalid argument" in report["refused"]
+
+
+def test_virtual_time_asks_for_nothing():
+    report, kernel = prepared(paced=False, cpu=CPU)
+    assert report["affinity"] == kernel["affinity"] == sorted(os.sched_getaffinity(0))
+    assert (report["timer_slack_ns"], report["refused"], report["priority"]) == (None, [], 0)
+    assert kernel["slack_ns"] != 1
+    assert not kernel["locked"]

@@ -1,0 +1,113 @@
+"""The tests that are run for a mutant: those of its room that execute its line, the most telling first."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.mutants.mutant import Mutant
+from tests.mutants.rooms import ROOMS, ROOT, room_tests
+from tests.mutants.steady import OPTIONS
+from tests.mutants.survey import SHARED, Survey
+from tests.mutants.trees import Tree, ended
+
+SURVEY_LIMIT_S = 1200.0
+"""For the tests of one file."""
+TEST_LIMIT_S = 60
+"""A test that waits for longer is left out, as one is that computes for long."""
+
+
+class Choice:
+    """What was surveyed of the tests, kept in `folder` for as long as neither sources nor tests change."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[tuple[str, bool], dict[str, Any]] = {}
+        self._sources = _digest(
+            *(path for place in ("rtloop", "hil", "drivers") for path in (ROOT / place).rglob("*.py")),
+            *(path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")),
+        )
+
+    def survey(self, rooms: set[str], trees: list[Tree]) -> None:
+        """Survey the test files of rooms that were not yet, one process each, as many at once as there are trees."""
+        wanted = sorted({(file, ROOMS[room].compiled) for room in rooms for file in room_tests(ROOMS[room])})
+        missing = [entry for entry in wanted if not self._path(*entry).exists()]
+        idle, running = list(trees), list[tuple[int, float, Tree, Path]]()
+        while missing or running:
+            while missing and idle:
+                file, compiled = missing.pop(0)
+                tree, path = idle.pop(), self._path(file, compiled)
+                running.append((_start(file, compiled, tree, path), time.monotonic(), tree, path))
+            for entry in list(running):
+                child, began, tree, path = entry
+                if ended(child, began + SURVEY_LIMIT_S) is not None:
+                    _say(path, tree, time.monotonic() - began)
+                    running.remove(entry)
+                    idle.append(tree)
+            time.sleep(0.05)
+        self._known = {entry: json.loads(self._path(*entry).read_text()) for entry in wanted}
+
+    def _path(self, file: str, compiled: bool) -> Path:
+        name = file.removesuffix(".py").replace("/", ".") + (".compiled" if compiled else "")
+        return self._folder / f"{name}-{self._sources}{_digest(ROOT / file)}.json"
+
+    def tests(self, mutant: Mutant) -> dict[str, float]:
+        """The tests for a mutant, in order, with their seconds; for a line that runs at import, all of its file."""
+        room = ROOMS[mutant.room]
+        surveyed = [(file, self._known[file, room.compiled]) for file in room_tests(room)]
+        at_line = {name: seconds for _, known in surveyed for name, seconds in _executing(known, mutant, line=True)}
+        chosen = at_line or {name: seconds for _, known in surveyed for name, seconds in _executing(known, mutant)}
+        stem = Path(mutant.file).stem
+        return dict(sorted(chosen.items(), key=lambda item: (stem not in item[0], item[1])))
+
+
+def _executing(known: dict[str, Any], mutant: Mutant, *, line: bool = False) -> list[tuple[str, float]]:
+    def executes(name: str) -> bool:
+        lines = known["lines"].get(name, {}).get(mutant.file, [])
+        return mutant.line in lines if line else bool(lines)
+
+    return [
+        (name, seconds)
+        for name, seconds in known["seconds"].items()
+        if executes(name) or executes(f"{name.partition('::')[0]}::{SHARED}")
+    ]
+
+
+def _start(file: str, compiled: bool, tree: Tree, path: Path) -> int:
+    """Number of a process that surveys one test file and writes what it found to `path`."""
+
+    def run() -> int:
+        survey = Survey(tree.root, compiled=compiled)
+        pytest.main([*OPTIONS, f"--timeout={TEST_LIMIT_S}", file], plugins=[survey])
+        _write(path, survey.result())
+        return 0
+
+    return tree.start(run, compiled=compiled, writes_bytecode=True)
+
+
+def _write(path: Path, told: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".part")
+    partial.write_text(json.dumps(told))
+    partial.rename(path)
+
+
+def _say(path: Path, tree: Tree, seconds: float) -> None:
+    if not path.exists():  # it did not come to its end
+        _write(path, {"seconds": {}, "failed": {path.stem: tree.output()[-400:]}, "lines": {}})
+    told = json.loads(path.read_text())
+    counts = f"{len(told['seconds'])} tests, {len(told['failed'])} left out"
+    print(f"surveyed {path.stem}: {counts}, {seconds:.0f} s", file=sys.stderr, flush=True)
+
+
+def _digest(*paths: Path) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]

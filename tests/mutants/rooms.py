@@ -1,0 +1,99 @@
+"""The rooms that are mutated, and the tests of each: data for `make mutants`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+LEAST = 25
+"""Mutants of a room, where as many are asked for and it has as many places."""
+
+
+class Room(NamedTuple):
+    """Sources and tests, folders or files from the root of the tree; `without` are sources that another room has."""
+
+    sources: str
+    tests: tuple[str, ...]
+    compiled: bool
+    """Whether kernels are compiled in its tests: only where no kernel is made from its sources, for that takes long."""
+    without: str = ""
+
+
+_RECORDING = ("tests/recording", "tests/panel/test_recordings.py", "tests/laws/test_replay.py", "tests/test_steps.py")
+ROOMS = {
+    "law": Room("rtloop/law", ("tests/law",), compiled=False),
+    "laws": Room("rtloop/laws", ("tests/laws", "tests/law/test_inverse_hysteresis.py"), compiled=False),
+    "engine": Room("rtloop/engine", ("tests/engine", "tests/law/test_safety.py"), compiled=False),
+    "supervision": Room(
+        "rtloop/supervision",
+        (
+            *("tests/service/test_parking.py", "tests/service/test_stall.py", "tests/service/test_recording_state.py"),
+            *("tests/service/test_other_users.py", "tests/service/test_binding.py", "tests/service/test_finding.py"),
+            *("tests/service/test_short_runs.py", "tests/service/test_run.py", "tests/service/test_lock.py"),
+            *("tests/service/test_python_driver.py", "tests/service/test_can_supervision.py", "tests/test_files.py"),
+            *("tests/doctor/test_host_delay.py", "tests/doctor/test_conditions.py", "tests/recording/test_quota.py"),
+            *("tests/recording/test_disk.py", "tests/recording/test_replaced.py"),
+        ),
+        compiled=True,
+    ),
+    "recording": Room("rtloop/recording", _RECORDING, compiled=True, without="rtloop/recording/replay"),
+    "replay": Room("rtloop/recording/replay", (*_RECORDING, "tests/laws/test_coupled.py"), compiled=True),
+    "changing": Room(
+        "rtloop/service/changing",
+        (
+            *("tests/service/test_building.py", "tests/service/test_preview.py", "tests/service/test_reload.py"),
+            *("tests/service/test_api.py", "tests/service/test_api_refusals.py", "tests/service/test_learn.py"),
+            *("tests/service/test_retune.py", "tests/laws/test_coupled.py"),
+        ),
+        compiled=True,
+    ),
+    "analysis": Room(
+        "rtloop/analysis",
+        (
+            *("tests/design/test_learning.py", "tests/design/test_coupled_loop.py", "tests/design/test_judgement.py"),
+            *("tests/design/test_measured_loop.py", "tests/design/test_loop_analysis.py"),
+            *("tests/design/test_compare_discrete.py", "tests/design/test_referee.py"),
+            *("tests/design/test_running_loop.py", "tests/design/test_simulated.py", "tests/service/test_response.py"),
+        ),
+        compiled=True,
+    ),
+    "hil": Room(
+        "hil",
+        (
+            *("tests/hil", "tests/test_kernels.py", "tests/engine/test_stale_cache.py", "tests/test_messages.py"),
+            *("tests/drivers/test_sim_contract.py", "tests/drivers/test_shm_contract.py"),
+            *("tests/drivers/test_board_losses.py", "tests/drivers/test_board_stale.py", "tests/test_files.py"),
+            *("tests/service/test_other_users.py", "tests/service/test_binding.py"),
+        ),
+        compiled=False,
+    ),
+}
+
+
+def sources_of(room: Room, tree: Path = ROOT) -> list[str]:
+    """The room's modules, as paths from the root of the tree."""
+    found = sorted(path.relative_to(tree).as_posix() for path in (tree / room.sources).rglob("*.py"))
+    return [path for path in found if not (room.without and path.startswith(room.without + "/"))]
+
+
+def room_tests(room: Room) -> list[str]:
+    """The room's test files, as paths from the root of the tree."""
+    found = [
+        path
+        for place in room.tests
+        for path in ([ROOT / place] if place.endswith(".py") else sorted((ROOT / place).glob("test_*.py")))
+    ]
+    return [path.relative_to(ROOT).as_posix() for path in found]
+
+
+def shares(counts: dict[str, int], total: int, least: int = LEAST) -> dict[str, int]:
+    """The number of mutants of each room: `least` (where `total` suffices), and a share of the rest by its places."""
+    base = min(least, total // len(counts))
+    rest, places_in_all = total - base * len(counts), sum(counts.values())
+    exact = {name: rest * count / places_in_all for name, count in counts.items()}
+    given = {name: base + int(share) for name, share in exact.items()}
+    largest = sorted(counts, key=lambda name: exact[name] % 1, reverse=True)
+    for name in largest[: total - sum(given.values())]:
+        given[name] += 1
+    return {name: min(number, counts[name]) for name, number in given.items()}

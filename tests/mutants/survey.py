@@ -1,0 +1,104 @@
+"""Which lines each test of a room executes, and how long it takes, without any mistake: a plug-in of pytest."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import coverage
+import pytest
+
+from tests.mutants.steady import Steady
+
+CPU_LIMIT_S = 2.0
+"""A test that computes for longer (traced, and kernels perhaps uncompiled) is left out."""
+SHARED = "shared"
+"""The test of a file under whose name lines of its wider fixtures stand."""
+
+
+class TooLong(BaseException):
+    """A test took more than its share of the processor."""
+
+
+class Survey(Steady):
+    """Notes the seconds and the lines of every test that passes."""
+
+    def __init__(self, root: Path, *, compiled: bool) -> None:
+        super().__init__(compiled=compiled)
+        self.root = root
+        self.seconds: dict[str, float] = {}
+        self.failed: dict[str, str] = {}
+        self._coverage = coverage.Coverage(
+            data_file=None, config_file=False, include=[f"{root}/{place}/*" for place in ("rtloop", "hil", "drivers")]
+        )
+        self._too_long: set[str] = set()
+        """Functions of which one case was too long, so that the others need not be tried."""
+        signal.signal(signal.SIGPROF, _raise_too_long)
+        self._coverage.start()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Run one test under its own name."""
+        self._coverage.switch_context(item.nodeid)
+        start = time.monotonic()
+        try:
+            return (yield)
+        finally:
+            self.seconds[item.nodeid] = time.monotonic() - start
+            self._coverage.switch_context("")
+
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        """Leave a case out whose like was too long."""
+        if item.nodeid.partition("[")[0] in self._too_long:
+            pytest.skip("another case was too long")
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        """For so long and no longer."""
+        signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT_S, CPU_LIMIT_S / 10)  # again, where a callback swallowed it
+        try:
+            return (yield)
+        except TooLong:
+            self._too_long.add(item.nodeid.partition("[")[0])
+            pytest.fail("too long")
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[None]:
+        """What a wider fixture executes belongs to every test of the file."""
+        if fixturedef.scope == "function":
+            return (yield)
+        item = request._pyfuncitem.nodeid
+        self._coverage.switch_context(f"{item.partition('::')[0]}::{SHARED}")
+        try:
+            return (yield)
+        finally:
+            self._coverage.switch_context(item)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note what did not pass, or was skipped."""
+        if report.outcome != "passed":
+            self.failed[report.nodeid] = str(report.longrepr)[-400:]
+
+    def result(self) -> dict[str, Any]:
+        """For each test that passed: seconds, and its lines by file; beside them what did not, and why."""
+        self._coverage.stop()
+        data = self._coverage.get_data()
+        lines: dict[str, dict[str, list[int]]] = {}
+        for file in data.measured_files():
+            path = os.path.relpath(file, self.root)
+            for line, contexts in data.contexts_by_lineno(file).items():
+                for context in contexts:
+                    lines.setdefault(context, {}).setdefault(path, []).append(line)
+        passed = {name: seconds for name, seconds in self.seconds.items() if name not in self.failed}
+        names = {name for name in lines if name in passed or name.endswith(f"::{SHARED}")}
+        return {"seconds": passed, "failed": self.failed, "lines": {name: lines[name] for name in sorted(names)}}
+
+
+def _raise_too_long(*_: Any) -> None:
+    raise TooLong(f"more than {CPU_LIMIT_S} s of the processor")

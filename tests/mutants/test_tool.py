@@ -1,0 +1,114 @@
+"""The tool that plants mistakes tells the dead from the survivors, and counts them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import pytest
+
+from tests.mutants.account import EQUIVALENT, Equivalent, Result, Verdict, equivalents, keep, kept, table
+from tests.mutants.mutant import Mutant
+from tests.mutants.rooms import LEAST, ROOMS, ROOT, room_tests, shares, sources_of
+from tests.mutants.trees import Tree
+from tests.mutants.trial import Trial
+
+SOURCE = """def limited(value, limit):
+    if value > limit:
+        return limit
+    return value
+"""
+TEST = """from rtloop.limits import limited
+
+def test_a_value_beyond_the_limit_is_the_limit():
+    assert limited(3, 2) == 2
+"""
+
+
+def mutant(room: str = "law", after: str = "if value <= limit:") -> Mutant:
+    return Mutant(room, "hil/modal.py", 2, "operator", hash(after), "if value > limit:", after)
+
+
+@dataclass
+class Scratch:
+    """A project of one module and one test in a temporary folder."""
+
+    tree: Tree
+
+    def verdict(self, text: str, tests: tuple[str, ...]) -> Result:
+        trial = Trial(
+            self.tree, mutant()._replace(file="rtloop/limits.py"), text, dict.fromkeys(tests, 1.0), compiled=True
+        )
+        while (result := trial.result()) is None:
+            time.sleep(0.01)
+        return result
+
+
+@pytest.fixture
+def scratch(tmp_path, monkeypatch):
+    project = tmp_path / "project"
+    for name, text in (("rtloop/limits.py", SOURCE), ("tests/test_limits.py", TEST), ("pytest.ini", "[pytest]\n")):
+        (project / name).parent.mkdir(parents=True, exist_ok=True)
+        (project / name).write_text(text)
+    monkeypatch.setattr(Mutant, "key", "key")
+    return Scratch(Tree(tmp_path / "work", project))
+
+
+def test_a_mutant_that_a_test_sees_dies_and_one_that_none_sees_survives(scratch):
+    test = "tests/test_limits.py::test_a_value_beyond_the_limit_is_the_limit"
+    died = scratch.verdict(SOURCE.replace(">", "<="), (test,))
+    assert (died.verdict, died.test) == (Verdict.DIED, test)
+    assert (scratch.tree.root / "rtloop/limits.py").read_text() == SOURCE
+    survived = scratch.verdict(SOURCE.replace(">", ">="), (test,))
+    assert (survived.verdict, survived.test) == (Verdict.SURVIVED, "")
+    assert scratch.verdict(SOURCE.replace(">", "<="), ()).verdict is Verdict.UNTESTED
+
+
+def test_a_test_that_is_not_there_is_no_death(scratch):
+    with pytest.raises(RuntimeError, match="exit code is 4"):
+        scratch.verdict(SOURCE, ("tests/test_limits.py::test_of_another_name",))
+
+
+def test_every_room_gets_its_share():
+    counts = {"small": 30, "middle": 300, "large": 3000}
+    assert shares(counts, 12) == {"small": 4, "middle": 4, "large": 4}
+    given = shares(counts, 175)
+    assert sum(given.values()) == 175
+    assert given == {"small": LEAST + 1, "middle": LEAST + 9, "large": LEAST + 90}
+    assert shares({"small": 3, "large": 3000}, 100)["small"] == 3
+
+
+def test_every_room_has_sources_and_tests_and_no_source_is_in_two():
+    sources = [path for room in ROOMS.values() for path in sources_of(room)]
+    assert len(sources) == len(set(sources))
+    for room in ROOMS.values():
+        assert sources_of(room)
+        assert all((ROOT / path).is_file() for path in room_tests(room))
+
+
+def test_each_mutant_that_is_called_equivalent_still_fits_its_source():
+    for entry in equivalents(EQUIVALENT):
+        text = " ".join(line.strip() for line in (ROOT / entry.file).read_text(encoding="utf-8").splitlines())
+        assert entry.before in text, entry
+        assert entry.after != entry.before, entry
+        assert entry.reason, entry
+
+
+def test_the_score_counts_deaths_among_mutants_that_change_something():
+    verdicts = [Verdict.DIED, Verdict.TIMED_OUT, Verdict.SURVIVED, Verdict.UNTESTED, Verdict.SURVIVED]
+    mutants = [mutant(after=str(number)) for number in range(len(verdicts) + 1)]
+    results = {
+        one.key: Result(one.key, verdict, 1.0, "") for one, verdict in zip(mutants, verdicts, strict=False)
+    }  # the last was not tried
+    known = [Equivalent(mutants[4].file, mutants[4].before, mutants[4].after, "a reason")]
+    _, survivors, score = table(mutants, results, known)
+    assert survivors == mutants[2:4]
+    assert score == 0.5
+
+
+def test_the_newest_result_of_a_mutant_counts(tmp_path):
+    path, one = tmp_path / "folder" / "results.jsonl", mutant()
+    assert kept(path) == {}
+    for verdict in (Verdict.SURVIVED, Verdict.DIED):
+        keep(path, one, Result(one.key, verdict, 1.5, "a test"))
+    assert kept(path) == {one.key: Result(one.key, Verdict.DIED, 1.5, "a test")}

@@ -1,0 +1,120 @@
+"""Copies of the tree, in which mutants are planted, and tests that run in them without a new interpreter."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import os
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.mutants.rooms import ROOT
+
+LEFT = shutil.ignore_patterns(
+    ".git", ".venv", "build", "dist", ".benchmarks", "recordings", "__pycache__", "*.egg-info"
+)
+PRELOADED = (
+    *("numpy", "scipy.signal", "scipy.linalg", "scipy.optimize", "pydantic", "pytest", "_pytest.runner", "hypothesis"),
+    *(
+        "click",
+        "rich.console",
+        "rich.table",
+        "starlette.applications",
+        "uvicorn",
+        "mcap.reader",
+        "zstandard",
+        "lz4.frame",
+    ),
+    *(
+        "tomlkit",
+        "jinja2",
+        "prometheus_client",
+        "websockets",
+        "llvmlite.binding",
+        "coverage",
+        "xdist",
+        "pytest_timeout",
+    ),
+)
+"""Other people's modules that most tests import: once, by the process that is forked for each mutant."""
+TIMED_OUT, NOT_RUN = -100, 70
+"""Exit codes that neither pytest nor a signal gives."""
+
+
+def preload() -> None:
+    """Import what most tests need, and leave it to the processes that are forked."""
+    for name in PRELOADED:
+        importlib.import_module(name)
+    gc.freeze()
+
+
+class Tree:
+    """A copy of the project with a cache of compiled code of its own, in `folder`."""
+
+    def __init__(self, folder: Path, source: Path = ROOT) -> None:
+        self.root, self._cache, self._output = folder / "tree", folder / "cache", folder / "output"
+        self._cache.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(self.root, ignore_errors=True)
+        shutil.copytree(source, self.root, symlinks=True, ignore=LEFT)
+
+    def start(self, run: Callable[[], int], *, compiled: bool, writes_bytecode: bool = False) -> int:
+        """Number of a new process that calls `run` within this tree, and ends with what it returns."""
+        child = os.fork()
+        if child == 0:
+            status = NOT_RUN
+            try:
+                self._enter(compiled=compiled, writes_bytecode=writes_bytecode)
+                status = run()
+            except BaseException:  # whatever it is, the parent reads of it
+                traceback.print_exc()
+            finally:
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(status)
+        return child
+
+    def _enter(self, *, compiled: bool, writes_bytecode: bool) -> None:
+        os.setsid()
+        output = os.open(self._output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+        os.chdir(self.root)
+        os.environ |= {"XDG_CACHE_HOME": str(self._cache), "PYTHONPATH": str(self.root), "OPENBLAS_NUM_THREADS": "1"}
+        os.environ.pop("NUMBA_DISABLE_JIT", None)
+        if not compiled:
+            os.environ["NUMBA_DISABLE_JIT"] = "1"
+        if not writes_bytecode:  # of a mutated module it would be found by the next one, whose time stamp is the same
+            sys.dont_write_bytecode, os.environ["PYTHONDONTWRITEBYTECODE"] = True, "1"
+        sys.path[:] = [str(self.root), *(place for place in sys.path if place not in ("", str(ROOT)))]
+        for name in [name for name in sys.modules if name.partition(".")[0] in ("tests", "rtloop")]:
+            del sys.modules[name]
+
+    def output(self) -> str:
+        """What the last process wrote."""
+        return self._output.read_text(errors="replace")
+
+
+def ended(child: int, until: float) -> int | None:
+    """Exit code of a process, or None while it runs; after `until` it is killed with its children: TIMED_OUT."""
+    number, status = os.waitpid(child, os.WNOHANG)
+    if number:
+        _end_group(child)
+        return os.waitstatus_to_exitcode(status)
+    if time.monotonic() < until:
+        return None
+    _end_group(child)
+    os.waitpid(child, 0)
+    return TIMED_OUT
+
+
+def _end_group(leader: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(leader, signal.SIGKILL)

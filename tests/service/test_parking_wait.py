@@ -1,0 +1,60 @@
+"""How long `rtloop park` waits for a loop that outlived its service, in told time: no loop is killed in its ramp."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rtloop.drivers.errors import DriverError
+from rtloop.engine.memory import Word
+from rtloop.supervision import parking
+
+HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S = 1.5, 2.0
+
+
+class Driven:
+    """A block whose loop goes on until it is killed at `killed_s`, or for ever; `now_s` is the time that passes."""
+
+    def __init__(self, drives_v: list[float], *, can_be_killed: bool = True) -> None:
+        self.now_s, self.killed_s, self._can_be_killed = 100.0, None, can_be_killed
+        self._fields = {"last_drive_v": np.array(drives_v)}
+
+    def __getitem__(self, name: str):
+        return self._fields[name]
+
+    def load(self, word: Word) -> int:
+        assert word is Word.HEARTBEAT_NS
+        return 7
+
+    def driven_by(self) -> int | None:
+        return None if self.killed_s is not None and self._can_be_killed else 4711
+
+    def kill_driver(self) -> None:
+        self.killed_s = self.killed_s or self.now_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_s += duration_s
+
+
+def await_end(block: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(monotonic=lambda: block.now_s, sleep=block.sleep)
+    monkeypatch.setattr(parking, "time", clock)
+    parking._await_end(block, HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("drives_v", [[9.0], [0.5, -9.0], [9.0, 0.5]])
+def test_a_loop_has_the_time_of_its_timeout_and_of_its_longest_ramp(drives_v, monkeypatch):
+    """9 V at 2 V/s take 4.5 s, after 1.5 s without a supervisor."""
+    block = Driven(drives_v)
+    await_end(block, monkeypatch)
+    assert block.killed_s == pytest.approx(100.0 + 4.5 + 1.5 + parking.MARGIN_S, abs=2 * parking.POLL_S)
+
+
+def test_a_loop_that_cannot_be_killed_is_told(monkeypatch):
+    block = Driven([0.0], can_be_killed=False)
+    with pytest.raises(DriverError, match="process 4711 drives the outputs and cannot be killed"):
+        await_end(block, monkeypatch)
+    end_s = 100.0 + 1.5 + parking.MARGIN_S + parking.KILL_S
+    assert block.now_s == pytest.approx(end_s, abs=2 * parking.POLL_S)
