@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.drivers.comedi_board import Board, Kind
 from rtloop.drivers.errors import DriverError
-from rtloop.hil.native.compiled import cfunc, intrinsic
+from rtloop.hil.native.compiled import cfunc, intrinsic_like
 from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import Options
 
@@ -28,7 +28,7 @@ LINE = np.dtype(
 )
 """A channel as libcomedi addresses it, and its scale: volts = lowest_v + code · lsb_v."""
 CONTEXT = np.dtype(
-    [(name, np.int64) for name in ("device", "data_read", "data_write", "code", "inputs", "outputs")]
+    [(name, np.int64) for name in ("board", "data_read", "data_write", "code", "inputs", "outputs")]
     + [(name, np.int64) for name in ("input_count", "output_count", "failed_input", "failed_output")]
 )
 """`failed_…`: place of the channel that failed last, −1 for none."""
@@ -67,7 +67,14 @@ class ComediOptions(Options):
         return self
 
 
-@intrinsic
+def _call_in_python(function: int, device: int, line: tuple[int, ...], last: Any) -> int:
+    """As `_call`: `last` is of type uint32 where it is a code."""
+    last_type = ctypes.c_uint32 if isinstance(last, np.uint32) else ctypes.c_ssize_t
+    prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
+    return prototype(int(function))(int(device), *map(int, line), int(last))
+
+
+@intrinsic_like(_call_in_python)
 def _call(compiler: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
     """`int function(comedi_t *, subdevice, channel, range, aref, last)`, addresses as integers.
 
@@ -97,7 +104,7 @@ def comedi_read(context, values):
     for i in range(card.input_count):
         line = lines[i]
         where = line.subdevice, line.channel, line.range, line.aref
-        if _call(card.data_read, card.device, where, card.code) < 0:
+        if _call(card.data_read, card.board, where, card.code) < 0:
             card.failed_input = i
             return FAILED
         out[i] = line.lowest_v + code[0] * line.lsb_v
@@ -118,7 +125,7 @@ def comedi_write(context, values):
         code = np.rint((volts[i] - line.lowest_v) / line.lsb_v)
         code = 0.0 if code < 0.0 else (line.highest_code if code > line.highest_code else code)
         where = line.subdevice, line.channel, line.range, line.aref
-        if _call(card.data_write, card.device, where, np.uint32(code)) < 0:
+        if _call(card.data_write, card.board, where, np.uint32(code)) < 0:
             card.failed_output = i
             return FAILED
     return 0
@@ -211,7 +218,7 @@ class ComediDriver(Driver):
         assert self._board is not None
         self._arrays = inputs, outputs, code
         context = self._context
-        context["device"], context["data_read"], context["data_write"] = self._board.addresses
+        context["board"], context["data_read"], context["data_write"] = self._board.addresses
         context["inputs"], context["outputs"], context["code"] = (array.ctypes.data for array in self._arrays)
         context["input_count"], context["output_count"] = inputs.size, outputs.size
         context["failed_input"] = context["failed_output"] = -1

@@ -31,6 +31,12 @@ def listed(source: str, faults: Sequence[str]) -> str:
     return "\n  ".join([f"{source}: {count}", *faults])
 
 
+def one_line(error: BaseException) -> str:
+    """Type and message of an exception on one line, without characters that a terminal would obey."""
+    words = " ".join(str(error).split())
+    return f"{type(error).__name__}: {''.join(letter if letter.isprintable() else '?' for letter in words)}"
+
+
 class RtloopError(Exception):
     """Base: the message names the thing, the value and what is allowed."""
 

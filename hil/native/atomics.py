@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from rtloop.hil.native.compiled import intrinsic
+from rtloop.hil.native import uncompiled
+from rtloop.hil.native.compiled import intrinsic, intrinsic_like
 
 ALIGNMENT = 8
 
@@ -22,7 +23,7 @@ def _is_words(types: Any, array: Any) -> bool:
     return isinstance(array, types.Array) and array.dtype == types.uint64 and array.ndim == 1
 
 
-@intrinsic
+@intrinsic_like(uncompiled.load_acquire)
 def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
     """Word `index` of a uint64 array, ordered before every later load and store."""
     types = compiler.types
@@ -36,7 +37,7 @@ def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
     return types.uint64(array, types.intp), codegen
 
 
-@intrinsic
+@intrinsic_like(uncompiled.store_release)
 def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
     """Set word `index` of a uint64 array, ordered after every earlier load and store."""
     types = compiler.types

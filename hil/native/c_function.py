@@ -13,11 +13,16 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from rtloop.hil.native import machine_code
+from rtloop.hil.native.uncompiled import as_written, runs_as_written
 
 C_TYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_uint64, "intp": ctypes.c_ssize_t}
 C_TYPES |= {"voidptr": ctypes.c_ssize_t, "CPointer(float64)": ctypes.c_ssize_t}
 ENTRY = {"error_model": "numpy"}
+FAILED = -1
+"""What a C function returns that raised in Python: to clocks and drivers a failure."""
 
 
 class Outward:
@@ -26,11 +31,14 @@ class Outward:
     def __init__(self, function: Callable[..., Any], signature: str) -> None:
         self.__name__, self._function, self._signature = function.__name__, function, signature
         self._name = f"{function.__module__}.{function.__qualname__}"
+        self._machine_code: int | None = None
 
-    @cached_property
+    @property
     def address(self) -> int:
-        """Where its machine code is."""
-        return machine_code.loaded(self._name) or self._compiled()
+        """Where its machine code is, which is compiled if need be."""
+        if self._machine_code is None:
+            self._machine_code = machine_code.loaded(self._name) or self._compiled()
+        return self._machine_code
 
     def _compiled(self) -> int:
         raise NotImplementedError
@@ -42,17 +50,42 @@ class Outward:
 
 
 class CFunction(Outward):
-    """A kernel as a C function. It raises nothing, or numba's own C function says so where nobody can catch it."""
+    """A kernel as a C function. It raises nothing, or numba's own C function says so where nobody can catch it.
+
+    Within `as_written`, where there is no machine code, it is the kernel as it is written, called back.
+    """
+
+    @property
+    def address(self) -> int:
+        """Where a C function is: machine code, compiled if need be, or the kernel as it is written."""
+        if self._machine_code is None and runs_as_written():
+            self._machine_code = machine_code.loaded(self._name)
+            return self._machine_code or self._written[1]
+        return super().address
 
     def __call__(self, *arguments: int) -> Any:
         """Run it."""
-        return self._callable(*arguments)
+        return self._prototype(self.address)(*arguments)
 
     @cached_property
-    def _callable(self) -> Any:
+    def _prototype(self) -> Any:
         """With the interpreter waiting, as for every kernel."""
         result, *given = self._types
-        return ctypes.PYFUNCTYPE(result, *given)(self.address)
+        return ctypes.PYFUNCTYPE(result, *given)
+
+    @cached_property
+    def _written(self) -> tuple[Any, int]:
+        """The kernel as it is written, as a C function, and its address. What it raises is returned as FAILED."""
+
+        def run(*arguments: int) -> Any:
+            try:
+                with as_written(), np.errstate(all="ignore"):
+                    return self._function(*arguments)
+            except Exception:  # nothing may propagate into C
+                return FAILED
+
+        function = self._prototype(run)
+        return function, ctypes.cast(function, ctypes.c_void_p).value or 0
 
     def _compiled(self) -> int:
         from rtloop.hil.native.compiler import numba

@@ -14,7 +14,7 @@ from typing import Any
 
 from rtloop.hil.native import machine_code
 from rtloop.hil.native.c_function import CFunction, Entry, kernel_address
-from rtloop.hil.native.uncompiled import address_of
+from rtloop.hil.native.uncompiled import address_of, runs_as_written
 
 OURS = "rtloop."
 """Modules whose sources name the cache; what stands in others is numba's to cache."""
@@ -39,7 +39,7 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run it."""
-        return self._dispatcher(*arguments)
+        return (self.py_func if runs_as_written() else self._dispatcher)(*arguments)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # what Python asks of any object is no reason to import the compiler
@@ -48,10 +48,19 @@ class Kernel:
 
 
 class Name:
-    """A name in kernels that stands for no kernel; `meaning` gives its type, once there is a compiler to ask for it."""
+    """A name in kernels that stands for no kernel; `meaning` gives its type, once there is a compiler to ask for it.
 
-    def __init__(self, name: str, meaning: Callable[[Any], Any]) -> None:
-        self.__name__, self._meaning = name, meaning
+    `uncompiled` is what it does in a kernel that runs as it is written; without one it cannot be called there.
+    """
+
+    def __init__(self, name: str, meaning: Callable[[Any], Any], uncompiled: Callable[..., Any] | None = None) -> None:
+        self.__name__, self._meaning, self._uncompiled = name, meaning, uncompiled
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Do what it stands for, in Python."""
+        if self._uncompiled is None:
+            raise NotImplementedError(f"{self.__name__} runs in compiled kernels only")
+        return self._uncompiled(*arguments)
 
     @cached_property
     def _numba_type_(self) -> Any:
@@ -97,7 +106,7 @@ def inlined(function: Callable[..., Any]) -> Any:
     return _kernel(function, inline="always", error_model="numpy")
 
 
-def intrinsic(function: Callable[..., Any]) -> Any:
+def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | None = None) -> Any:
     """A function that writes its own LLVM code; its first parameter is the module `compiler`, with what that takes."""
 
     def meaning(compiler: Any) -> Any:
@@ -107,13 +116,18 @@ def intrinsic(function: Callable[..., Any]) -> Any:
 
         return compiler.types.Function(compiler.make_intrinsic_template(found, typed, function.__name__))
 
-    found: Any = Name(function.__name__, meaning)  # as Any, for its callers leave out that parameter
+    found: Any = Name(function.__name__, meaning, uncompiled)  # as Any, for its callers leave out that parameter
     return found
 
 
-def borrowed(name: str) -> Any:
+def intrinsic_like(uncompiled: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+    """An `intrinsic` that does the same as a function in Python, which stands for it where kernels run as written."""
+    return lambda function: intrinsic(function, uncompiled)
+
+
+def borrowed(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
     """A function of numba's own, for kernels."""
-    return Name(name, lambda compiler: compiler.type_of(getattr(compiler.numba, name)))
+    return Name(name, lambda compiler: compiler.type_of(getattr(compiler.numba, name)), uncompiled)
 
 
 def external(name: str, signature: str) -> Any:

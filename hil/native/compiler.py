@@ -11,12 +11,13 @@ import numba
 import numba.np.linalg
 from llvmlite import ir
 from numba import config
-from numba.core import cgutils, types
+from numba.core import caching, cgutils, types
 from numba.core.registry import cpu_target
 from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import make_intrinsic_template
 
 from rtloop.hil.native.cache import CACHE_FOLDER
+from rtloop.hil.native.whole_files import WholeFiles
 
 __all__ = ["cgutils", "ir", "make_intrinsic_template", "numba", "signature_of", "type_of", "types"]
 
@@ -40,6 +41,7 @@ def _absent() -> None:
 
 
 _load_arrays_without_blas()
+caching.IndexDataCacheFile = WholeFiles  # pyright: ignore[reportAttributeAccessIssue]
 config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIssue]
 # Four equal operations written side by side become one vector operation, which reorders no sum. Loops are left as they
 # are: they run over an axis, five states or fifteen plays, and their vector forms cost more than they save.

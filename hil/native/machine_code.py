@@ -5,50 +5,56 @@ To have numba load its own takes a second, most of which numba needs to know all
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import os
-import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
 
-_DIGEST_BYTES = hashlib.sha256().digest_size
+from rtloop.hil.native import stored
+
 _engines: list[Any] = []
 """They own the machine code, one each: several may hold copies of one kernel."""
 
 
 def keep(name: str, machine_code: bytes) -> None:
     """Keep it under the name of its symbol, if that can be."""
-    path = _path(name)
-    with contextlib.suppress(OSError):  # it is compiled again
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(machine_code).digest() + machine_code)
-        os.replace(file.name, path)
+    stored.write(_path(name), machine_code)
 
 
 def loaded(name: str) -> int | None:
     """Address of what was kept; None where nothing was, or not the whole of it."""
     try:
-        data = _path(name).read_bytes()
-    except OSError:
+        machine_code = stored.read(_path(name))
+    except OSError:  # there is no folder for a cache
         return None
-    machine_code = data[_DIGEST_BYTES:]
-    if hashlib.sha256(machine_code).digest() != data[:_DIGEST_BYTES]:
+    if machine_code is None:
         return None
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+    engine = _engine("")
     engine.add_object_file(llvm.ObjectFileRef.from_data(machine_code))
     engine.finalize_object()
-    _engines.append(engine)
     return engine.get_function_address(name)
+
+
+def assembled(text: str, name: str) -> int:
+    """Address of a function in a text in LLVM's language, compiled here: a millisecond for a few lines."""
+    engine = _engine(text)
+    engine.finalize_object()
+    return engine.get_function_address(name)
+
+
+def _engine(text: str) -> Any:
+    """A linker that holds a text in LLVM's language."""
+    machine = _machine()  # first: the text is parsed for this processor
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
+    _engines.append(engine)
+    return engine
 
 
 def _path(name: str) -> Path:
     from rtloop.hil.native.cache import CACHE_FOLDER
 
-    return CACHE_FOLDER / f"{name}.o"
+    return CACHE_FOLDER / f"{name}{stored.MACHINE_CODE}"
 
 
 @cache

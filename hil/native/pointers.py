@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 from rtloop.hil.native import uncompiled
-from rtloop.hil.native.compiled import UNCOMPILED, borrowed, external, intrinsic
+from rtloop.hil.native.compiled import borrowed, external, intrinsic_like
 
-carray: Any = uncompiled.carray if UNCOMPILED else borrowed("carray")
+carray: Any = borrowed("carray", uncompiled.carray)
 """numba's array view of a pointer."""
 SIGNATURE = "int32(voidptr, CPointer(float64))"
 """numba's signature of `int32 function(void *context, double *values)`."""
@@ -20,7 +20,7 @@ copy: Any = external("memcpy", "intp(intp, intp, intp)")
 """`memcpy`: to, from, bytes."""
 
 
-@intrinsic
+@intrinsic_like(uncompiled.call)
 def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
     """Call `int32 function(void *context, double *values)`, all three given as integers."""
 
@@ -38,7 +38,7 @@ def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
     return types.int32(types.intp, types.intp, types.intp), codegen
 
 
-@intrinsic
+@intrinsic_like(uncompiled.call_law)
 def call_law(compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, told: Any) -> Any:
     """Call a compiled function of two records and a third or a number; its status, 0 where it came to its end.
 
@@ -59,7 +59,7 @@ def call_law(compiler: Any, function: Any, result: Any, raised: Any, coefficient
     return types.int32(*[types.intp] * 5, types.float64 if number else types.intp), codegen
 
 
-@intrinsic
+@intrinsic_like(uncompiled.address_pointer)
 def address_pointer(compiler: Any, address: Any) -> Any:
     """An integer address as `void *`, for numba.carray."""
     types = compiler.types
@@ -68,7 +68,3 @@ def address_pointer(compiler: Any, address: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), codegen
-
-
-if UNCOMPILED:
-    call, call_law, address_pointer = uncompiled.call, uncompiled.call_law, uncompiled.address_pointer

@@ -1,23 +1,47 @@
-"""What compiled code does with addresses, in Python: for kernels that run without the compiler, to be looked into.
+"""What compiled code does with addresses, in Python: for kernels that run as they are written, without the compiler.
 
-With NUMBA_DISABLE_JIT=1 every kernel is an ordinary function. An address is then still one of memory, and that of a
-function a number under which `address_of` has noted it.
+With NUMBA_DISABLE_JIT=1 every kernel is an ordinary function, to be looked into. An address is then still one of
+memory, and that of a function a number under which `address_of` has noted it.
+
+Within `as_written` kernels whose machine code is not at hand are ordinary functions: parking waits for no compiler.
 """
 
 from __future__ import annotations
 
 import ctypes
 import itertools
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+
+from rtloop.hil.native import words
 
 _functions: dict[int, Callable[..., Any]] = {}
 _numbers = itertools.count(1)
 OK, RAISED = 0, -1
 raised: list[Exception] = []
 """What functions of laws have raised, the newest last."""
+
+
+_thread = threading.local()
+
+
+@contextmanager
+def as_written() -> Iterator[None]:
+    """In this thread, run kernels as they are written if their machine code is not at hand: slower, the same bits."""
+    before, _thread.as_written = runs_as_written(), True
+    try:
+        yield
+    finally:
+        _thread.as_written = before
+
+
+def runs_as_written() -> bool:
+    """Whether this thread is within `as_written`."""
+    return getattr(_thread, "as_written", False)
 
 
 def address_of(function: Callable[..., Any]) -> int:
@@ -32,7 +56,7 @@ def address_pointer(address: int) -> int:
     return int(address)
 
 
-def carray(pointer: int, shape: Any, dtype: Any) -> Any:
+def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
     """An array over the memory at `pointer`, its records with attributes."""
     kind = np.dtype(dtype)
     size = int(np.prod(shape)) * kind.itemsize
@@ -58,3 +82,13 @@ def call_law(function: int, result: int, place: int, coefficients: int, state: i
     if value is not None:
         carray(result, 1, np.float64)[0] = value
     return OK
+
+
+def load_acquire(array: Any, index: int) -> Any:
+    """As the compiled one."""
+    return np.uint64(words.load_acquire(array.ctypes.data + int(index) * array.itemsize))
+
+
+def store_release(array: Any, index: int, value: int) -> None:
+    """As the compiled one."""
+    words.store_release(array.ctypes.data + int(index) * array.itemsize, int(value))

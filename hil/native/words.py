@@ -1,28 +1,55 @@
-"""Ordered access to single words of shared memory, from Python; what compiled code has in `atomics`."""
+"""Ordered access to single words of shared memory, from Python; what compiled code has in `atomics`.
+
+Written in LLVM's language, for parking needs them: each process assembles them in a millisecond, without numba and
+without a cache.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+import ctypes
+from functools import cache
+from typing import Any
 
-from rtloop.hil.native import atomics
-from rtloop.hil.native.compiled import entry
-from rtloop.hil.native.pointers import address_pointer, carray
+from rtloop.hil.native import machine_code
+
+_TEXT = """
+define i64 @load_acquire(i64 %address) {
+  %word = inttoptr i64 %address to ptr
+  %value = load atomic i64, ptr %word acquire, align 8
+  ret i64 %value
+}
+define void @store_release(i64 %address, i64 %value) {
+  %word = inttoptr i64 %address to ptr
+  store atomic i64 %value, ptr %word release, align 8
+  ret void
+}
+define i32 @exchanged(i64 %address, i64 %expected, i64 %wanted) {
+  %word = inttoptr i64 %address to ptr
+  %pair = cmpxchg ptr %word, i64 %expected, i64 %wanted seq_cst seq_cst, align 8
+  %done = extractvalue { i64, i1 } %pair, 1
+  %result = zext i1 %done to i32
+  ret i32 %result
+}
+"""
+_WORD = ctypes.c_uint64
 
 
-@entry("uint64(intp)")
-def load_acquire(address):
+@cache
+def _function(name: str, result: Any, count: int) -> Any:
+    """A function of the text above, of so many words; the interpreter waits for it."""
+    return ctypes.PYFUNCTYPE(result, *[_WORD] * count)(machine_code.assembled(_TEXT, name))
+
+
+def load_acquire(address: int) -> int:
     """The uint64 at an address, loaded before every later load and store."""
-    return atomics.load_acquire(carray(address_pointer(address), 1, np.uint64), 0)
+    return _function("load_acquire", _WORD, 1)(address)
 
 
-@entry("int32(intp, uint64)")
-def store_release(address, value):
-    """Set the uint64 at an address, after every earlier load and store; 0."""
-    atomics.store_release(carray(address_pointer(address), 1, np.uint64), 0, value)
-    return 0
+def store_release(address: int, value: int) -> None:
+    """Set the uint64 at an address, after every earlier load and store."""
+    _function("store_release", None, 2)(address, value)
 
 
-@entry("int32(intp, uint64, uint64)")
-def exchanged(address, expected, wanted):
+def exchanged(address: int, expected: int, wanted: int) -> int:
     """Set the uint64 at an address to `wanted` if it is `expected`, at once; 1 if it was, 0 otherwise."""
-    return atomics.exchanged(carray(address_pointer(address), 1, np.uint64), 0, expected, wanted)
+    return _function("exchanged", ctypes.c_int32, 3)(address, expected, wanted)

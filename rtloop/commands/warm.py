@@ -7,6 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from rtloop.hil.native import stored
 from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 
 KEPT_CACHES = 8
@@ -18,6 +19,8 @@ def main() -> int:
 
     rehearse()
     _rehearse_others()
+    for path in stored.set_aside_files(CACHE_FOLDER):
+        path.unlink(missing_ok=True)
     if CACHE_IS_PERSISTENT:
         caches = sorted(CACHE_FOLDER.parent.iterdir(), key=lambda folder: folder.stat().st_mtime, reverse=True)
         for folder in caches[KEPT_CACHES:]:
@@ -31,8 +34,8 @@ def _rehearse_others() -> None:
     """What recorder, service and board compile for themselves."""
     import numpy as np
 
-    import rtloop.drivers.comedi  # noqa: F401  (compiled where it is imported)
-    from rtloop.drivers.shm import ShmOptions
+    from rtloop.drivers.comedi import comedi_read, comedi_write
+    from rtloop.drivers.shm import ShmOptions, shm_read, shm_write
     from rtloop.engine.commands import send, withdraw
     from rtloop.engine.memory import SharedBlock, Sizes
     from rtloop.engine.messages import MESSAGE, Kind, message
@@ -40,6 +43,7 @@ def _rehearse_others() -> None:
     from rtloop.hil.board import serve
     from rtloop.recording.capture.recorder import Recorder
 
+    assert all(function.address for function in (comedi_read, comedi_write, shm_read, shm_write))
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)
     drain(block.ring("events"), 0, np.zeros(1, MESSAGE))

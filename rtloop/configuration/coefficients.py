@@ -10,6 +10,7 @@ import numpy as np
 from rtloop.configuration.axis import AxisOptions, InterlockOptions, LimitsOptions, ModelOptions, PrefilterOptions
 from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
+from rtloop.engine.ramp import require_short_ramp
 from rtloop.hil.modal import Real
 from rtloop.law.layout import TAP_LANES, Records
 from rtloop.law.memory import records
@@ -122,13 +123,7 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     if options.lowest_v < lowest_v:
         given = "drive_v: −" if options.drive_min_v is None else "drive_min_v: −"
         raise ValueError(f"limits.{given}{-options.lowest_v} is outside the driver's {allowed} V; set drive_min_v")
-    farthest_v = max(highest_v - output.safe_v, output.safe_v - lowest_v)
-    if options.trip_slew_v_per_s * LONGEST_RAMP_S < farthest_v:
-        took_s, least = farthest_v / options.trip_slew_v_per_s, farthest_v / LONGEST_RAMP_S
-        raise ValueError(
-            f"limits.trip_slew_v_per_s: {options.trip_slew_v_per_s:g} takes {took_s:.3g} s from {farthest_v:g} V to "
-            f"safe; {LONGEST_RAMP_S:g} s, so at least {least:g} V/s, are allowed"
-        )
+    require_short_ramp("limits.trip_slew_v_per_s", options.trip_slew_v_per_s, output)
     slew = float("inf") if options.slew_v_per_s is None else options.slew_v_per_s * period_s
     return {
         "drive_min_v": options.lowest_v,
@@ -157,8 +152,6 @@ def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping
     }
 
 
-LONGEST_RAMP_S = 5.0
-"""Of a trip, a stop or a parking, from anywhere in the channel's range to safe."""
 WATCHED = (
     *("frozen_drive_v", "frozen_ticks", "tracking_error_um", "tracking_ticks"),
     *("oscillation_um", "oscillation_swings", "swing_ticks", "late_us", "late_ticks"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import platform
+import sys
 from importlib.metadata import PackageNotFoundError, version
 
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
 from rtloop.engine.plan import Pacing
 from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.hil.native.stored import damaged_files, set_aside_files
 
 LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
@@ -16,6 +18,16 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
     """The cache of compiled code; without one each start compiles for half a minute, and no tick is later for it."""
     kept = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
+    if damaged := len(damaged_files(CACHE_FOLDER)) + len(set_aside_files(CACHE_FOLDER)):
+        return Finding(
+            "compiled code",
+            f"{kept}; {damaged} damaged files",
+            "no damaged file",
+            False,
+            0.0,
+            "what is damaged is compiled anew by the next start; damage that comes again is the disk's",
+            f"{sys.executable} -m rtloop.commands.warm",
+        )
     return Finding(
         "compiled code",
         kept,

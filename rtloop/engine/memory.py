@@ -39,6 +39,10 @@ URGENT_SLOTS = 16
 """Of the command queue, for what makes the outputs safe: no flood of other commands fills them."""
 
 
+UNREADABLE = (ValueError, TypeError, KeyError, AttributeError)
+"""Raised by `SharedBlock` for a file that holds no block, or a damaged one."""
+
+
 class Word(IntEnum):
     """Index into `words`, the block's uint64 control words."""
 
@@ -173,9 +177,7 @@ class SharedBlock:
 
     def driven_by(self) -> int | None:
         """The process that claimed the block and still lives, as the kernel knows it; not for that process itself."""
-        asked = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0)
-        kind, *_, pid = struct.unpack(_LOCK, fcntl.fcntl(self.fd, fcntl.F_GETLK, asked))
-        return None if kind == fcntl.F_UNLCK else pid
+        return claimant(self.fd)
 
     def kill_driver(self) -> None:
         """End the process that claimed the block: that one, and none that has got its number meanwhile."""
@@ -197,6 +199,13 @@ class SharedBlock:
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
+
+
+def claimant(fd: int) -> int | None:
+    """The process that claimed the block in a file and still lives; None for the calling process."""
+    asked = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0)
+    kind, *_, pid = struct.unpack(_LOCK, fcntl.fcntl(fd, fcntl.F_GETLK, asked))
+    return None if kind == fcntl.F_UNLCK else pid
 
 
 def ring_ticks(rate_hz: float) -> int:

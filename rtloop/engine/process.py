@@ -26,7 +26,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
 from rtloop.engine.ramp import found_v, ramp_to_safe
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
-from rtloop.errors import ConfigError, HostRefused, LoopFault, RtloopError, UnavailableError
+from rtloop.errors import ConfigError, HostRefused, LoopFault, RtloopError, UnavailableError, one_line
 
 EXIT_CODES = {
     Outcome.DONE: 0,
@@ -103,7 +103,7 @@ def _opened(driver: Driver) -> Pointers:
     except DriverError:
         raise
     except Exception as error:
-        raise DriverError(f"driver {driver.kind!r}: it could not be opened: {_said(error)}") from error
+        raise DriverError(f"driver {driver.kind!r}: it could not be opened: {one_line(error)}") from error
 
 
 def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
@@ -152,14 +152,8 @@ def _fault(driver: Driver, loop: Any) -> str:
     """Which driver failed at what, when, and why as far as it says so."""
     verb = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
-    reason = f"its status was {loop.failed_status}" if error is None else _said(error)
+    reason = f"its status was {loop.failed_status}" if error is None else one_line(error)
     return f"driver {driver.kind!r}: {verb} failed at tick {loop.failed_tick}: {reason}"
-
-
-def _said(error: Exception) -> str:
-    """What was raised, on one line, and without what a terminal would obey."""
-    words = " ".join(str(error).split())
-    return f"{type(error).__name__}: {''.join(letter if letter.isprintable() else '?' for letter in words)}"
 
 
 if __name__ == "__main__":

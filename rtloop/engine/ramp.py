@@ -13,13 +13,16 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.drivers.base import Driver, Pointers, index_of
+from rtloop.drivers.base import Channel, Driver, Pointers, index_of
 from rtloop.drivers.errors import DriverError
 
 Volts = npt.NDArray[np.float64]
 _WRITE = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
-SHORTEST_PERIOD_S = 0.0001
-"""The ramp takes its steps at the loop's rate, like the loop's own, but no faster than an interpreter can."""
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 0.0001, 0.01
+"""The ramp takes its steps at the loop's rate, like the loop's own, but no faster than an interpreter can. The steps of
+a slow loop are divided: they would be large, and the last of them followed by a long wait."""
+LONGEST_RAMP_S = 5.0
+"""Of a trip, a stop or a parking, from anywhere in the channel's range to safe."""
 SPIN_S = 0.0005
 """A sleep may last longer by so much: what is left of a period is spun."""
 
@@ -34,15 +37,49 @@ def output_indices(driver: Driver) -> list[int]:
     return [index_of(driver.facts.outputs, wiring.output) for wiring in driver.wiring.values()]
 
 
+def require_short_ramp(where: str, slew_v_per_s: float, output: Channel) -> None:
+    """Raise ValueError, which begins with `where`, for a slew that takes longer than LONGEST_RAMP_S to safe.
+
+    The ramp counts from the end of the channel's range that is farthest from safe.
+    """
+    farthest_v = max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v)
+    if slew_v_per_s * LONGEST_RAMP_S < farthest_v:
+        took_s, least = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
+        raise ValueError(
+            f"{where}: {slew_v_per_s:g} takes {took_s:.3g} s from {farthest_v:g} V to "
+            f"safe; {LONGEST_RAMP_S:g} s, so at least {least:g} V/s, are allowed"
+        )
+
+
+def unusable_drives(driver: Driver, noted_v: Sequence[float] | Volts) -> list[str]:
+    """A sentence for each axis whose noted drive is no number, or beyond the range of its channel."""
+    sentences = []
+    for axis, index, volts in zip(driver.wiring, output_indices(driver), noted_v, strict=True):
+        channel = driver.facts.outputs[index]
+        if not channel.minimum_v <= volts <= channel.maximum_v:
+            allowed = f"{channel.minimum_v:g} … {channel.maximum_v:g} V"
+            sentences.append(
+                f"axis {axis}: the drive noted last is {volts:g} V, and counts for nothing; allowed: {allowed}"
+            )
+    return sentences
+
+
 def found_v(driver: Driver, noted_v: Sequence[float] | Volts | None) -> Volts:
-    """Where the outputs of a driver are that was just opened: as it says, else as noted, axis by axis; else safe."""
+    """Where the outputs of a driver are that was just opened: as it says, else as noted, axis by axis; else safe.
+
+    A card that says a value beyond a channel's range is at the end of that range. A noted value beyond it, or one that
+    is no number, counts for nothing: a ramp from there could drive the output away from safe.
+    """
+    safe_v = safe_outputs_v(driver)
+    lowest_v, highest_v = np.array([(channel.minimum_v, channel.maximum_v) for channel in driver.facts.outputs]).T
     told = driver.outputs_v()
     if told is not None:
-        return np.array(told, float)
-    outputs_v = safe_outputs_v(driver)
+        outputs_v = np.clip(np.array(told, float), lowest_v, highest_v)
+        return np.where(np.isnan(outputs_v), safe_v, outputs_v)
+    outputs_v = safe_v.copy()
     if noted_v is not None:
         outputs_v[output_indices(driver)] = noted_v
-    return outputs_v
+    return np.where((outputs_v >= lowest_v) & (outputs_v <= highest_v), outputs_v, safe_v)
 
 
 def ramp(from_v: Volts, safe_v: Volts, step_v: float) -> Iterator[Volts]:
@@ -65,7 +102,8 @@ def ramp_to_safe(
     `on_step` is told what was written, after it was: whoever dies in between has noted where the outputs were a step
     before, and another ramp from there begins with the very same write.
     """
-    write, period_s = _WRITE(pointers.write), max(1.0 / driver.rate_hz, SHORTEST_PERIOD_S)
+    period_s = min(max(1.0 / driver.rate_hz, SHORTEST_PERIOD_S), LONGEST_PERIOD_S)
+    write = _WRITE(pointers.write)
     for row in ramp(from_v, safe_outputs_v(driver), slew_v_per_s * period_s):
         values = np.ascontiguousarray(row)
         if write(pointers.context, values.ctypes.data) < 0:

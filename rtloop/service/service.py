@@ -206,7 +206,7 @@ class Service:
         """One loop from its start to its end; `resting` starts with the outputs off and without a schedule."""
         with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
-            keep(hardware_path(self.configuration.name), Hardware.of(prepared.plan))
+            keep(hardware_path(self.configuration.name), Hardware.of(prepared.configuration))
             options = self.configuration.service
             # nobody knows where the actuator rests: the outputs start off, and the mode is entered bumplessly; a
             # schedule alone must have its first tick

@@ -1,6 +1,7 @@
 """The hardware of a run, noted beside its shared block: what parking needs, whatever becomes of the configuration.
 
-A file that was edited while its service ran may name another board by now, or be no configuration any more.
+A file that was edited while its service ran may name another board by now, or be no configuration any more. The note in
+turn may be one of another version, or name what is no longer installed: it is believed as a whole or not at all.
 """
 
 from __future__ import annotations
@@ -10,41 +11,50 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
-from rtloop.drivers.base import Driver, Wiring
+from rtloop.configuration.file import HIGHEST_RATE_HZ, Configuration, describe, load
+from rtloop.drivers.base import Driver, Wiring, index_of, require_channels
+from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
-from rtloop.engine.plan import Plan
-from rtloop.errors import writing
+from rtloop.engine.ramp import require_short_ramp
+from rtloop.errors import ConfigError, RtloopError, one_line, writing
 from rtloop.hil.trusted import Untrusted, open_file
 from rtloop.supervision.paths import new_file, refusal
 
 LARGEST_BYTES = 1 << 20
 
 
+class UnusableNote(RtloopError):
+    """A note of the hardware that nothing can be parked by; the message says what of it is not understood."""
+
+
 @dataclass(frozen=True)
 class Hardware:
-    """A driver, its options as JSON, the channels of each axis, and how outputs are brought down."""
+    """A driver, its options as JSON, the channels of each axis, and how outputs are brought down.
+
+    The numbers have the bounds that they have in a configuration.
+    """
 
     driver_kind: str
     driver_options: str
-    wiring: Mapping[str, Wiring]
-    rate_hz: float
-    trip_slew_v_per_s: float
-    heartbeat_timeout_s: float
+    wiring: Annotated[Mapping[str, Wiring], Field(min_length=1)]
+    rate_hz: Annotated[float, Field(gt=0, le=HIGHEST_RATE_HZ)]
+    trip_slew_v_per_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    heartbeat_timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
     @classmethod
-    def of(cls, plan: Plan) -> Hardware:
-        """What a plan drives."""
-        options = driver_class(plan.driver_kind).options_model(**plan.driver_options)
+    def of(cls, configuration: Configuration) -> Hardware:
+        """What a configuration drives; whether its laws are good is no matter."""
         return cls(
-            plan.driver_kind,
-            options.model_dump_json(exclude_unset=True),
-            plan.wiring,
-            plan.pacing.rate_hz,
-            plan.trip_slew_v_per_s,
-            plan.pacing.heartbeat_timeout_s,
+            configuration.driver_kind,
+            configuration.driver_options.model_dump_json(exclude_unset=True),
+            configuration.wiring,
+            configuration.loop.rate_hz,
+            min(axis.limits.trip_slew_v_per_s for axis in configuration.axes),
+            configuration.loop.heartbeat_timeout_s,
         )
 
     def drives_like(self, other: Hardware) -> bool:
@@ -54,9 +64,14 @@ class Hardware:
         )  # fmt: skip
 
     def driver(self) -> Driver:
-        """The driver, not open. Raises ValueError, DriverError."""
+        """The driver, not open. Raises ValueError, DriverError; for a ramp that would take too long, too."""
         kind = driver_class(self.driver_kind)
-        return kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
+        driver = kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
+        require_channels(self.wiring, driver.facts)
+        for wiring in self.wiring.values():
+            output = driver.facts.outputs[index_of(driver.facts.outputs, wiring.output)]
+            require_short_ramp("trip_slew_v_per_s", self.trip_slew_v_per_s, output)
+        return driver
 
 
 _AS_JSON = TypeAdapter(Hardware)
@@ -71,11 +86,46 @@ def keep(path: Path, hardware: Hardware) -> None:
 
 
 def noted(path: Path) -> Hardware | None:
-    """What stands there; None where nothing does, or nothing whole. Raises HostRefused for what others may have put."""
+    """The hardware that is noted at `path`, whose driver can be made; None where nothing is noted.
+
+    Raises UnusableNote, HostRefused for a file that others may have put there.
+    """
     try:
         with open(open_file(path, os.O_RDONLY), "rb") as file:
-            return _AS_JSON.validate_json(file.read(LARGEST_BYTES))
+            hardware = _AS_JSON.validate_json(file.read(LARGEST_BYTES))
+    except FileNotFoundError:
+        return None
     except Untrusted as error:
         raise refusal(error) from None
-    except (OSError, ValidationError):
-        return None
+    except OSError as error:
+        raise _unusable(path, error.strerror or str(error)) from None
+    except ValidationError as error:
+        raise _unusable(path, describe(error, "note", None)[0]) from None
+    try:
+        hardware.driver()
+    except ValidationError as error:
+        raise _unusable(path, describe(error, "note.driver_options", None)[0]) from None
+    except Exception as error:  # a third party's driver may raise anything
+        raise _unusable(path, one_line(error)) from error
+    return hardware
+
+
+def configured_hardware(config: Path) -> Hardware:
+    """The hardware of a configuration file. Raises ConfigError, InputFileError, DriverError for a missing library.
+
+    Only what drives an output is judged: outputs whose laws are wrong are to be parked all the same.
+    """
+    hardware = Hardware.of(load(config))
+    try:
+        hardware.driver()
+    except DriverError:
+        raise
+    except Exception as error:  # a third party's driver may raise anything
+        text = str(error) if isinstance(error, ValueError) else one_line(error)
+        raise ConfigError(str(config), [f"driver.{text}"]) from error
+    return hardware
+
+
+def _unusable(path: Path, reason: str) -> UnusableNote:
+    """The error that says why the note at `path` counts as none."""
+    return UnusableNote(f"{path}: the note of the hardware is not understood, and counts as none: {reason}")

@@ -5,20 +5,20 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.configuration.file import load
-from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Driver
 from rtloop.drivers.errors import DriverError
-from rtloop.engine.memory import SharedBlock, Word
-from rtloop.engine.ramp import found_v, output_indices, ramp_to_safe, safe_outputs_v
-from rtloop.errors import RtloopError, UnavailableError
-from rtloop.supervision.hardware import Hardware, noted
+from rtloop.engine.memory import UNREADABLE, SharedBlock, Word, claimant
+from rtloop.engine.ramp import LONGEST_RAMP_S, found_v, output_indices, ramp_to_safe, safe_outputs_v, unusable_drives
+from rtloop.errors import RtloopError, UnavailableError, one_line
+from rtloop.hil.native.uncompiled import as_written
+from rtloop.supervision.account import Account
+from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, noted
 from rtloop.supervision.paths import block_path, hardware_path, open_block
 
 POLL_S = 0.005
@@ -28,45 +28,77 @@ MARGIN_S = 2.0
 
 
 def park_configuration(config: Path) -> str:
-    """Park the outputs of a configuration in place of a service that died; what was done, in words.
+    """Park the outputs of a configuration in place of a service that died. Returns a message of what was done.
 
     A loop that outlived its service is given the time to ramp down by itself, and killed if it does not. What counts is
-    the hardware that the service ran with; if the configuration names another by now, that is parked as well. Raises
-    ConfigError where no service has run yet, DriverError, UnavailableError while the service is alive.
+    the hardware that the service ran with; if the configuration names another by now, that is parked as well. Each is
+    tried by itself, and neither is in the other's way. Raises, when all that can be parked is, what failed: ConfigError
+    where nothing tells the hardware, DriverError, HostRefused, UnavailableError while the service is alive, or one
+    RtloopError of several.
     """
-    name, unread = config.stem, ""
-    last, configured = noted(hardware_path(name)), None
+    account = Account(config.stem)
+    boards = _hardware(config, account)
+    if boards:
+        with _last_block(block_path(config.stem), account) as block, account.attempt():
+            if block is not None:
+                _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
+            _park(boards[0], None if block is None else block["last_drive_v"], account)
+        for other in boards[1:]:
+            with account.attempt():
+                _park(other, None, account)
+    return account.result()
+
+
+def _hardware(config: Path, account: Account) -> list[Hardware]:
+    """The hardware that the last service ran with, then that of the configuration, where it is another."""
+    note: Hardware | None = None
+    with account.attempt():
+        try:
+            note = noted(hardware_path(config.stem))
+        except UnusableNote as error:
+            account.remarks.append(str(error))
     try:
-        configured = Hardware.of(prepare(load(config)).plan)
-    except (DriverError, RtloopError) as error:
-        if last is None:
-            raise
-        unread = f", as it last ran; the configuration is of no use:\n{error}"
-    from_v: list[float] = []
-    with _last_block(block_path(name)) as block:
+        configured = configured_hardware(config)
+    except (RtloopError, DriverError) as error:
+        if note is None:
+            account.failures.append(error)
+            return []
+        account.remarks.append(f"as it last ran; the configuration is of no use:\n{error}")
+        return [note]
+    return [configured] if note is None else [note] if configured.drives_like(note) else [note, configured]
+
+
+def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: Account) -> None:
+    """Park a board, and enter into the account where its outputs were. Raises ValueError, DriverError.
+
+    `noted_v` is where its drives were noted last; of other axes than its own it counts as None.
+    """
+    driver = hardware.driver()
+    if noted_v is not None and len(noted_v) != len(driver.wiring):
         noted_v = None
-        driven = last or configured
-        assert driven is not None
-        if block is not None:
-            _await_end(block, driven.heartbeat_timeout_s, driven.trip_slew_v_per_s)
-            noted_v = block["last_drive_v"] if len(block["last_drive_v"]) == len(driven.wiring) else None
-        from_v += park(driven.driver(), driven.trip_slew_v_per_s, noted_v)
-    if last is not None and configured is not None and not configured.drives_like(last):
-        from_v += park(configured.driver(), configured.trip_slew_v_per_s)
-    return f"{name}: parked from {', '.join(f'{value:.3f} V' for value in from_v)}{unread}"
+    if noted_v is not None:
+        account.remarks += unusable_drives(driver, noted_v)
+    account.from_v += park(driver, hardware.trip_slew_v_per_s, noted_v)
 
 
 @contextmanager
-def _last_block(path: Path) -> Iterator[SharedBlock | None]:
-    """A service's shared block; None where there is none."""
+def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
+    """The shared block of a service; None where there is none that this version can read."""
     fd = open_block(path)
     if fd is None:
         yield None
         return
     try:
         block = None
-        with suppress(EOFError):  # its service died before there was anything in it
+        try:
             block = SharedBlock.attach(fd, lambda: True)
+            _ = block["last_drive_v"], block["words"]
+        except EOFError:  # its service died before there was anything in it
+            pass
+        except UNREADABLE as error:
+            if (pid := claimant(fd)) is not None:
+                raise UnavailableError(f"process {pid} drives the outputs; stop it, then park") from None
+            account.remarks.append(f"{path}: the shared block is not understood, and counts as none: {one_line(error)}")
         yield block
     finally:
         os.close(fd)
@@ -75,6 +107,7 @@ def _last_block(path: Path) -> Iterator[SharedBlock | None]:
 def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:
     """Wait until nobody drives any more. Raises UnavailableError while a service is alive, DriverError."""
     ramp_s = float(np.max(np.abs(block["last_drive_v"]))) / slew_v_per_s
+    ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # nor for a drive that is no number
     beat_ns = block.load(Word.HEARTBEAT_NS)
     kill_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driven_by()) is not None:
@@ -88,11 +121,22 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
 
 
 def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:
-    """Ramp every output from where it is to its safe value, then close the driver; where they were, in V.
+    """Ramp every output from where it is to its safe value, then close the driver. Returns where they were, in V.
 
     `noted_v` (axes,) is where the axes' drives were noted last, and is kept up to date: it counts where the card cannot
-    say it. What is parked already does not move. Raises DriverError.
+    say it. What is parked already does not move. Waits for no compiler. Raises DriverError, whatever a third party's
+    driver raises.
     """
+    try:
+        with as_written():
+            return _ramp_down(driver, slew_v_per_s, noted_v)
+    except DriverError:
+        raise
+    except Exception as error:
+        raise DriverError(f"driver {driver.kind!r}: its outputs could not be parked: {one_line(error)}") from error
+
+
+def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None) -> list[float]:
     pointers = driver.open()
     try:
         from_v, index = found_v(driver, noted_v), output_indices(driver)

@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rtloop.doctor import software
 from rtloop.doctor.examine import conditions
 from rtloop.doctor.host import cpu_list, cpu_text
 from rtloop.doctor.remedy import apply
 from rtloop.engine.plan import Pacing
+from rtloop.hil.native import stored
 from tests.doctor.hosts import CPUS, host
 
 SPINNING = Pacing(10_000.0, spin_us=95.0, cpu=3)
@@ -113,3 +115,19 @@ def test_processor_list_as_the_kernel_writes_it():
     assert cpu_list("0-2,8,10-11") == {0, 1, 2, 8, 10, 11}
     assert cpu_text({0, 1, 2, 8, 10, 11}) == "0-2,8,10-11"
     assert cpu_list("") == set()
+
+
+@pytest.mark.parametrize("state", ["damaged", "set aside", "whole"])
+def test_a_torn_cache_of_compiled_code_is_named(tmp_path, monkeypatch, state):
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    monkeypatch.setattr(software, "CACHE_FOLDER", cache)
+    monkeypatch.setattr(software, "CACHE_IS_PERSISTENT", True)
+    stored.write(cache / "kernel.nbc", b"code")
+    if state != "whole":
+        (cache / "kernel.nbc").write_bytes(b"")
+    if state == "set aside":
+        stored.read(cache / "kernel.nbc")
+    finding = software.compiled_code(host(tmp_path), Pacing(10_000.0))
+    assert finding.good == (state == "whole")
+    assert ("1 damaged file" in finding.value) == (state != "whole")

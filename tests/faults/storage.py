@@ -16,11 +16,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import rtloop
 from rtloop.engine.memory import Word
+from rtloop.hil.native.cache import CACHE_FOLDER
 from rtloop.recording.replay.replay import replay
 from tests.faults.account import unexplained
 from tests.faults.bench import Bench
 from tests.faults.configuration import BOARD_RATE_HZ
-from tests.faults.evidence import wait_for
+from tests.faults.evidence import TIMEOUT_S, wait_for
 from tests.faults.fault import Fault, Measured, NotPossible
 from tests.faults.preload import preloaded
 
@@ -28,6 +29,7 @@ SMALL, LARGE = "size=900k", "size=64m"
 ROUNDS = 1.4
 STALLED, STALL_S = "stalled", 10.0
 """File that tells of the stall; how long it takes, as stalling_disk.c has it."""
+DAMAGED = "the cache of compiled code is damaged"
 
 
 @contextmanager
@@ -142,10 +144,41 @@ def disk_stalls(bench: Bench) -> Measured:
     return Measured(note=f"{status['recorder_replacements']} recorder replaced")
 
 
+def torn_cache(folder: Path) -> dict[str, str]:
+    """A copy of the cache of compiled code in which a power cut left no file whole."""
+    shutil.copytree(CACHE_FOLDER, folder / "cache" / "rtloop" / CACHE_FOLDER.name)
+    tear(folder / "cache")
+    return {"XDG_CACHE_HOME": str(folder / "cache")}
+
+
+def tear(folder: Path) -> None:
+    """Leave nothing of one file and half of the next."""
+    for number, path in enumerate(sorted(path for path in folder.rglob("*") if path.is_file())):
+        os.truncate(path, path.stat().st_size // 2 * (number % 2))
+
+
+def cache_torn(bench: Bench) -> Measured:
+    """The service has started on a torn cache, which is torn again before service and loop die."""
+    assert DAMAGED in bench.log()
+    tear(bench.folder / "cache")
+    service, loop = bench.pid("service"), bench.pid("rt")
+    bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
+    assert bench.service is not None
+    bench.service.wait()
+    before = bench.log().count(DAMAGED)
+    assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
+    took_ms = bench.await_safe()  # no bound: an interpreter must start
+    assert bench.log().count(DAMAGED) == before + 1, "park names the cache"
+    bench.start_service()
+    bench.await_drive()
+    return Measured(took_ms, note="started twice, parked, each time on a torn cache")
+
+
 FAULTS = (
     Fault("disk full", "the loop goes on; lost ticks said at once", disk_full, around=small_disk),
     Fault("disk full, then room", "recorded again; the gap said", disk_full_then_room, around=small_disk),
     Fault("folder of recordings removed, then made", "recorded again; the gap said", folder_removed),
+    Fault("compiler cache torn", "named and made anew; parks without it", cache_torn, environment=torn_cache),
     Fault("ring overrun", "the loop goes on; the gap said", ring_overrun),
     Fault("disk stalls 10 s at a rotation", "the loop goes on, nothing is lost", disk_stalls,
           changes=(("[recording]", "[recording]\nrotate_s = 4.0"),), environment=stalling_disk),

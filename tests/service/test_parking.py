@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 from rtloop.configuration.file import load
-from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Channel, Facts
+from rtloop.drivers.errors import DriverError
 from rtloop.drivers.python import PythonDriver
 from rtloop.engine.memory import SharedBlock, Sizes, Word
-from rtloop.errors import ConfigError, HostRefused, UnavailableError
+from rtloop.errors import ConfigError, HostRefused, RtloopError, UnavailableError
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware as Noted
-from rtloop.supervision.hardware import keep, noted
+from rtloop.supervision.hardware import UnusableNote, keep, noted
 from rtloop.supervision.paths import hardware_path
 from tests.faults.bench import Bench
 from tests.one_axis import one_axis, wired
@@ -270,7 +270,7 @@ def test_a_card_that_parks_itself_is_not_driven_back(parked):
 def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, tmp_path):
     hardware, park = parked(ReadableCard)
     text = (tmp_path / "lab.toml").read_text()
-    keep(hardware_path("lab"), Noted.of(prepare(load(tmp_path / "lab.toml")).plan))
+    keep(hardware_path("lab"), Noted.of(load(tmp_path / "lab.toml")))
     (tmp_path / "lab.toml").write_text(text.replace("[driver]", "[drive"))
     assert "6.500 V" in park()
     assert "as it last ran" in park()
@@ -284,7 +284,7 @@ def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, t
 def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
     _, park = parked(ReadableCard)
     config = tmp_path / "lab.toml"
-    keep(hardware_path("lab"), Noted.of(prepare(load(config)).plan))
+    keep(hardware_path("lab"), Noted.of(load(config)))
     assert park().count(" V") == 1
     config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
     assert park().count(" V") == 2
@@ -292,8 +292,8 @@ def test_another_board_in_the_file_is_parked_as_well(parked, tmp_path):
 
 @pytest.mark.parametrize("damage", ["whole", "half", "another's"])
 def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
-    _, park = parked(ReadableCard)
-    hardware = Noted.of(prepare(load(tmp_path / "lab.toml")).plan)
+    board, park = parked(ReadableCard)
+    hardware = Noted.of(load(tmp_path / "lab.toml"))
     path = hardware_path("lab")
     keep(path, hardware)
     assert path.stat().st_mode & 0o777 == 0o600
@@ -301,11 +301,124 @@ def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
         path.write_bytes(path.read_bytes()[:-9])
     if damage == "another's":
         path.chmod(0o666)
-        with pytest.raises(HostRefused, match="others may write"):
+        with pytest.raises(RtloopError, match="others may write") as raised:
             park()
+        assert raised.value.exit_code == HostRefused.exit_code
+        assert board.volts == 0.0  # the configuration's
         return
-    assert noted(path) == (hardware if damage == "whole" else None)
+    if damage == "whole":
+        assert noted(path) == hardware
+    else:
+        with pytest.raises(UnusableNote, match="is not understood"):
+            noted(path)
     park()
+
+
+@pytest.fixture
+def block_of_lab(tmp_path) -> Callable[[], SharedBlock]:
+    """The shared block of the service that died."""
+
+    def read() -> SharedBlock:
+        fd = os.open(tmp_path / "run" / "lab.block", os.O_RDWR)
+        try:
+            return SharedBlock(fd)
+        finally:
+            os.close(fd)
+
+    return read
+
+
+@pytest.mark.parametrize("noted_v", [np.nan, np.inf, -np.inf, 10.001, -50.0, 1e300])
+def test_a_drive_that_cannot_have_been_is_not_ramped_from(parked, block_of_lab, noted_v):
+    """Nobody knows where the output is: it is made safe at once, and never driven away from safe."""
+    hardware, park = parked(MuteCard)
+    block_of_lab()["last_drive_v"][:] = noted_v
+    message = park()
+    assert hardware.written[1:] == [0.0]
+    assert f"the drive noted last is {noted_v:g} V" in message
+
+
+@pytest.mark.parametrize("card", [Card, ReadableCard])
+def test_a_noted_drive_does_not_matter_where_the_card_knows(parked, block_of_lab, card):
+    hardware, park = parked(card)
+    block_of_lab()["last_drive_v"][:] = np.nan
+    park()
+    assert hardware.written[-1] == 0.0
+    assert hardware.largest_step_v <= (STEP_V + 1e-12 if card is ReadableCard else DRIVE_V)
+
+
+@pytest.mark.parametrize(("said_v", "from_v"), [(np.nan, 0.0), (np.inf, 10.0), (1e9, 10.0), (-10.5, -10.0)])
+def test_a_card_that_says_what_cannot_be_is_parked_all_the_same(parked, said_v, from_v):
+    class Liar(ReadableCard):
+        def outputs_v(self):
+            return [said_v]
+
+    hardware, park = parked(Liar)
+    assert f"{from_v:.3f} V" in park()
+    assert hardware.written[-1] == 0.0
+    assert max(map(abs, hardware.written[1:])) < max(abs(from_v), 1e-9)
+
+
+def test_a_loop_that_noted_no_number_is_not_waited_for_for_ever(block, monkeypatch):
+    monkeypatch.setattr(parking, "MARGIN_S", 0.05)
+    monkeypatch.setattr(parking, "LONGEST_RAMP_S", 0.05)
+    for noted_v in (np.nan, np.inf, 1e300):
+        block["last_drive_v"][:] = noted_v
+        with a_loop(block) as loop:
+            loop.send_signal(signal.SIGSTOP)
+            parking._await_end(block, 0.05, 1000.0)
+        assert loop.returncode == -signal.SIGKILL
+
+
+def test_nothing_is_parked_while_the_service_is_alive(parked, tmp_path, monkeypatch):
+    """Not even another board that the configuration names by now."""
+    hardware, park = parked(ReadableCard)
+    config = tmp_path / "lab.toml"
+    keep(hardware_path("lab"), Noted.of(load(config)))
+    config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
+
+    def alive(*_):
+        raise UnavailableError("process 1 drives the outputs and its service is alive")
+
+    monkeypatch.setattr(parking, "_await_end", alive)
+    with pytest.raises(UnavailableError, match="is alive"):
+        park()
+    assert hardware.written == []
+
+
+def test_a_loop_that_cannot_be_killed_keeps_no_other_board_from_being_parked(parked, tmp_path, monkeypatch):
+    hardware, park = parked(ReadableCard)
+    config = tmp_path / "lab.toml"
+    keep(hardware_path("lab"), Noted.of(load(config)))
+    config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
+
+    def hang(*_):
+        raise DriverError("process 1 drives the outputs and cannot be killed")
+
+    monkeypatch.setattr(parking, "_await_end", hang)
+    with pytest.raises(RtloopError, match="cannot be killed") as raised:
+        park()
+    assert raised.value.exit_code == UnavailableError.exit_code
+    assert hardware.written[-1] == 0.0
+
+
+@pytest.mark.parametrize("text", [b"{", b"{}", b'{"words": 3}', b"{" + bytes(range(256)) * 40])
+def test_a_block_that_is_not_understood_counts_as_none(parked, tmp_path, text):
+    hardware, park = parked(ReadableCard)
+    (tmp_path / "run" / "lab.block").write_bytes(text)
+    assert "the shared block is not understood" in park()
+    assert hardware.written[-1] == 0.0
+
+
+@pytest.mark.parametrize("verb", ["start", "outputs_v", "write", "stop", "facts"])
+def test_whatever_a_card_raises_is_an_error_of_that_driver(parked, verb):
+    def fail(self, *_):
+        raise LookupError("no such thing")
+
+    hardware, park = parked(type("Failing", (ReadableCard,), {verb: property(fail) if verb == "facts" else fail}))
+    with pytest.raises((DriverError, ConfigError), match="no such thing"):
+        park()
+    assert hardware.volts in (0.0, DRIVE_V)
 
 
 def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):

@@ -1,0 +1,118 @@
+"""The cache of compiled code after a power cut: damaged files are named, set aside and made anew, and run by nobody."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rtloop.hil.native import stored
+from tests.full_pipe import fill
+
+KERNEL = """
+from rtloop.hil.native.compiled import jit
+
+
+@jit
+def doubled(number):
+    return number * 2
+"""
+PROGRAM = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from kernel import doubled
+print(doubled(21), sum(doubled.stats.cache_hits.values()))
+"""
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda data: b"",
+    "half": lambda data: data[: len(data) // 2],
+    "zeros": lambda data: bytes(len(data)),
+    "one bit": lambda data: data[:-200] + bytes([data[-200] ^ 1]) + data[-199:],
+    "somebody's": lambda data: b"\x80\x05N.",
+}
+
+
+def run(folder: Path) -> tuple[str, str]:
+    """What a process that calls the kernel prints, the kernel's result and the hits of the cache, and complains of."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache")}
+    command = [sys.executable, "-c", PROGRAM, str(folder)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip(), done.stderr
+
+
+def test_a_damaged_file_is_named_set_aside_and_made_anew(tmp_path: Path):
+    """An index that is empty, then code of which one bit is wrong: neither is run."""
+    (tmp_path / "kernel.py").write_text(KERNEL)
+    assert run(tmp_path) == ("42 0", "")
+    for suffix, damage in ((".nbi", "empty"), (".nbc", "one bit")):
+        (path,) = (tmp_path / "cache").rglob(f"*{suffix}")
+        torn = DAMAGE[damage](path.read_bytes())
+        path.write_bytes(torn)
+        printed, complaint = run(tmp_path)
+        assert printed == "42 0"
+        assert complaint.count("\n") == 1
+        assert f"the cache of compiled code is damaged: {path}" in complaint
+        assert Path(f"{path}{stored.DAMAGED}").read_bytes() == torn
+    assert run(tmp_path) == ("42 1", "")
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_only_a_whole_file_is_read(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, damage: str
+):
+    path = tmp_path / "code.o"
+    assert stored.read(path) is None
+    monkeypatch.setattr(stored, "_named", [])
+    stored.write(path, b"machine code" * 100)
+    assert stored.read(path) == b"machine code" * 100
+    assert capfd.readouterr().err == ""
+    path.write_bytes(DAMAGE[damage](path.read_bytes()))
+    assert stored.damaged_files(tmp_path) == [path]
+    assert stored.read(path) is None
+    assert str(path) in capfd.readouterr().err
+    assert not path.exists()
+    assert stored.damaged_files(tmp_path) == []
+    assert stored.set_aside_files(tmp_path) == [Path(f"{path}{stored.DAMAGED}")]
+
+
+def test_a_writer_that_dies_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """At the instant before the rename nothing can be seen, and what will be seen is on the disk already."""
+    path, synced = tmp_path / "code.o", list[int]()
+
+    def die(source: str, target: Path) -> None:
+        assert os.stat(source).st_ino in synced
+        assert not path.exists()
+        raise SystemExit
+
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(os.fstat(fd).st_ino))
+    monkeypatch.setattr(os, "replace", die)
+    with pytest.raises(SystemExit):
+        stored.write(path, b"machine code")
+
+
+@pytest.mark.parametrize("place", ["missing/code.o", "folder"])
+def test_what_cannot_be_stored_is_left_out(tmp_path: Path, place: str):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").touch()
+    stored.write(tmp_path / place, b"machine code")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder"]
+
+
+def test_a_reader_of_stderr_that_stands_still_holds_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A pipe that is full: the line is lost, and the parking that asked goes on."""
+    reading, writing = os.pipe()
+    fill(writing)
+    monkeypatch.setattr(stored, "STDERR", writing)
+    monkeypatch.setattr(stored, "_named", [])
+    (tmp_path / "code.o").write_bytes(b"")
+    assert stored.read(tmp_path / "code.o") is None
+    os.close(reading)
+    (tmp_path / "code.o").write_bytes(b"")
+    monkeypatch.setattr(stored, "_named", [])
+    assert stored.read(tmp_path / "code.o") is None
+    os.close(writing)

@@ -1,0 +1,38 @@
+"""A board's memory without the board: it outlives who parks, and keeps every write in order."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.hil import board
+from rtloop.hil.board import FIFO, LSB_V, BoardMemory
+
+
+class FakeBoard:
+    """Memory of a board in the file `path`, with all its outputs at `volts`."""
+
+    def __init__(self, path: Path, volts: float, channels: int = 1) -> None:
+        self.channels, self.start_v = channels, volts
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        os.ftruncate(fd, board.file_bytes())
+        self._memory = BoardMemory(fd)
+        os.close(fd)
+        facts = self._memory.facts
+        facts["version"], facts["channels"], facts["rate_hz"] = board.VERSION, channels, 8000.0
+        self._memory.dac_codes[:channels] = round(volts / LSB_V)
+        facts["magic"] = board.MAGIC
+
+    @property
+    def outputs_v(self) -> list[float]:
+        """Volts at the converters."""
+        return (self._memory.dac_codes[: self.channels] * LSB_V).tolist()
+
+    @property
+    def path_v(self) -> np.ndarray:
+        """Volts of the first output, from the start through every write to the end."""
+        count = int(self._memory.words[board.WRITTEN])
+        assert count < FIFO, "more writes than the board keeps"
+        return np.array([self.start_v, *self._memory.fifo[:count, 0] * LSB_V, self.outputs_v[0]])

@@ -1,0 +1,311 @@
+"""The note of the hardware in every state that an upgrade, a removed plug-in or an exchanged board may leave it in.
+
+What became of the outputs is read from the memory of boards, which outlives the parking.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli.service import park
+from rtloop.hil.board import LSB_V
+from tests.faults.configuration import BOARD_RATE_HZ, TRIP_SLEW_V_PER_S, on_a_board
+from tests.service.fake_board import FakeBoard
+
+START_V = 6.66
+GOOD, UNAVAILABLE, REFUSED = 0, 69, 77
+NOT_UNDERSTOOD = "the note of the hardware"
+Note = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A configuration `lab`, its board, another board, and the note of a service that ran on the first."""
+
+    config: Path
+    note: Path
+    board: FakeBoard
+    other: FakeBoard
+    text: Note
+
+    def park(self) -> tuple[int, str]:
+        """Exit code and message of `rtloop park`, which ends with no traceback."""
+        result = CliRunner().invoke(park, [str(self.config)])
+        assert isinstance(result.exception, SystemExit | None), repr(result.exception)
+        assert "Traceback" not in result.output
+        return result.exit_code, result.output
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
+    run = tmp_path / "run"
+    run.mkdir(mode=0o700)
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(run))
+    config = tmp_path / "lab.toml"
+    config.write_text(on_a_board(tmp_path))
+    options = {"file": str(tmp_path / "board"), "board_rate_hz": 8000.0}
+    text = {
+        "driver_kind": "shm",
+        "driver_options": json.dumps(options),
+        "wiring": {"x": ["adc0", "dac0"]},
+        "rate_hz": BOARD_RATE_HZ,
+        "trip_slew_v_per_s": TRIP_SLEW_V_PER_S,
+        "heartbeat_timeout_s": 1.0,
+    }
+    boards = FakeBoard(tmp_path / "board", START_V), FakeBoard(tmp_path / "other", START_V, channels=2)
+    return Lab(config, run / "lab.hardware", *boards, text)
+
+
+def assert_ramped(board: FakeBoard, slew_v_per_s: float = TRIP_SLEW_V_PER_S, rate_hz: float = BOARD_RATE_HZ) -> None:
+    """Down to 0 V by steps of the slew, and never away from it."""
+    assert board.outputs_v == [0.0] * board.channels
+    steps = -np.diff(board.path_v)
+    assert steps.min() >= -LSB_V / 2
+    assert steps.max() <= slew_v_per_s / rate_hz + LSB_V
+
+
+def changed(**values: Any) -> Callable[[Note], Note]:
+    """The note with other values."""
+    return lambda note: note | values
+
+
+def with_options(**values: Any) -> Callable[[Note], Note]:
+    """The note with other options of the driver."""
+    return lambda note: note | {"driver_options": json.dumps(json.loads(note["driver_options"]) | values)}
+
+
+def as_bytes(data: bytes) -> Callable[[Note], bytes]:
+    """No note at all but these bytes."""
+    return lambda note: data
+
+
+def half(note: Note) -> bytes:
+    """A note whose writer died."""
+    data = json.dumps(note).encode()
+    return data[: len(data) // 2]
+
+
+def without(key: str) -> Callable[[Note], Note]:
+    """The note of a version that did not have this key."""
+    return lambda note: {name: value for name, value in note.items() if name != key}
+
+
+USABLE: dict[str, Callable[[Note], Note]] = {
+    "as it is": changed(),
+    "unknown key": changed(colour="blue"),
+    "another slew": changed(trip_slew_v_per_s=300.0),
+    "longest heartbeat": changed(heartbeat_timeout_s=1e99),
+    "another driver": changed(driver_kind="sim", driver_options="{}"),
+}
+"""What the note says is done; the board of the configuration is down afterwards."""
+UNUSABLE: dict[str, tuple[Callable[[Note], Note | bytes], str]] = {
+    "empty": (as_bytes(b""), "JSON"),
+    "garbage": (as_bytes(bytes(range(256))), "JSON"),
+    "zeros": (as_bytes(bytes(300)), "JSON"),
+    "half": (half, "JSON"),
+    "null": (as_bytes(b"null"), "must be an object"),
+    "a list": (as_bytes(b"[1, 2]"), "must be an object"),
+    "a number": (as_bytes(b"7"), "must be an object"),
+    "large": (as_bytes(b'{"driver_kind": "' + b"x" * (3 << 20) + b'"}'), "JSON"),
+    "nested deeply": (as_bytes(b"[" * 100_000), "JSON"),
+    "missing driver": (without("driver_kind"), "driver_kind"),
+    "missing wiring": (without("wiring"), "wiring"),
+    "missing slew": (without("trip_slew_v_per_s"), "trip_slew_v_per_s"),
+    "unknown driver": (changed(driver_kind="my_card"), "my_card"),
+    "driver of no name": (changed(driver_kind=None), "driver_kind"),
+    "driver whose plug-in is broken": (changed(driver_kind="broken"), "broken"),
+    "unknown option": (with_options(spin=3), "spin"),
+    "option of another type": (with_options(file=5), "file"),
+    "options that are none": (changed(driver_options="not JSON"), "driver_options"),
+    "options nested deeply": (changed(driver_options="[" * 100_000), "driver_options"),
+    "options of another driver": (changed(driver_options='{"device": "/dev/comedi0"}'), "device"),
+    "channel that the driver lacks": (changed(wiring={"x": ["adc0", "dac7"]}), "dac7"),
+    "channels exchanged": (changed(wiring={"x": ["dac0", "adc0"]}), "dac0"),
+    "no channels": (changed(wiring={}), "wiring"),
+    "wiring of another shape": (changed(wiring={"x": "dac0"}), "wiring"),
+    "slew of 0": (changed(trip_slew_v_per_s=0.0), "trip_slew_v_per_s"),
+    "slew of -5": (changed(trip_slew_v_per_s=-5.0), "trip_slew_v_per_s"),
+    "slew of NaN": (changed(trip_slew_v_per_s=float("nan")), "trip_slew_v_per_s"),
+    "infinite slew": (changed(trip_slew_v_per_s=float("inf")), "trip_slew_v_per_s"),
+    "slew of null": (changed(trip_slew_v_per_s=None), "trip_slew_v_per_s"),
+    "slew that takes an hour": (changed(trip_slew_v_per_s=0.002), "trip_slew_v_per_s"),
+    "rate of 0": (changed(rate_hz=0.0), "rate_hz"),
+    "rate of -1": (changed(rate_hz=-1.0), "rate_hz"),
+    "rate of 10^9": (changed(rate_hz=1e9), "rate_hz"),
+    "rate of NaN": (changed(rate_hz=float("nan")), "rate_hz"),
+    "heartbeat of -1": (changed(heartbeat_timeout_s=-1.0), "heartbeat_timeout_s"),
+    "heartbeat of NaN": (changed(heartbeat_timeout_s=float("nan")), "heartbeat_timeout_s"),
+}
+"""No note: the configuration's board is parked, and a sentence names what was not understood."""
+
+
+@pytest.mark.parametrize("case", USABLE)
+def test_a_note_that_is_understood_is_parked_by(lab: Lab, case: str):
+    lab.note.write_text(json.dumps(USABLE[case](lab.text)))
+    lab.note.chmod(0o600)
+    code, message = lab.park()
+    assert (code, NOT_UNDERSTOOD in message) == (GOOD, False), message
+    assert_ramped(lab.board)
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_a_note_that_is_not_understood_is_none_and_named(
+    lab: Lab, case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    if case == "driver whose plug-in is broken":
+        from rtloop.drivers import registry
+
+        (tmp_path / "broken_plug_in.py").write_text("import a_library_that_was_removed\n")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.setitem(registry.BUILT_IN, "broken", "broken_plug_in:Card")
+    damage, culprit = UNUSABLE[case]
+    note = damage(lab.text)
+    lab.note.write_bytes(note if isinstance(note, bytes) else json.dumps(note).encode())
+    lab.note.chmod(0o600)
+    code, message = lab.park()
+    assert code == GOOD, message
+    assert len(message.splitlines()) == 2
+    sentence = message.splitlines()[1]
+    assert NOT_UNDERSTOOD in sentence
+    assert str(lab.note) in sentence
+    assert culprit in sentence
+    assert len(sentence) < 700
+    assert_ramped(lab.board)
+
+
+def test_a_slew_beyond_all_measure_is_one_step(lab: Lab):
+    lab.note.write_text(json.dumps(lab.text | {"trip_slew_v_per_s": 1e12}))
+    lab.note.chmod(0o600)
+    assert lab.park()[0] == GOOD
+    assert lab.board.outputs_v == [0.0]
+    assert lab.board.path_v.min() >= 0.0
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 1e-6])
+def test_a_slow_rate_makes_neither_large_steps_nor_a_long_wait(lab: Lab, rate_hz: float):
+    """The slew is kept by steps that are smaller than the loop's."""
+    lab.note.write_text(json.dumps(lab.text | {"rate_hz": rate_hz, "trip_slew_v_per_s": 50.0}))
+    lab.note.chmod(0o600)
+    assert lab.park()[0] == GOOD
+    assert_ramped(lab.board, 50.0, 100.0)
+
+
+def test_no_note_is_no_mishap(lab: Lab):
+    code, message = lab.park()
+    assert (code, NOT_UNDERSTOOD in message) == (GOOD, False)
+    assert_ramped(lab.board)
+
+
+@pytest.mark.parametrize("case", ["FIFO", "folder", "mode 666", "mode 660"])
+def test_a_note_that_others_may_have_made_is_refused_and_the_configuration_parked(lab: Lab, case: str):
+    if case == "FIFO":
+        os.mkfifo(lab.note, 0o600)
+    elif case == "folder":
+        lab.note.mkdir(0o700)
+    else:
+        lab.note.write_text(json.dumps(lab.text))
+        lab.note.chmod(int(case[-3:], 8))
+    code, message = lab.park()
+    assert code == REFUSED
+    assert str(lab.note) in message
+    assert_ramped(lab.board)
+
+
+@pytest.mark.parametrize("target", ["note", "nothing", "itself"])
+def test_a_note_that_is_a_link_is_none(lab: Lab, tmp_path: Path, target: str):
+    place = {"note": tmp_path / "elsewhere", "nothing": tmp_path / "missing", "itself": lab.note}[target]
+    (tmp_path / "elsewhere").write_text(json.dumps(lab.text))
+    lab.note.symlink_to(place)
+    code, message = lab.park()
+    assert code == GOOD
+    assert NOT_UNDERSTOOD in message
+    assert_ramped(lab.board)
+
+
+def noted_on(lab: Lab, **options: Any) -> None:
+    """The service ran with other options than the configuration has by now."""
+    lab.note.write_text(json.dumps(with_options(**options)(lab.text)))
+    lab.note.chmod(0o600)
+
+
+def test_another_file_of_the_same_driver_is_another_board(lab: Lab, tmp_path: Path):
+    noted_on(lab, file=str(tmp_path / "other"))
+    code, message = lab.park()
+    assert (code, message.count("6.660 V")) == (GOOD, 2)
+    assert_ramped(lab.board)
+    assert lab.other.outputs_v[0] == 0.0
+
+
+def test_two_channels_of_another_board_are_ramped(lab: Lab, tmp_path: Path):
+    wiring = {"x": ["adc0", "dac0"], "y": ["adc1", "dac1"]}
+    noted_on(lab, file=str(tmp_path / "other"))
+    lab.note.write_text(json.dumps(json.loads(lab.note.read_text()) | {"wiring": wiring}))
+    assert lab.park()[0] == GOOD
+    assert_ramped(lab.other)
+    assert_ramped(lab.board)
+
+
+def test_a_noted_board_that_is_gone_is_said_after_the_other_was_parked(lab: Lab, tmp_path: Path):
+    noted_on(lab, file=str(tmp_path / "gone"))
+    code, message = lab.park()
+    assert code == UNAVAILABLE
+    assert "gone" in message
+    assert "6.660 V" in message
+    assert_ramped(lab.board)
+
+
+def test_a_configured_board_that_is_gone_is_said_after_the_noted_one_was_parked(lab: Lab, tmp_path: Path):
+    noted_on(lab)
+    lab.config.write_text(lab.config.read_text().replace(f'"{tmp_path}/board"', f'"{tmp_path}/gone"'))
+    code, message = lab.park()
+    assert code == UNAVAILABLE
+    assert "gone" in message
+    assert "6.660 V" in message
+    assert_ramped(lab.board)
+
+
+def test_a_silent_node_is_said_after_the_other_board_was_parked(lab: Lab):
+    pytest.importorskip("can")
+    options = {"interface": "udp_multicast", "channel": "239.74.163.77", "wait_s": 0.2,
+               "settings": {"port": free_port(), "hop_limit": 0}}  # fmt: skip
+    lab.note.write_text(json.dumps(lab.text | {"driver_kind": "can", "driver_options": json.dumps(options)}))
+    lab.note.chmod(0o600)
+    code, message = lab.park()
+    assert code == UNAVAILABLE
+    assert "no node has answered" in message
+    assert_ramped(lab.board)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return int(one.getsockname()[1])
+
+
+def test_all_that_failed_is_said(lab: Lab, tmp_path: Path):
+    noted_on(lab, file=str(tmp_path / "gone"))
+    lab.config.write_text(lab.config.read_text().replace(f'"{tmp_path}/board"', f'"{tmp_path}/gone too"'))
+    code, message = lab.park()
+    assert code == UNAVAILABLE
+    assert f"{tmp_path}/gone:" in message
+    assert f"{tmp_path}/gone too:" in message
+
+
+def test_neither_note_nor_configuration_is_understood(lab: Lab):
+    lab.note.write_text("{")
+    lab.note.chmod(0o600)
+    lab.config.write_text("[[axis")
+    code, message = lab.park()
+    assert code == 78
+    assert NOT_UNDERSTOOD in message
+    assert str(lab.config) in message
