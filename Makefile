@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship planted
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -37,6 +37,11 @@ browser: $(READY)
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)
 	$(BIN)/python -m tests.faults
+
+# Mistakes that a competent programmer could make, planted one by one in a copy of the tree (tests/planted): each turns
+# its tests red. A minute each where kernels are compiled anew; `WORDS="ramp pid"` for some of them.
+planted: $(READY)
+	$(BIN)/python -m tests.planted $(WORDS)
 
 # Two of them at once, a hundred times at random: a quarter of an hour.
 faults-pairs: $(READY)
