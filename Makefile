@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants planted
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -41,6 +41,11 @@ faults: $(READY)
 # Mistakes planted one at a time, each of which must make a row of that table fail: about five minutes.
 faults-mutants: $(READY)
 	$(BIN)/python -m tests.faults.mutants
+
+# Mistakes that a competent programmer could make, planted one by one in a copy of the tree (tests/planted): each turns
+# its tests red. A minute each where kernels are compiled anew; `WORDS="ramp pid"` for some of them.
+planted: $(READY)
+	$(BIN)/python -m tests.planted $(WORDS)
 
 # Two of them at once, a hundred times at random: a quarter of an hour.
 faults-pairs: $(READY)

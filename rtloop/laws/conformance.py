@@ -23,20 +23,29 @@ from rtloop.law.layout import MAX_EXTRAS, told_by
 from rtloop.law.memory import records
 from rtloop.laws.binding import signatures_of
 from rtloop.laws.contract import Controller, Law, record_of
+from rtloop.laws.limited_return import SATURATED, LimitedLoop, gains_of
 from rtloop.laws.linearise import as_written
 from rtloop.laws.purity import foreign_calls
 
 TICKS, SEED = 400, 7
 COST_TICKS = 4_000
+SETTLING_TICKS = 2_000
 REACH_UM = 60.0
 BUMP = 1e-6
 """Of the command that a law is told to go on from, and of the error that it meets."""
+LATER, LATER_TICKS, FURTHER = 0.15, 5, 0.2
+"""By how much the return from a limit may take longer than without one, as a part and in ticks; by which part of the
+way it may overshoot further."""
 
 
 class LawConformance:
-    """Set `law`: an instance, with options as a user would give them."""
+    """Set `law`: an instance, with options as a user would give them.
+
+    A law whose memory is longer than its loop's settling time sets `saturated_ticks` to that.
+    """
 
     law: Law
+    saturated_ticks = 0
 
     @pytest.fixture
     def bench(self) -> Bench:
@@ -103,6 +112,28 @@ class LawConformance:
             found = bench.enter(position_um, error_um, command_um)
             room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
             assert np.all(np.abs(found - command_um) <= room), f"told to go on at {command_um}, it gave {found}"
+
+    def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
+        """After a limit was long in force, the loop comes back as soon as from rest, and overshoots no further.
+
+        The loop is that of `rtloop.laws.limited_return`: a lag with the gain of the law's model, or 1.
+        """
+        if not isinstance(self.law, Controller):
+            pytest.skip("a feedforward has no loop")
+        free = bench.limited_loop(at_rest=True).unlimited_return()
+        if free is None:
+            pytest.skip("without a limit its loop around a lag with the gain of its model, or 1, does not come back")
+        most_ticks = int((1 + LATER) * free.ticks) + LATER_TICKS
+        saturated_ticks = max(SATURATED * free.ticks, self.saturated_ticks)
+        found = bench.limited_loop().limited_return(saturated_ticks, most_ticks)
+        assert found is not None, (
+            f"wound up: {saturated_ticks} ticks beyond the limit, and it was not back after {most_ticks} ticks; "
+            f"it takes {free.ticks} without a limit"
+        )
+        assert found.overshoot <= free.overshoot + FURTHER, (
+            f"wound up: back from the limit it overshot by {100 * found.overshoot:.1f} % of the way; "
+            f"without a limit by {100 * free.overshoot:.1f} %"
+        )
 
     def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:
         """No memory taken, nothing printed, no interpreter, no mathematics that differs between processors."""
@@ -197,6 +228,27 @@ class Bench:
         if "enter" in self._kernels:
             self._call("enter", told)
         return self._commands(told)
+
+    def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
+        """The law at the edge of what the limit can hold; one without `enter` is brought to rest there if `at_rest`."""
+        count = self._law.count
+        loop = LimitedLoop(self._follow, gains_of(self._law.model, count), REACH_UM)
+        self.enter(loop.edge_um, np.zeros(count), np.full(count, REACH_UM))
+        if at_rest and "enter" not in self._kernels:
+            loop.follow(loop.edge_um, SETTLING_TICKS, limited=False)
+        return loop
+
+    def _follow(self, position_um: Any, reference_um: Any, limit_um: float) -> Any:
+        """One tick with a limit of the command; what was applied. All (axes,)."""
+        told = self._told[0]
+        if self._law.count == 1:
+            position_um, reference_um = float(position_um[0]), float(reference_um[0])
+        told.position_um, told.reference_um, told.error_um = position_um, reference_um, reference_um - position_um
+        told.inputs, told.outputs = 0.0, 0.0
+        value = self._commands(told)
+        told.command_um, told.applied_um = value, np.clip(value, -limit_um, limit_um)
+        self._call("update", told)
+        return np.atleast_1d(np.array(told.applied_um))
 
     def foreign(self) -> Iterator[tuple[str, dict[str, str]]]:
         """Of each function what it calls that a law may not."""

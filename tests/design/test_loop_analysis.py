@@ -134,6 +134,19 @@ def test_gain_margin_of_three_lags() -> None:
     assert not analyse_continuous(Transfer.from_zpk([], [], 8.1), plant).stable
 
 
+def test_gain_margin_of_a_conditionally_stable_loop() -> None:
+    """k (s + 1)²/s³/(1 + s/10)² is real where ω² − 9 ω + 10 = 0: beyond −1 at the slower one, within at the faster."""
+    w = (9 + math.sqrt(41)) / 2
+    gain = (1 + w**2) / (w**3 * (1 + w**2 / 100))
+    analysis = analyse_continuous(
+        Transfer.from_factors(3.0, [[1, 1], [1, 1]], [[1, 0], [1, 0]]),
+        Transfer.from_factors(100.0, [], [[1, 0], [1, 10], [1, 10]]),
+    )
+    assert analysis.stable
+    assert analysis.gain_margin == pytest.approx(1 / (3.0 * gain), rel=1e-9)
+    assert analysis.gain_margin_hz == pytest.approx(w / (2 * math.pi), rel=1e-9)
+
+
 def test_gain_margin_at_half_the_sampling_rate() -> None:
     """x⁺ = x + k T e is stable for k T < 2, and reaches −1 at z = −1."""
     integrator = Transfer.from_factors(1, [], [[1, 0]])

@@ -127,6 +127,8 @@ def test_two_modes_move_by_themselves_in_every_combination() -> None:
     assert {one.delay_ticks for one in Family(model, 2, RANGE, PERIOD_S).corners()} == {2}
     both = RANGE.model_copy(update={"delay_ticks": (0, 1)})
     assert {one.delay_ticks for one in Family(model, 2, both, PERIOD_S).corners()} == {0, 1}
+    swept = [(one.delay_ticks, one.resonance[0]) for one in Family(model, 2, both, PERIOD_S).swept(3)]
+    assert set(swept) == {(ticks, percent) for ticks in (0, 1) for percent in (-8.0, 0.0, 8.0)}
 
 
 def test_evolution_finds_the_minimum_of_a_bent_valley_and_its_seed_decides() -> None:

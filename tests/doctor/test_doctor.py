@@ -18,6 +18,7 @@ from rtloop.analysis.margins import delay_tolerated
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.doctor.examine import Examination, Latency, conditions
+from rtloop.doctor.findings import Finding
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
 from rtloop.linear.transfer import Transfer
@@ -97,6 +98,13 @@ def test_conditions_count_against_the_period(tmp_path):
     fast, slow = latency(np.full(20_000, 5.0)), latency(np.full(20, 5.0), 10.0)
     assert [reason.partition(":")[0] for reason in reasons(Examination(fast, found))] == ["kernel"]
     assert reasons(Examination(slow, found)) == []
+
+
+def test_a_condition_that_the_host_does_not_show_is_no_reason():
+    """Beyond a period of 100 µs, and neither good nor bad: only what is known to be bad counts."""
+    shown = [Finding("kernel", "unknown", "PREEMPT_RT", good, 5000.0, "late ticks", "") for good in (None, True, False)]
+    quiet = latency(np.full(20_000, 5.0))
+    assert [len(reasons(Examination(quiet, (finding,)))) for finding in shown] == [0, 0, 1]
 
 
 def test_a_stall_and_steady_lateness_are_told_apart():

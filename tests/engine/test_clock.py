@@ -69,6 +69,17 @@ def test_missed_periods_are_counted_and_skipped():
     assert grid == [0, 10, 13, 14, 1014]
 
 
+@pytest.mark.parametrize("rate_hz", [3_000, 7, 44_100])
+def test_a_deadline_long_after_the_start_is_the_exact_one(rate_hz):
+    """Deadline k is k/rate in whole ns: a period of whole ns would be 333 µs early at 3 kHz after a million ticks."""
+    context = clock_context(rate_hz)
+    clock = paced_clock(context, 0.0)
+    context.index = 1_000_000
+    context.start_ns = time.monotonic_ns() - 1_000_000 * 10**9 // rate_hz
+    deadline, _, missed, _ = wait(clock)
+    assert deadline == (1_000_000 + int(missed)) * 10**9 // rate_hz
+
+
 def test_a_late_tick_runs_once():
     """In the loop: missed periods stand in the record of the tick after them; one event begins an episode."""
     us = 1000.0

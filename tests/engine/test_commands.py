@@ -108,6 +108,26 @@ def test_a_mode_is_refused_while_tripped_and_taken_after_a_reset():
     assert bench.column(rows, "flags").tolist() == [0, 0]
 
 
+def test_into_closed_loop_the_position_in_force_is_held():
+    """Out of raw mode, with `held`: 3 V are some 7 µm, and what a reference in volts was is no reference any more."""
+    bench = LoopBench(text(IDEAL, AXIS, CONTROLLER, mode="raw"))
+    hold(bench, 3.0)
+    before = bench.run(500)
+    bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP, 0.0, 1.0)
+    after = bench.run(10)
+    position_um, command_um = (bench.column(before, f"x_{name}_um")[-1] for name in ("position", "command"))
+    assert abs(position_um - command_um) > 0.01
+    assert set(bench.column(after, "x_reference_um")) == {position_um}
+
+
+def test_another_reference_ends_what_was_fed_with_the_one_before():
+    bench = LoopBench(text(IDEAL, AXIS, CONTROLLER))
+    bench.assembly.generators["feed_um"] = 3.0
+    assert set(bench.column(bench.run(5), "x_feed_um")) == {3.0}
+    hold(bench, 1.0)
+    assert set(bench.column(bench.run(5), "x_feed_um")) == {0.0}
+
+
 def test_stop_ramps_down_then_ends_and_refuses_modes_meanwhile():
     bench = LoopBench(RAW)
     hold(bench, 2.0)

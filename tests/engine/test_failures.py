@@ -123,6 +123,22 @@ def test_a_card_that_refuses_for_a_while_is_not_stepped(refused: int):
     assert np.count_nonzero(bench.column(rows, "flags").astype(int) & Flag.WRITE_FAILED) == refused
 
 
+def test_a_card_that_refuses_most_values_is_still_ramped_down():
+    """It takes one of 401: for longer than a second in all, and never for a second in a row."""
+    tries: list[int] = []
+
+    def refuse(k: int) -> None:
+        tries.append(k)
+        if len(tries) > 25 and len(tries) % 401 != 0:
+            raise OSError("busy")
+
+    driver = ScriptedDriver(lambda k: 0.0, refuse)
+    bench = LoopBench(RAW, driver)
+    bench.run(FOR_EVER)
+    assert len(tries) > 10_000
+    assert driver.written[-1] == 0.0
+
+
 def test_a_nan_from_the_driver_holds_then_ramps():
     bench = LoopBench(RAW, ScriptedDriver(lambda k: math.nan if k == 10 else 0.1))
     rows = bench.run(100)

@@ -75,6 +75,19 @@ def test_axis_value_and_limit(
     assert said is None or event["what"]["reason"] == said
 
 
+def test_a_trip_names_the_axis_that_is_to_blame() -> None:
+    """The second of two axes is driven beyond its limit; the first rests."""
+    channel = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n'
+    second = AXIS.replace('name = "x"', 'name = "y"') + "[axis.interlocks]\nposition_um = 5.0\n"
+    driven = '[axis.reference]\nkind = "hold"\nvalue = 4.0\n'
+    loop = LoopBench(text(channel, IDEAL, AXIS, second, driven, mode="raw"))
+    loop.run(400)
+    (trip,) = (message for message in loop.drain("events") if message["kind"] == Kind.TRIPPED)
+    event = event_of(trip, ["x", "y"], 0)
+    assert (event["axis"], event["what"]["values"][2]) == ("y", 5.0)
+    assert event["what"]["values"][1] > 5.0
+
+
 def test_a_trip_that_is_no_axis_fault_names_none() -> None:
     loop = bench(flicker(0.0))
     loop.driver.status = -5  # type: ignore[attr-defined]

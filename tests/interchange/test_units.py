@@ -34,6 +34,8 @@ TABLE = Table(
         ("Å", "nm", Fraction(1, 10)),
         ("kHz", "1/s", Fraction(1000)),
         ("m/s²", "µm/s^2", Fraction(10**6)),
+        ("mm²", "m²", Fraction(1, 10**6)),
+        ("1/ms²", "s^-2", Fraction(10**6)),
         ("Volts", "mV", Fraction(1000)),
         ("min", "s", Fraction(60)),
     ],

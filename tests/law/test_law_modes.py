@@ -12,7 +12,7 @@ from rtloop.drivers.base import Channel
 from rtloop.law.memory import view
 from rtloop.laws.shipped.transfer import COEFFICIENTS
 from rtloop.signals import Flag, Mode
-from tests.law.harness import EQ_4, EQ_20, PERIOD_S, LawBench, coefficients_of
+from tests.law.harness import EQ_4, EQ_20, EXACT, PERIOD_S, LawBench, coefficients_of
 from tests.law.oracle import Hysteresis, P, R, sine
 
 PLAIN = coefficients_of(controller=EQ_20)
@@ -47,6 +47,16 @@ def test_the_controller_is_the_difference_equation():
     b, a = signal.bilinear([0.5, 40.0], [1.0, 0.0], 1 / PERIOD_S)
     assert not np.any(signals.flags)
     np.testing.assert_allclose(signals.command_um, signal.lfilter(b, a, signals.error_um), rtol=0, atol=1e-9)
+
+
+def test_a_controller_without_integrator_goes_on_beside_a_feed():
+    """Entered at a command of 10 µm of which 4 µm are fed: at rest with the other 6 µm, so that nothing moves."""
+    lag = {"form": "transfer_function", "numerator": [40.0], "denominator": [1.0, 50.0]}
+    bench = LawBench(coefficients_of(controller=lag, feedforward=EXACT, limits={"bump_s": 1e9}), Mode.FEEDFORWARD)
+    bench.run(np.full(50, 10.0))
+    signals = bench.run(np.full(600, 1.0), mode=Mode.CLOSED_LOOP, feed_um=4.0)
+    np.testing.assert_allclose(signals.command_um, 10.0, rtol=0, atol=1e-6)
+    assert not np.any(signals.flags)
 
 
 def test_limited_commands_and_drives_say_so():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rtloop.signals import Flag, Mode
-from tests.law.harness import EQ_20, LawBench, coefficients_of
+from tests.law.harness import EQ_20, KEEP, LawBench, coefficients_of
 
 NEVER = -1
 
@@ -45,6 +45,18 @@ def test_an_error_that_lasts():
     # an error is judged in the tick after it was made
     assert first_trip(bench_of(Mode.CLOSED_LOOP, **limits), Flag.TRIP_TRACKING, error, 0.0) == 250
     assert first_trip(bench_of(Mode.FEEDFORWARD, **limits), Flag.TRIP_TRACKING, error, 0.0) == NEVER
+
+
+def test_an_error_that_lasts_is_counted_anew_after_mode_off():
+    """Thirty ticks of an error, OFF, thirty more: neither lasted for fifty."""
+    modes = np.full(200, KEEP)
+    modes[[130, 135]] = Mode.OFF, Mode.CLOSED_LOOP
+    error = np.zeros(200)
+    error[100:165] = 7.0
+    bench = bench_of(Mode.CLOSED_LOOP, tracking_error_um=6.0, tracking_ticks=50)
+    assert first_trip(bench, Flag.TRIP_TRACKING, error, modes=modes) == NEVER
+    bench = bench_of(Mode.CLOSED_LOOP, tracking_error_um=6.0, tracking_ticks=50)
+    assert first_trip(bench, Flag.TRIP_TRACKING, error) == 150
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,20 @@ class NoAntiWindup(Good):
         s.integral_um += 1e8 * told.error_um
 
 
+class WindsUp(Good):
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        s.integral_um += c.ki * told.error_um
+
+
+class WindsUpALittle(Good):
+    """A tenth of what was not applied is made up for in a tick: 23 ms for a loop that takes 30 ms."""
+
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        s.integral_um += c.ki * told.error_um + 0.004 * (told.applied_um - told.command_um)
+
+
 class EntersAtZero(Good):
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
@@ -161,6 +175,7 @@ FINITE, WHOLE = "test_it_builds_numbers_that_can_be_computed_with", "test_whole_
 BITS, RECORD = "test_compiled_and_uncompiled_give_the_same_bits", "test_its_state_is_in_its_record"
 READ_ONLY, STAYS = "test_its_coefficients_are_read_only", "test_it_stays_finite"
 POISON, ENTERS = "test_no_number_that_is_none_outlives_an_entry", "test_it_goes_on_where_it_is_told_to"
+WINDUP = "test_a_limited_command_does_not_wind_it_up"
 FOREIGN = "test_it_calls_nothing_that_waits_or_differs"
 BROKEN = {
     InfiniteCoefficient: FINITE,
@@ -173,6 +188,8 @@ BROKEN = {
     CountsElsewhere: RECORD,
     GrowsWithoutBound: STAYS,
     NoAntiWindup: STAYS,
+    WindsUp: WINDUP,
+    WindsUpALittle: WINDUP,
     EntersAtZero: ENTERS,
     EntersWithTheErrorForgotten: ENTERS,
     KeepsNan: POISON,

@@ -28,6 +28,7 @@ from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.replay.laws import Trust
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing import live
+from rtloop.signals import Mode
 from tests.engine.harness import LoopBench
 from tests.law.harness import PERIOD_S
 from tests.laws.changing import PAIR
@@ -40,6 +41,14 @@ LOOP = CONTROLLER[CONTROLLER.index("[[axis.controller.loops]]\n") :].split("[[ax
 DECOUPLING = "decoupling = [[0.98232, -0.14735], [0.11788, 0.98232]]"
 PID = '[axis.controller]\nkind = "pid"\nki_per_s = 1.0\n'
 ALONE = "[axis.controller]\n" + LOOP
+PAIR_OF_LAGS = """[axis.controller]
+kind = "coupled"
+axes = ["x", "y"]
+a = [[-50.0, 0.0], [0.0, -50.0]]
+b = [[1.0, 0.0], [0.0, 1.0]]
+c = [[40.0, 10.0], [0.0, 40.0]]
+d = [[0.0, 0.0], [0.0, 0.0]]
+"""
 THRESHOLDS, WEIGHTS = "thresholds_v = [0.0, 1.46, 4.01]", "weights_um_per_v = [3.0, 0.6, 0.9]"
 INVERTIBLE = f'[driver.plant.hysteresis]\ntruth = "custom"\n{THRESHOLDS}\n{WEIGHTS}\n[driver.coupling]'
 """Hysteresis without a dead band, which the inverse undoes wholly: what is left is linear."""
@@ -127,6 +136,37 @@ def test_a_limited_command_does_not_wind_it_up():
             np.testing.assert_allclose(c @ x + d @ told.error_um, applied_um, atol=1e-7)
             bench._call("update", told)
             np.testing.assert_allclose(bench.state["x"][0, : a.shape[0]], a @ x + b @ told.error_um, atol=1e-9)
+
+
+def test_what_it_remembers_does_not_matter_to_an_entry():
+    """Entered on a state of zeros, and entered in the middle of a run: the same commands from there on."""
+    for law in (example(EXAMPLES["coupled"]), state_space()):
+        bench, axes = Bench(law, compiled=False), law.count
+        asked_um = np.array([[3.0, -1.0, 2.0], [0.5, 4.0, -2.0], [7.0, 8.0, -9.0]])[:, :axes]
+        first = bench.enter(*asked_um)
+        state = bench.state["x"].copy()
+        list(bench.run(20))
+        told = bench._told[0]
+        told.position_um, told.error_um, told.command_um = asked_um
+        told.applied_um = told.command_um
+        bench._call("enter", told)
+        assert np.array_equal(bench.state["x"], state)
+        assert bench._commands(told) == first
+
+
+def test_entered_beside_feeds_it_rests_with_its_own_part_of_the_commands():
+    """Two lags without integrator, let in at commands of 10 and −6 µm of which 4 and 3 µm are fed: nothing moves."""
+    lags = f"{PAIR_OF_LAGS}allow_unstable = true\n\n"
+    text = EXAMPLE.replace(CONTROLLER, lags).replace("rate_hz = 10000", 'rate_hz = 10000\nmode = "feedforward"')
+    text = text.replace("[axis.feedforward]", "[axis.limits]\nbump_s = 1e9\n\n[axis.feedforward]")
+    bench, before = run(referenced(text, 'kind = "hold"\nvalue = 10.0', 'kind = "hold"\nvalue = -6.0'), 300)
+    bench.assembly.generators["feed_um"] = 4.0, 3.0
+    bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP)
+    after = bench.run(300)
+    assert np.all(bench.column(after, "mode") == Mode.CLOSED_LOOP)
+    for axis in "xy":
+        moved_um = bench.column(after, f"{axis}_command_um") - bench.column(before, f"{axis}_command_um")[-1]
+        assert np.abs(moved_um).max() < 0.3
 
 
 def test_cross_talk_is_what_the_decoupling_takes_away():

@@ -24,7 +24,7 @@ from rtloop.errors import ConfigError, HostRefused, RtloopError, UnavailableErro
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware as Noted
 from rtloop.supervision.hardware import UnusableNote, keep, noted
-from rtloop.supervision.paths import hardware_path
+from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.bench import Bench
 from tests.one_axis import one_axis, wired
 
@@ -243,6 +243,16 @@ def test_what_is_parked_stays_where_it_is(parked, card):
     for _ in range(3):
         park()
     assert set(hardware.written) <= {0.0}
+
+
+def test_what_was_noted_of_an_output_that_is_safe_already_is_put_right(parked):
+    """Somebody else made it safe: it does not move, and nobody believes any more that it is where it was noted."""
+    hardware, park = parked(ReadableCard)
+    hardware.volts = 0.0
+    park()
+    fd = os.open(block_path("lab"), os.O_RDWR)
+    assert SharedBlock(fd)["last_drive_v"].tolist() == [0.0]
+    os.close(fd)
 
 
 @pytest.mark.parametrize("card", [ReadableCard, MuteCard])

@@ -1,0 +1,46 @@
+"""Standard deviations that are stated beside a figure, against the spread of that figure over known draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from rtloop.analysis.measured.loop import MeasuredLoop
+from rtloop.analysis.measured.margins import measured_margins
+from rtloop.design.identification.hysteresis.judgement import together
+
+DRAWS = 1000
+CHANCE = 1e-6
+"""That a right statement is refused."""
+
+
+def require_stated(stated: float, values: np.ndarray, room: float) -> None:
+    """Fail unless `values`, which are normal, spread as stated, but for chance and a bias of `room`."""
+    freedom = values.size - 1
+    low, high = np.sqrt(stats.chi2.ppf([CHANCE / 2, 1 - CHANCE / 2], freedom) / freedom)
+    ratio = values.std(ddof=1) / stated
+    assert low * (1 - room) < ratio < high * (1 + room), f"stated {stated:.4g}, the spread is {ratio:.3f} of it"
+
+
+def test_the_error_of_several_recordings_spreads_as_stated():
+    """Thirty recordings of 20 normal errors each; what is stated is right in the mean of its square."""
+    errors_um = np.random.default_rng(1).normal(0.0, 0.3, (DRAWS, 30, 20))
+    rms_um = np.sqrt(np.mean(errors_um**2, axis=2))
+    found = [together(row.tolist()) for row in rms_um]
+    stated = np.sqrt(np.mean([one.std_um**2 for one in found]))
+    assert stated == pytest.approx(0.3 / np.sqrt(2 * 30 * 20), rel=0.02)  # σ/√(2n), of n normal errors
+    require_stated(stated, np.array([one.rms_um for one in found]), room=0.02)
+
+
+def test_margins_of_a_measured_loop_spread_as_stated():
+    """L = 2/(s + 1)³, known to 2 % of its magnitude: every draw moves all of it by one complex number."""
+    hz, spread = np.geomspace(0.05, 0.6, 60), 0.02
+    loop = 2 / (2j * np.pi * hz + 1) ** 3
+    stated = measured_margins(MeasuredLoop(hz, loop, np.full(hz.size, spread), 1e4, None))
+    dense = 2 / (2j * np.pi * np.geomspace(0.05, 0.6, 4000) + 1) ** 3
+    parts = np.random.default_rng(2).normal(0.0, spread * np.sqrt(0.5), (DRAWS, 2))
+    modulus = np.array([np.abs(1 + dense * (1 + complex(*part))).min() for part in parts])
+    assert stated.modulus_margin.value == pytest.approx(np.abs(1 + dense).min(), rel=1e-4)
+    require_stated(stated.modulus_margin.std, modulus, room=0.02)
+    require_stated(stated.max_sensitivity.std, 1 / modulus, room=0.02)

@@ -1,0 +1,168 @@
+"""After a mishap: supervisor, parking, the recorder's keeper and the service against clocks that the test moves."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtloop.configuration.file import RecordingOptions
+from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
+from rtloop.errors import LoopFault
+from rtloop.recording.capture.names import Names
+from rtloop.service import service as service_module
+from rtloop.service.service import Service
+from rtloop.supervision import parking, recorder_keeper
+from rtloop.supervision.recorder_keeper import RecorderKeeper
+from rtloop.supervision.stall import StallWatch
+from rtloop.supervision.supervisor import WATCHED_S, Supervisor
+from tests.laws.test_shipped import DEPLOY
+
+SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
+
+
+class Clock:
+    """The module `time` of whoever is told so: it moves as one sleeps."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(1e9 * self.now_s)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+@pytest.fixture
+def block() -> SharedBlock:
+    return SharedBlock.create(SIZES)
+
+
+@pytest.mark.parametrize("drive_v", [-10.0, 10.0])
+def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monkeypatch, drive_v):
+    """From either end of the range: 10 V at 2 V/s after a heartbeat of 1 s; only then is it killed."""
+    clock, killed_s = Clock(), list[float]()
+    monkeypatch.setattr(parking, "time", clock)
+    monkeypatch.setattr(SharedBlock, "driven_by", lambda _: None if killed_s else 4711)
+    monkeypatch.setattr(SharedBlock, "kill_driver", lambda _: killed_s.append(clock.now_s))
+    block["last_drive_v"][:] = drive_v
+    parking._await_end(block, 1.0, 2.0)
+    assert killed_s[0] - 1000.0 == pytest.approx(1.0 + 5.0 + parking.MARGIN_S, abs=2 * parking.POLL_S)
+
+
+@pytest.mark.parametrize(("silent_s", "beats"), [(0.5 * WATCHED_S, True), (1.5 * WATCHED_S, False)])
+def test_the_heart_beats_only_while_the_loop_is_watched(block, silent_s, beats):
+    supervisor: Any = object.__new__(Supervisor)
+    closed = threading.Event()
+    supervisor.block, supervisor._watched_s = block, time.monotonic() - silent_s
+    supervisor._closed = SimpleNamespace(is_set=closed.is_set, wait=lambda _: closed.set())
+    supervisor._beat()
+    assert (block.load(Word.HEARTBEAT_NS) != 0) == beats
+
+
+def test_a_loop_that_ramps_down_behind_its_last_tick_does_not_stand_still(block):
+    """Ticks behind the last recorded one are in no ring: its head stands still while the outputs are ramped."""
+    supervisor: Any = object.__new__(Supervisor)
+    ended: list[bool] = []
+    supervisor.block, supervisor._stall = block, StallWatch(0.0, 1.0)
+    supervisor.prepared = SimpleNamespace(plan=SimpleNamespace(pacing=SimpleNamespace(paced=True)))
+    supervisor._loop = SimpleNamespace(end=lambda: ended.append(True))
+    block.store(Word.LOOP_STATE, ProcessState.RUNNING)
+    block["ticks_head"][0] = 100
+    block.store(Word.FINISHED_TICKS, 100)
+    assert not supervisor._loop_stalled()
+    block.store(Word.FINISHED_TICKS, 0)
+    assert supervisor._loop_stalled()
+    assert ended == [True]
+
+
+@pytest.mark.parametrize(("complete", "code"), [(True, 0), (False, LoopFault.exit_code)])
+def test_a_recording_that_is_not_whole_is_no_success(complete, code):
+    supervisor: Any = object.__new__(Supervisor)
+    finished = {"report": "finished", "outcome": "done", "driver_error": None}
+    supervisor._loop = SimpleNamespace(wait=lambda _: 0, reports=lambda: [finished], exit_code=0)
+    supervisor._reports, supervisor.error, supervisor.recorder = {}, None, SimpleNamespace(notes=[])
+    assert supervisor._result({"paths": [], "complete": complete}).exit_code == code
+
+
+class Recorder:
+    """A recorder's process that lives and does nothing."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self.exit_code: int | None = None
+
+    def end(self) -> bool:
+        return True
+
+
+def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
+    options = RecordingOptions()
+    keeper = RecorderKeeper(Recorder(), block, Names.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
+    keeper._ordered = True
+    return keeper
+
+
+@pytest.mark.parametrize(("recorded", "replaced"), [(500, 0), (499, 1)])
+def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_path, monkeypatch, recorded, replaced):
+    """Its cursor stands still for ten seconds: at the newest tick it waits, behind it it stands still."""
+    clock = Clock()
+    monkeypatch.setattr(recorder_keeper, "time", clock)
+    monkeypatch.setattr(recorder_keeper, "Child", Recorder)
+    keeper = a_keeper(block, tmp_path)
+    block["ticks_head"][0] = 500
+    block.store(Word.RECORDER_CURSOR, recorded)
+    for _ in range(200):
+        keeper._replace_if_gone()
+        clock.sleep(0.05)
+    assert keeper.replacements == replaced
+
+
+def test_another_recorder_begins_behind_the_last_file_whatever_was_removed(block, tmp_path):
+    """The quota took the files 1 to 3: a fifth after the fourth, and never one that is there."""
+    keeper = a_keeper(block, tmp_path)
+    keeper.replacements = 1
+    (tmp_path / "lab-1-0004.mcap").touch()
+    (tmp_path / "lab-1-0005.mcap.part").touch()
+    assert keeper._next_sequence() == 6
+
+
+def dying_loops(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 100) -> tuple[Service, list[bool]]:
+    """A service whose loops die after so many seconds, and which is ended with the last of them; what each was told
+    of `resting`."""
+    service, clock, resting = Service(DEPLOY / "paper.toml"), Clock(), list[bool]()
+    options = service.configuration.service.model_copy(update={"restarts": 2, "restart_window_s": 60.0})
+    service.configuration = replace(service.configuration, service=options)
+    monkeypatch.setattr(service_module, "time", clock)
+    monkeypatch.setattr(service, "_aside", lambda work: None)
+
+    def episode(at_rest: bool) -> Any:
+        resting.append(at_rest)
+        clock.sleep(after_s)
+        if len(resting) == loops:
+            service.end()
+        return SimpleNamespace(error="the loop's process died", outcome="killed", exit_code=70, notes=[])
+
+    monkeypatch.setattr(service, "_episode", episode)
+    return service, resting
+
+
+def test_the_loop_after_one_that_died_begins_with_its_outputs_off(monkeypatch):
+    service, resting = dying_loops(monkeypatch, after_s=1.0)
+    with pytest.raises(LoopFault, match="died too often"):
+        service.run()
+    assert resting == [service.configuration.service.arm, True, True]
+
+
+def test_deaths_that_lie_far_apart_are_not_too_many(monkeypatch):
+    service, resting = dying_loops(monkeypatch, after_s=31.0, loops=10)
+    assert service.run() == 70
+    assert len(resting) == 10

@@ -1,0 +1,66 @@
+"""The desk and the staging beside a shared block whose words the test moves: neither is a tick early."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.engine.memory import SharedBlock, Sizes
+from rtloop.engine.messages import Kind, message
+from rtloop.engine.ring import claim, publish
+from rtloop.service import desk as desk_module
+from rtloop.service.changing.staging import Staging
+from rtloop.service.desk import Desk, Refused, Taken
+from rtloop.signals import Mode
+
+
+@pytest.fixture
+def block() -> SharedBlock:
+    return SharedBlock.create(Sizes(columns=20, axes=1, rate_hz=1000.0, snapshot_bytes=64, table_samples=0))
+
+
+def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatch):
+    """The event comes before its tick: the head of the ring stands at that tick until the tick was executed."""
+    now_s = [0.0]
+
+    def sleep(seconds: float) -> None:
+        """The loop meanwhile: it publishes the event of tick 7, and then one record after the other."""
+        now_s[0] += seconds
+        events = block.ring("events")
+        if int(events.head[0]) == 0:
+            event = message(Kind.SET_MODE, tick=7, values=[float(Mode.OFF)])
+            event["identity"] = 1
+            events.slots[claim(events, np.uint64(0))] = event[0]
+            publish(events, np.uint64(0))
+        else:
+            block["ticks_head"][0] += 1
+
+    block["ticks_head"][0] = 7
+    monkeypatch.setattr(desk_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    assert Desk(block).submit(Kind.SET_MODE, values=[float(Mode.OFF)]) == 7
+    assert block["ticks_head"][0] == 8
+
+
+def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
+    """Taken with records up to tick 4 there: tick 5 may be the one that reads what is staged, and tick 6 follows it."""
+
+    class DeafDesk:
+        def submit(self, *_: Any, **__: Any) -> int:
+            raise Taken("the loop has taken it and stands still")
+
+    staging = Staging(block, DeafDesk())  # type: ignore[arg-type]
+    staging.require_settled()
+    block["ticks_head"][0] = 5
+    with pytest.raises(Taken):
+        staging.submit(Kind.LOAD_LAW, 0, [])
+    for head in (5, 6):
+        block["ticks_head"][0] = head
+        with pytest.raises(Refused, match="stands still"):
+            staging.require_settled()
+    block["ticks_head"][0] = 7
+    staging.require_settled()
+    block["ticks_head"][0] = 5
+    staging.require_settled()  # once settled, it is forgotten
