@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.plan import Plan
-from rtloop.errors import writing
+from rtloop.errors import UnavailableError, writing
 from rtloop.hil.trusted import Untrusted, open_file
 from rtloop.supervision.paths import new_file, refusal
 
@@ -63,19 +63,29 @@ _AS_JSON = TypeAdapter(Hardware)
 
 
 def keep(path: Path, hardware: Hardware) -> None:
-    """Write it to `path`. Raises OutputError, HostRefused for a folder that others may write to."""
-    what = "the note of the hardware"
-    with open(new_file(path, what), "wb") as file, writing(f"{path}: cannot make {what}"):
-        file.write(_AS_JSON.dump_json(hardware))
-        file.flush()
+    """Write it to `path`, whose old note counts until the new one is whole.
+
+    Raises OutputError, HostRefused for a folder that others may write to.
+    """
+    what, new = "the note of the hardware", path.with_name(f"{path.name}.new")
+    with writing(f"{path}: cannot make {what}"):
+        with open(new_file(new, what), "wb") as file:
+            file.write(_AS_JSON.dump_json(hardware))
+        os.replace(new, path)
 
 
 def noted(path: Path) -> Hardware | None:
-    """What stands there; None where nothing does, or nothing whole. Raises HostRefused for what others may have put."""
+    """What stands there; None where nothing does, or nothing whole.
+
+    Raises HostRefused for what others may have put there, UnavailableError for a note that is there and cannot be read:
+    it may name the only board whose outputs are up.
+    """
     try:
         with open(open_file(path, os.O_RDONLY), "rb") as file:
             return _AS_JSON.validate_json(file.read(LARGEST_BYTES))
     except Untrusted as error:
         raise refusal(error) from None
-    except (OSError, ValidationError):
+    except (FileNotFoundError, ValidationError):
         return None
+    except OSError as error:
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None

@@ -48,7 +48,8 @@ def park_configuration(config: Path) -> str:
         driven = last or configured
         assert driven is not None
         if block is not None:
-            _await_end(block, driven.heartbeat_timeout_s, driven.trip_slew_v_per_s)
+            with _answering(block_path(name)):
+                _await_end(block, driven.heartbeat_timeout_s, driven.trip_slew_v_per_s)
             noted_v = block["last_drive_v"] if len(block["last_drive_v"]) == len(driven.wiring) else None
         from_v += park(driven.driver(), driven.trip_slew_v_per_s, noted_v)
     if last is not None and configured is not None and not configured.drives_like(last):
@@ -65,11 +66,20 @@ def _last_block(path: Path) -> Iterator[SharedBlock | None]:
         return
     try:
         block = None
-        with suppress(EOFError):  # its service died before there was anything in it
+        with suppress(EOFError), _answering(path):  # its service died before there was anything in it
             block = SharedBlock.attach(fd, lambda: True)
         yield block
     finally:
         os.close(fd)
+
+
+@contextmanager
+def _answering(path: Path) -> Iterator[None]:
+    """Raise UnavailableError where the system refuses to tell something of the shared block at `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None
 
 
 def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:
