@@ -38,7 +38,7 @@ browser: $(READY)
 strace:
 	command -v strace >/dev/null || { apt-get update && apt-get install --yes strace; }
 
-# Each system call of recorder, recover, cut, quota, parking and service fails, or is the last before SIGKILL: some 5000 tries.
+# Each system call of recorder, recover, cut, quota, note of the hardware and parking fails, or is the last before SIGKILL.
 soak-syscalls: $(READY) strace
 	$(BIN)/python -m tests.syscalls --mutants
 	$(BIN)/python -m tests.syscalls

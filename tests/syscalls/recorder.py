@@ -28,6 +28,8 @@ OPTIONS = {"min_free_bytes": 1, "rotate_bytes": 14_000, "message_index": True}
 class Recording(Case):
     """A loop that has run, recorded by a process; a recorder that dies is replaced, and its file repaired."""
 
+    may_crash = True
+
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.block = published()

@@ -14,8 +14,7 @@ from tests.syscalls.traced import unavailable
 
 SAMPLE = 200
 pytestmark = pytest.mark.skipif(bool(unavailable()), reason=unavailable())
-IN_PROCESS = [component for component in COMPONENTS.values() if component.name != "service"]
-SHARES = sum(component.share for component in IN_PROCESS)
+SHARES = sum(component.share for component in COMPONENTS.values())
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +23,7 @@ def _surroundings() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("component", IN_PROCESS, ids=lambda component: component.name)
+@pytest.mark.parametrize("component", COMPONENTS.values(), ids=COMPONENTS)
 def test_no_call_that_fails_or_is_the_last_leaves_harm(component, tmp_path: Path):
     tries, problems = plan([component], tmp_path)
     for _, injection in sample(tries, round(SAMPLE * component.share / SHARES)):
