@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants planted
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants planted strace soak-syscalls
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -33,6 +33,15 @@ browser: $(READY)
 	command -v chromium >/dev/null || apt-get install --yes chromium
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[browser]'
 	npm install --prefix $(VENV)/lib --no-save --silent axe-core@4 || echo "axe-core could not be installed: its test will be skipped"
+
+# What traces system calls, from Debian's packages (as root): tests that need it are skipped without.
+strace:
+	command -v strace >/dev/null || { apt-get update && apt-get install --yes strace; }
+
+# Each system call of recorder, recover, cut, quota, note of the hardware and parking fails, or is the last before SIGKILL.
+soak-syscalls: $(READY) strace
+	$(BIN)/python -m tests.syscalls --mutants
+	$(BIN)/python -m tests.syscalls
 
 # Some thirty faults on real processes, and a table of what came of them: about four minutes, as root for the full disk.
 faults: $(READY)

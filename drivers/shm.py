@@ -121,11 +121,13 @@ class ShmDriver(Driver):
             ) from None
         try:
             self._take(self._fd)
-        except DriverError:
+            memory = self._memory = BoardMemory(self._fd)
+        except (DriverError, OSError) as error:
             os.close(self._fd)
             self._fd = None
-            raise
-        memory = self._memory = BoardMemory(self._fd)
+            if isinstance(error, DriverError):
+                raise
+            raise DriverError(f"{self._file}: {error.strerror or error}") from None
         copied, held, timespec = (
             np.zeros(MAX_CHANNELS, np.int64),
             np.zeros(MAX_CHANNELS, np.int64),

@@ -23,6 +23,8 @@ SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 0.0001, 0.01
 a slow loop are divided: they would be large, and the last of them followed by a long wait."""
 LONGEST_RAMP_S = 5.0
 """Of a trip, a stop or a parking, from anywhere in the channel's range to safe."""
+GIVE_UP_S = 1.0
+"""As in the loop: a card that takes no write for so long is given up."""
 SPIN_S = 0.0005
 """A sleep may last longer by so much: what is left of a period is spun."""
 
@@ -97,7 +99,10 @@ def ramp_to_safe(
     slew_v_per_s: float,
     on_step: Callable[[Volts], None] = lambda _: None,
 ) -> None:
-    """Bring the outputs of an open driver from `from_v` to safe. Raises DriverError where a write fails.
+    """Bring the outputs of an open driver from `from_v` to safe.
+
+    A write that is refused is tried again each period: the output is where it was, and goes on from there. Raises
+    DriverError for a card that takes no write for GIVE_UP_S.
 
     `on_step` is told what was written, after it was: whoever dies in between has noted where the outputs were a step
     before, and another ramp from there begins with the very same write.
@@ -106,7 +111,10 @@ def ramp_to_safe(
     write = _WRITE(pointers.write)
     for row in ramp(from_v, safe_outputs_v(driver), slew_v_per_s * period_s):
         values = np.ascontiguousarray(row)
-        if write(pointers.context, values.ctypes.data) < 0:
+        given_up_s = time.monotonic() + GIVE_UP_S
+        while (status := write(pointers.context, values.ctypes.data)) < 0 and time.monotonic() < given_up_s:
+            _wait(time.monotonic() + period_s)
+        if status < 0:
             raise DriverError(f"{driver.kind}: write failed while parking at {row.tolist()} V")
         on_step(row)
         _wait(time.monotonic() + period_s)

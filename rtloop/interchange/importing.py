@@ -215,7 +215,7 @@ def _write(output: Path, header: dict[str, Any], signals: Signals, rate_hz: floa
         for start in range(0, len(ticks), step):
             writer.write_ticks(np.column_stack([column[start : start + step] for column in columns]))
             progress(writer.ticks)
-        writer.finish(final)
+        writer.finish(final, whole=True)
     except BaseException:
         writer.discard()
         raise

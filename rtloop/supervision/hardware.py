@@ -6,6 +6,7 @@ turn may be one of another version, or name what is no longer installed: it is b
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ from rtloop.drivers.base import Driver, Wiring, index_of, require_channels
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.ramp import require_short_ramp
-from rtloop.errors import ConfigError, RtloopError, one_line, writing
+from rtloop.errors import ConfigError, RtloopError, UnavailableError, one_line, writing
 from rtloop.hil.trusted import Untrusted, open_file
 from rtloop.supervision.paths import new_file, refusal
 
@@ -29,6 +30,13 @@ LARGEST_BYTES = 1 << 20
 
 class UnusableNote(RtloopError):
     """A note of the hardware that nothing can be parked by; the message says what of it is not understood."""
+
+
+class UnreadableNote(RtloopError):
+    """A note of the hardware that the system does not let be read now: it may name the only board whose outputs are
+    up."""
+
+    exit_code = UnavailableError.exit_code
 
 
 @dataclass(frozen=True)
@@ -78,17 +86,21 @@ _AS_JSON = TypeAdapter(Hardware)
 
 
 def keep(path: Path, hardware: Hardware) -> None:
-    """Write it to `path`. Raises OutputError, HostRefused for a folder that others may write to."""
-    what = "the note of the hardware"
-    with open(new_file(path, what), "wb") as file, writing(f"{path}: cannot make {what}"):
-        file.write(_AS_JSON.dump_json(hardware))
-        file.flush()
+    """Write it to `path`, whose old note counts until the new one is whole.
+
+    Raises OutputError, HostRefused for a folder that others may write to.
+    """
+    what, new = "the note of the hardware", path.with_name(f"{path.name}.new")
+    with writing(f"{path}: cannot make {what}"):
+        with open(new_file(new, what), "wb") as file:
+            file.write(_AS_JSON.dump_json(hardware))
+        os.replace(new, path)
 
 
 def noted(path: Path) -> Hardware | None:
     """The hardware that is noted at `path`, whose driver can be made; None where nothing is noted.
 
-    Raises UnusableNote, HostRefused for a file that others may have put there.
+    Raises UnusableNote, UnreadableNote, HostRefused for a file that others may have put there.
     """
     try:
         with open(open_file(path, os.O_RDONLY), "rb") as file:
@@ -98,7 +110,9 @@ def noted(path: Path) -> Hardware | None:
     except Untrusted as error:
         raise refusal(error) from None
     except OSError as error:
-        raise _unusable(path, error.strerror or str(error)) from None
+        if error.errno == errno.ELOOP:
+            raise _unusable(path, "it is a link") from None
+        raise UnreadableNote(f"{path}: the note of the hardware cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
         raise _unusable(path, describe(error, "note", None)[0]) from None
     try:

@@ -41,7 +41,8 @@ def park_configuration(config: Path) -> str:
     if boards:
         with _last_block(block_path(config.stem), account) as block, account.attempt():
             if block is not None:
-                _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
+                with _answering(block_path(config.stem)):
+                    _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
             _park(boards[0], None if block is None else block["last_drive_v"], account)
         for other in boards[1:]:
             with account.attempt():
@@ -91,7 +92,8 @@ def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
     try:
         block = None
         try:
-            block = SharedBlock.attach(fd, lambda: True)
+            with _answering(path):
+                block = SharedBlock.attach(fd, lambda: True)
             _ = block["last_drive_v"], block["words"]
         except EOFError:  # its service died before there was anything in it
             pass
@@ -102,6 +104,15 @@ def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
         yield block
     finally:
         os.close(fd)
+
+
+@contextmanager
+def _answering(path: Path) -> Iterator[None]:
+    """Raise UnavailableError where the system refuses to tell something of the shared block at `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise UnavailableError(f"{path}: {error.strerror or error}") from None
 
 
 def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: float) -> None:

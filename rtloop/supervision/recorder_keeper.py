@@ -186,8 +186,11 @@ class RecorderKeeper:
         except RtloopError as error:
             self.notes.append(str(error))
             return
-        part.unlink()
         self.notes.append(f"{report['output']}: recovered, {counted(report['ticks'], 'tick')}")
+        try:
+            part.unlink()
+        except OSError as error:
+            self.notes.append(f"{part}: is recovered, and cannot be removed: {error.strerror}")
 
     def _totals(self) -> dict[str, Any]:
         reports = self._child.reports()

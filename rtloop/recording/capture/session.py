@@ -164,13 +164,18 @@ class Session:
         return (large or long) and tick > self._cut_tick
 
     def _rotate(self, tick: int) -> None:
-        """Go on in another file; all before `tick` is written."""
-        self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
-        self._cut_tick = tick
+        """Go on in another file; all before `tick` is written.
+
+        The present file is finished once there is another: where none can be begun, it has to tell what is missing.
+        """
         try:
-            self._files.begin(self._files.opened(self._start_unix_ns() + self._place(tick).time_ns))
+            writer = self._files.opened(self._start_unix_ns() + self._place(tick).time_ns)
         except OutputError as error:
             self._fail(error)
+            return
+        self._finish_file(ROTATED, "rotated", self._files.next.tick, tick)
+        self._files.begin(writer)
+        self._cut_tick = tick
 
     def _place(self, tick: int) -> Place:
         return self._buffer.place(tick)

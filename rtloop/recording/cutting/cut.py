@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rtloop.errors import writing
 from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.cutting.source import Source, Stretch
 from rtloop.recording.errors import RecordingError
@@ -154,18 +155,18 @@ def _write(
 ) -> tuple[Copy, int]:
     """The copy, and the ticks in it. Raises OutputError, RecordingError; nothing of the output is left then."""
     left = output.with_name(output.name + UNFINISHED)
-    if left.exists() and not grows(left):
-        left.unlink()
+    with writing(output):
+        if left.exists() and not grows(left):
+            left.unlink()
     log_time = header["created_unix_ns"] if header["paced"] else 0
     writer = Writer(output, header, log_time, message_index=True, min_free_bytes=least, suffix=UNFINISHED)
     try:
         writer.start_unix_ns = source.start_unix_ns
         copy = Copy(source, writer, stretch)
         copy.run(progress)
-        writer.finish(copy.final)
+        writer.finish(copy.final, whole=True)
     except BaseException:
-        writer.close()
-        writer.part.unlink(missing_ok=True)
+        writer.discard()
         raise
     return copy, writer.ticks
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rtloop.errors import writing
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader, Rows
 from rtloop.recording.file.topics import format
@@ -34,7 +35,15 @@ def output_of(path: Path) -> Path:
 def leftovers(folder: Path) -> list[Path]:
     """Unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
     parts = sorted(folder.glob("*.mcap.part"))
-    return [part for part in parts if not output_of(part).exists() and not grows(part)]
+    return [part for part in parts if not output_of(part).exists() and _is_left(part)]
+
+
+def _is_left(part: Path) -> bool:
+    """Whether nobody writes the file; False where its lock cannot be asked for."""
+    try:
+        return not grows(part)
+    except RecordingError:
+        return False
 
 
 class Recovery:
@@ -105,7 +114,8 @@ class Recovery:
 def recover(path: Path | str, output: Path | str | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Write a complete file from `path`; `progress` is told the ticks so far.
 
-    Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError.
+    Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError,
+    OutputError where not all of it can be written; nothing of the output is left then.
     """
     path = Path(path)
     output = output_of(path) if output is None else Path(output)
@@ -113,7 +123,8 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
         raise RecordingError(f"{path}: is being written by a recorder right now")
     with Reader(path, tolerant=True) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
-        output.with_name(output.name + UNFINISHED).unlink(missing_ok=True)
+        with writing(output):
+            output.with_name(output.name + UNFINISHED).unlink(missing_ok=True)
         log_time = header["created_unix_ns"] if header["paced"] else 0
         writer = Writer(output, header, log_time, message_index=True, suffix=UNFINISHED)
         try:
@@ -121,10 +132,9 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
             recovery = Recovery(reader, writer)
             recovery.copy(progress)
             final = recovery.final(writer.ticks)
-            writer.finish(recovery.final)
+            writer.finish(recovery.final, whole=True)
         except BaseException:
-            writer.close()
-            writer.part.unlink(missing_ok=True)
+            writer.discard()
             raise
         what = json.loads(final.payload)
         return {
@@ -138,7 +148,7 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
 
 
 def grows(path: Path) -> bool:
-    """Whether a recorder holds its lock on the file."""
+    """Whether a recorder holds its lock on the file. Raises RecordingError where the system does not say it."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -147,6 +157,9 @@ def grows(path: Path) -> bool:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
+    except OSError as error:
+        reason = f"cannot be locked ({error.strerror}), so a recorder may be writing it"
+        raise RecordingError(f"{path}: {reason}") from None
     finally:
         os.close(fd)
     return False

@@ -125,13 +125,13 @@ class Writer:
         overview = OverviewLayout(self._columns).messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])
 
-    def finish(self, final: Callable[[int], Message]) -> None:
+    def finish(self, final: Callable[[int], Message], *, whole: bool = False) -> None:
         """Add the message `final(ticks written)`, the index and the end; then give the file its name.
 
-        Where that does not fit on the disk, the last chunks make room for it.
+        Where that does not fit on the disk, the last chunks make room for it; with `whole` OutputError is raised.
         """
         kept = len(self._file)
-        while not self._end_fits(final):
+        while not self._end_fits(final, whole):
             while len(self._file) >= kept:
                 self._drop_last()
             kept -= 1
@@ -158,12 +158,12 @@ class Writer:
         if counts.get(format.OVERVIEW):
             self.skipped -= self._skipped.pop()
 
-    def _end_fits(self, final: Callable[[int], Message]) -> bool:
+    def _end_fits(self, final: Callable[[int], Message], whole: bool) -> bool:
         try:
             self._file.append(_content([final(self.ticks)]))
             self._file.write_end()
         except OutputError as error:
-            if error.number not in FULL or len(self._file) <= 1:
+            if whole or error.number not in FULL or len(self._file) <= 1:
                 raise
             return False
         return True

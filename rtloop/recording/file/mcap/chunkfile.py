@@ -145,13 +145,12 @@ class ChunkFile:
                 message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
             os.rename(self.part, self.path)
-            folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            os.fsync(folder)
-            os.close(folder)
         except OSError as error:
             raise self._refused(error) from None
         finally:
             self.close()
+        with contextlib.suppress(OSError):  # the file is whole: without its name on the disk it is found as a .part
+            self._sync_folder()
 
     def _make_durable(self) -> None:
         """Have the system put the file on the disk. Raises NotOnDisk; a second try would say nothing."""
@@ -166,7 +165,8 @@ class ChunkFile:
     def close(self) -> None:
         """Give up the file as it is; idempotent."""
         if self._fd >= 0:
-            os.close(self._fd)
+            with contextlib.suppress(OSError):  # it is closed all the same; what counts is that it was synced
+                os.close(self._fd)
             self._fd = -1
 
     def discard(self) -> None:
@@ -199,10 +199,21 @@ class ChunkFile:
             raise self._refused(error) from None
         self._name = self.part
 
+    def _sync_folder(self) -> None:
+        folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
     def _refuse_to_replace(self) -> None:
-        if self.path.exists():
+        try:
+            is_finished, is_begun = self.path.exists(), self.part.exists()
+        except OSError as error:
+            raise self._refused(error) from None
+        if is_finished:
             raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
-        if self.part.exists():
+        if is_begun:
             message = f"{self.part} is left from an unfinished run; `rtloop recover` completes it"
             raise OutputError(message, errno.EEXIST)
 

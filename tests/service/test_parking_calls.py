@@ -1,0 +1,80 @@
+"""Parking where the host refuses a system call: the note is whole, and what cannot be read is told in one message."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.errors import DriverError
+from rtloop.drivers.shm import ShmDriver, ShmOptions
+from rtloop.engine.memory import SharedBlock, Sizes
+from rtloop.errors import OutputError, UnavailableError
+from rtloop.hil import board
+from rtloop.supervision import parking
+from rtloop.supervision.account import Account
+from rtloop.supervision.hardware import Hardware, UnreadableNote, keep, noted
+
+WIRING = {"x": Wiring("adc0", "dac0")}
+
+
+def refuse(*_: object) -> Any:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+def test_a_note_that_cannot_be_written_leaves_the_old_one(tmp_path: Path):
+    path = tmp_path / "lab.hardware"
+    old, new = (Hardware("shm", f'{{"file":"/{name}"}}', WIRING, 1000.0, 500.0, 1.0) for name in ("old", "new"))
+    keep(path, old)
+    handler, limits = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+        with pytest.raises(OutputError, match=r"lab\.hardware: .*too large"):
+            keep(path, new)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert noted(path) == old
+    keep(path, new)
+    assert noted(path) == new
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_note_that_cannot_be_read_is_not_taken_for_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "lab.hardware"
+    assert noted(path) is None
+    keep(path, Hardware("shm", '{"file":"/old"}', WIRING, 1000.0, 500.0, 1.0))
+    monkeypatch.setattr("rtloop.supervision.hardware.open_file", refuse)
+    with pytest.raises(UnreadableNote, match=r"lab\.hardware: .*: Too many open files"):
+        noted(path)
+
+
+def test_a_block_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "lab.block"
+    fd = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    SharedBlock.create(Sizes(1, 1, 1000.0, 8, 1), fd)
+    os.close(fd)
+    monkeypatch.setattr(os, "pread", refuse)
+    with (
+        pytest.raises(UnavailableError, match=r"lab\.block: Too many open files"),
+        parking._last_block(path, Account("lab")),
+    ):
+        pass
+
+
+def test_a_board_that_cannot_be_mapped_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "board"
+    path.write_bytes(bytes(board.file_bytes()))
+    path.chmod(0o600)
+    monkeypatch.setattr("rtloop.drivers.shm.BoardMemory", refuse)
+    driver = ShmDriver(ShmOptions(file=str(path)), WIRING, 1000.0)
+    open_before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(DriverError, match="Too many open files"):
+        driver.open()
+    assert len(os.listdir("/proc/self/fd")) == open_before

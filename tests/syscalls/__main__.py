@@ -1,0 +1,75 @@
+"""Every system call of each component fails, or is the last before SIGKILL: `make soak-syscalls`.
+
+    python -m tests.syscalls [COMPONENT ...] [--sample N] [--seed S] [--mutants]
+
+Prints a table: calls tried by component and kind, and what failed. Exit code 0 if nothing did.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rich.console import Console
+from rich.table import Table
+
+from tests.syscalls.components import COMPONENTS, surroundings
+from tests.syscalls.kinds import KINDS
+from tests.syscalls.sampling import SEED, plan, sample
+from tests.syscalls.traced import unavailable
+
+LONGEST = 1_500
+"""Characters of a problem."""
+
+
+def table(tried: Counter[tuple[str, str]], failed: Counter[str], missed: Counter[str]) -> Table:
+    """Calls tried by component and kind; `missed` are those that the work did not come to a second time."""
+    columns = ("component", *KINDS, "not reached", "failed")
+    shown = Table(*columns, title=f"{sum(tried.values())} calls, failed {sum(failed.values())}")
+    for name in dict.fromkeys(component for component, _ in tried):
+        counts = [str(tried[name, kind]) for kind in KINDS]
+        shown.add_row(name, *counts, str(missed[name]), str(failed[name]))
+    return shown
+
+
+def main() -> int:
+    """All calls of all components, or a sample of them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("components", nargs="*", choices=[[], *COMPONENTS], metavar="COMPONENT")
+    parser.add_argument("--sample", type=int, metavar="N")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--mutants", action="store_true", help="plant mistakes, and see each of them found")
+    options = parser.parse_args()
+    if reason := unavailable():
+        print(reason, file=sys.stderr)
+        return 1
+    if options.mutants:
+        from tests.syscalls.mutants import run
+
+        return run()
+    tried, failed, missed, start_s = Counter[tuple[str, str]](), Counter[str](), Counter[str](), time.monotonic()
+    with TemporaryDirectory(prefix="rtloop-syscalls-") as name, surroundings():
+        tries, problems = plan([COMPONENTS[each] for each in options.components or COMPONENTS], Path(name))
+        print(*problems, sep="\n", file=sys.stderr)
+        failed.update(["as it is"] * len(problems))
+        chosen = tries if options.sample is None else sample(tries, options.sample, options.seed)
+        for number, (component, injection) in enumerate(chosen, start=1):
+            result = component.measure(Path(name), injection)
+            tried[component.name, injection.kind] += 1
+            missed[component.name] += not result.reached
+            if result.problems:
+                failed[component.name] += 1
+                print(f"{component.name}: {injection}: {injection.call.line[:200]}", file=sys.stderr)
+                print("   " + "\n   ".join(problem[-LONGEST:] for problem in result.problems), file=sys.stderr)
+            if number % 100 == 0:
+                print(f"{number}/{len(chosen)}, {time.monotonic() - start_s:.0f} s", file=sys.stderr, flush=True)
+    Console(width=140).print(table(tried, failed, missed))
+    return int(any(failed.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

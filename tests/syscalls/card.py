@@ -1,0 +1,58 @@
+"""A card that is a file: each write of an output is a system call, and the file holds all of them in order.
+
+It cannot be read back, and leaves its output alone when it is opened.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+
+from rtloop.drivers.base import Channel, Facts
+from rtloop.drivers.python import PythonDriver
+from rtloop.hil.options import Options
+
+KIND = "file_card"
+
+
+class FileCardOptions(Options):
+    file: str
+
+
+class FileCard(PythonDriver):
+    kind = KIND
+    options_model = FileCardOptions
+    fd: int | None = None
+
+    @property
+    def facts(self) -> Facts:
+        return Facts((Channel("in"),), (Channel("out"),))
+
+    def start(self) -> None:
+        try:
+            self.fd = os.open(self.options.file, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+        except OSError as error:
+            from rtloop.drivers.errors import DriverError
+
+            raise DriverError(f"{self.options.file}: {error.strerror}") from None
+
+    def outputs_v(self) -> None:
+        """Unknown."""
+
+    def read(self) -> tuple[float]:
+        return (0.0,)
+
+    def write(self, volts: list[float]) -> None:
+        assert self.fd is not None
+        os.write(self.fd, struct.pack("<d", volts[0]))
+
+    def stop(self) -> None:
+        if self.fd is not None:
+            os.close(self.fd)
+            self.fd = None
+
+
+def written_v(path: Path) -> list[float]:
+    """All that was written to the card's output, in order."""
+    return [value for (value,) in struct.iter_unpack("<d", path.read_bytes())]

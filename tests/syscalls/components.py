@@ -1,0 +1,42 @@
+"""The components, by name, and what they share."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
+
+from rtloop.drivers.registry import BUILT_IN
+from tests.syscalls import card
+from tests.syscalls.component import Component
+from tests.syscalls.files import Cutting, KeepingQuota, Recovering
+from tests.syscalls.parking import Noting, ParkingABoard, ParkingACard, ParkingTheNoted
+from tests.syscalls.recorder import Recording
+from tests.syscalls.recordings import small_chunks
+
+COMPONENTS = {
+    component.name: component
+    for component in (
+        Component("recorder", Recording, share=8),
+        Component("recover", Recovering, share=4),
+        Component("cut", Cutting, share=4),
+        Component("quota", KeepingQuota, share=3),
+        Component("note", Noting, share=2),
+        Component("parking", ParkingABoard, share=4),
+        Component("parking-noted", ParkingTheNoted, share=2),
+        Component("parking-card", ParkingACard, share=4),
+    )
+}
+
+
+@contextmanager
+def surroundings() -> Iterator[None]:
+    """Small chunks, a card that is a file, and an environment that is put back."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    with small_chunks(), patch.dict(BUILT_IN, {card.KIND: "tests.syscalls.card:FileCard"}), patch.dict(os.environ):
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -1,0 +1,153 @@
+"""Components that make, mend and remove files: recover, cut and quota."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from types import SimpleNamespace
+from typing import Any, cast
+
+from rtloop.engine.messages import Kind, message
+from rtloop.recording.cutting.cut import cut, cut_path
+from rtloop.recording.file.recover import leftovers
+from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.events import event_of
+from rtloop.recording.file.topics.format import EVENTS
+from rtloop.recording.file.writer import Writer
+from rtloop.signals import Flag
+from rtloop.supervision.quota import Quota
+from rtloop.supervision.recorder_keeper import RecorderKeeper
+from tests.recording.hand_made_loop import AXES, START_UNIX_NS, final_message, make_header, make_rows
+from tests.syscalls.component import Case
+from tests.syscalls.recordings import SNAPSHOT_TICKS, TICKS, problems_of, ticks_on_disk, write
+from tests.syscalls.traced import Outcome
+
+NAME = "run.mcap"
+
+
+@cache
+def _base(finished: bool) -> Path:
+    """A finished recording, or the unfinished file of a killed recorder."""
+    path = Path(mkdtemp(prefix="rtloop-syscalls-")) / NAME
+    write(path, finished=finished)
+    return path if finished else path.with_name(f"{NAME}.part")
+
+
+class Recovering(Case):
+    """The supervisor's repair of what a recorder left: recovered, then the unfinished file removed."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.part = Path(shutil.copy(_base(False), folder))
+        self.flushed = ticks_on_disk([_base(False)])
+
+    def work(self) -> None:
+        keeper = cast(RecorderKeeper, SimpleNamespace(notes=[]))
+        RecorderKeeper._repair(keeper, self.part)
+
+    def judge(self, outcome: Outcome) -> list[str]:
+        problems = [] if outcome.killed or self._is_recovered() or self.part.exists() else ["nothing is left"]
+        problems += problems_of(self._finished(), set(), whole=self.flushed)
+        for part in leftovers(self.folder):
+            self._once_more(part)
+        problems += problems_of(self._finished(), self.flushed, whole=self.flushed)
+        strange = {path.name for path in self.folder.iterdir()} - {NAME, f"{NAME}.part"}
+        return [*problems, *(f"{name} is left" for name in strange)]
+
+    def _once_more(self, part: Path) -> None:
+        RecorderKeeper._repair(cast(RecorderKeeper, SimpleNamespace(notes=[])), part)
+
+    def _finished(self) -> list[Path]:
+        return sorted(self.folder.glob("*.mcap"))
+
+    def _is_recovered(self) -> bool:
+        return (self.folder / NAME).exists()
+
+
+class Cutting(Case):
+    """A stretch of a recording becomes a recording of its own."""
+
+    FIRST, END = 2 * SNAPSHOT_TICKS, TICKS
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.recording = Path(shutil.copy(_base(True), folder))
+        self.output = cut_path(self.recording, self.FIRST)
+
+    def work(self) -> None:
+        cut(self.recording, self.FIRST, self.END)
+
+    def judge(self, outcome: Outcome) -> list[str]:
+        stretch, problems = set(range(self.FIRST, self.END)), []
+        if self.recording.read_bytes() != _base(True).read_bytes():
+            problems.append("the recording was changed")
+        if self.output.exists():  # a killed cut may have come to its end
+            problems += problems_of([self.output], stretch, whole=stretch)
+            self.output.unlink()
+        elif outcome.finished:
+            problems.append("the cut says that it is done, and is not there")
+        self.work()
+        problems += problems_of([self.output], stretch, whole=stretch)
+        strange = {path.name for path in self.folder.iterdir()} - {self.recording.name, self.output.name}
+        return [*problems, *(f"{name} is left" for name in strange)]
+
+
+PART_TICKS = 5_000
+
+
+@cache
+def _stored() -> Path:
+    """Three runs of several files; the second tripped at the first tick of its second file."""
+    folder = Path(mkdtemp(prefix="rtloop-syscalls-"))
+    for run, count in ((1, 2), (2, 3), (3, 2)):
+        for number in range(1, count + 1):
+            _write_part(folder / f"test-2026010{run}T00000{run}-{number:04d}.mcap", run, number)
+    return folder
+
+
+def _write_part(path: Path, run: int, number: int) -> None:
+    first = (number - 1) * PART_TICKS
+    around = {"before_s": 0.1, "after_s": 0.2, "every_s": 1.0, "on": ["trip"]}
+    facts: dict[str, Any] = {"sequence": number, "first_tick": first, "format": 2, "around": around}
+    writer = Writer(path, make_header(**facts, created_unix_ns=START_UNIX_NS + run * 10**9), START_UNIX_NS)
+    if (run, number) == (2, 2):
+        record = message(Kind.TRIPPED, tick=first + 1, axis=0, values=[Flag.TRIP_POSITION])[0]
+        writer.write_messages([Message(EVENTS, START_UNIX_NS, json.dumps(event_of(record, AXES, 0)).encode())])
+    writer.write_ticks(make_rows(200, first=first))
+    writer.finish(lambda logged: final_message(first + PART_TICKS, logged))
+
+
+class KeepingQuota(Case):
+    """The oldest recordings are removed, none around a trip and not the newest; a quota of one file."""
+
+    REMOVABLE = frozenset(
+        ("test-20260101T000001-0001.mcap", "test-20260101T000001-0002.mcap", "test-20260102T000002-0003.mcap",
+         "test-20260103T000003-0001.mcap")
+    )  # fmt: skip
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        for path in _stored().iterdir():
+            shutil.copy(path, folder)
+        self.quota = Quota(folder, "test", 1, 0)
+
+    def work(self) -> None:
+        for _ in range(2):  # the second look is what the next second does
+            self.quota.keep(budget_s=60.0)
+
+    def judge(self, outcome: Outcome) -> list[str]:
+        problems = self._wrongly_removed()
+        Quota(self.folder, "test", 1, 0).keep(budget_s=60.0)
+        problems += self._wrongly_removed()
+        left = {path.name for path in self.folder.iterdir()} & self.REMOVABLE
+        return [*problems, *(f"{name} is not removed by the next hand" for name in left)]
+
+    def _wrongly_removed(self) -> list[str]:
+        gone = {path.name for path in _stored().iterdir()} - {path.name for path in self.folder.iterdir()}
+        changed = [
+            path.name for path in self.folder.iterdir() if path.read_bytes() != (_stored() / path.name).read_bytes()
+        ]
+        return [f"{name} was removed or changed" for name in (*(gone - self.REMOVABLE), *changed)]

@@ -1,0 +1,162 @@
+"""`rtloop park` after a service that died with its output up, and the note of the hardware that it goes by.
+
+The witness is the card's own memory, which outlives all processes and holds every write.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.errors import DriverError
+from rtloop.engine.memory import SharedBlock, Sizes
+from rtloop.errors import RtloopError
+from rtloop.hil import board
+from rtloop.hil.board import LSB_V, BoardMemory
+from rtloop.supervision import parking
+from rtloop.supervision.hardware import Hardware, keep, noted
+from rtloop.supervision.paths import block_path, hardware_path
+from tests.faults.configuration import BOARD_RATE_HZ, TRIP_SLEW_V_PER_S, on_a_board
+from tests.syscalls import card
+from tests.syscalls.component import Case
+from tests.syscalls.traced import Outcome
+
+NAME, DRIVE_CODE = "lab", 8192
+DRIVE_V = DRIVE_CODE * LSB_V
+STEP_V = TRIP_SLEW_V_PER_S / BOARD_RATE_HZ
+ANOTHER = (
+    ('kind = "shm"', f'kind = "{card.KIND}"'), ("board_rate_hz = 8000\n", ""), ('"adc0"', '"in"'), ('"dac0"', '"out"'),
+    ("[driver.plant.sensor]\num_per_v = 10.0\nnoise_um = 0.010\nresolution_um = 0.010\n", ""),
+)  # fmt: skip
+
+
+@lru_cache
+def _text(folder: Path, *changes: tuple[str, str]) -> tuple[str, Hardware, Sizes]:
+    """A configuration, its hardware, and the sizes of its shared block."""
+    config = folder / f"{NAME}.toml"
+    config.write_text(text := on_a_board(folder, *changes))
+    plan = prepare(load(config)).plan
+    options = '{"file":"' + str(folder / "board") + '"}'
+    pacing = plan.pacing
+    hardware = Hardware(plan.driver_kind, options, plan.wiring, pacing.rate_hz, plan.trip_slew_v_per_s,
+                        pacing.heartbeat_timeout_s)  # fmt: skip
+    return text, hardware, plan.sizes
+
+
+class ParkingABoard(Case):
+    """The board of `rtloop hil serve`, whose memory says where its outputs are."""
+
+    changes: tuple[tuple[str, str], ...] = ()
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        os.environ["RUNTIME_DIRECTORY"] = str(folder)
+        text, self.hardware, sizes = _text(folder, *self.changes)
+        self.config, self.card = folder / f"{NAME}.toml", folder / "board"
+        self.config.write_text(text)
+        fd = os.open(block_path(NAME), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self.block = SharedBlock.create(sizes, fd)
+        self.block["last_drive_v"][:] = DRIVE_V
+        keep(hardware_path(NAME), self.hardware)
+        self.switch_on()
+
+    def switch_on(self) -> None:
+        """Make the card as the service left it, its output up."""
+        fd = os.open(self.card, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        os.ftruncate(fd, board.file_bytes())
+        self.memory = BoardMemory(fd)
+        os.close(fd)
+        self.memory.reset()
+        facts = self.memory.facts
+        facts["version"], facts["channels"], facts["rate_hz"] = board.VERSION, 1, BOARD_RATE_HZ
+        facts["magic"], self.memory.dac_codes[0] = board.MAGIC, DRIVE_CODE
+
+    def written_v(self) -> list[float]:
+        """All that was written to the output, and what stands there now."""
+        count = int(self.memory.words[board.WRITTEN])
+        return [code * LSB_V for code in (*self.memory.fifo[:count, 0].tolist(), int(self.memory.dac_codes[0]))]
+
+    def work(self) -> None:
+        parking.park_configuration(self.config)
+
+    def judge(self, outcome: Outcome) -> list[str]:
+        problems = []
+        if outcome.finished and self._output_v() != 0.0:
+            problems.append(f"parking says that it is done; the output is at {self._output_v():.3f} V")
+        try:
+            self.work()
+        except (RtloopError, DriverError) as error:
+            problems.append(f"the next hand cannot park: {error}")
+        if self._output_v() != 0.0:
+            problems.append(f"after the next hand the output is at {self._output_v():.3f} V")
+        written = np.array([DRIVE_V, *self.written_v()])
+        if (step_v := float(np.max(np.abs(np.diff(written))))) > STEP_V + LSB_V:
+            problems.append(f"a step of {step_v:.3f} V, allowed {STEP_V:.3f} V")
+        os.close(self.block.fd)
+        return problems
+
+    def _output_v(self) -> float:
+        return ([DRIVE_V, *self.written_v()])[-1]
+
+
+class ParkingTheNoted(ParkingABoard):
+    """The configuration names another board by now: the one that is up is known by the note alone."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        other = folder / "other"
+        shutil.copy(self.card, other)
+        fd = os.open(other, os.O_RDWR | os.O_CLOEXEC)
+        BoardMemory(fd).dac_codes[0] = 0
+        os.close(fd)
+        other.chmod(0o600)
+        self.config.write_text(self.config.read_text().replace(f'"{self.card}"', f'"{other}"'))
+
+
+class ParkingACard(ParkingABoard):
+    """A card whose writes are system calls, and which cannot say where its output is."""
+
+    changes = ANOTHER
+
+    def switch_on(self) -> None:
+        self.card.write_bytes(struct.pack("<d", DRIVE_V))
+
+    def written_v(self) -> list[float]:
+        return card.written_v(self.card)
+
+
+class Noting(Case):
+    """A service that starts on another board than the last one's: the note is the old one or the new one."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.path = folder / f"{NAME}.hardware"
+        wiring = {"x": Wiring("adc0", "dac0")}
+        self.old, self.new = (
+            Hardware("shm", f'{{"file":"{folder}/{name}"}}', wiring, BOARD_RATE_HZ, TRIP_SLEW_V_PER_S, 1.0)
+            for name in ("old-board", "new-board")
+        )
+        keep(self.path, self.old)
+
+    def work(self) -> None:
+        keep(self.path, self.new)
+
+    def judge(self, outcome: Outcome) -> list[str]:
+        problems, there = [], noted(self.path)
+        if there not in (self.old, self.new):
+            problems.append("the note is neither the old one nor the new one")
+        if outcome.finished and there != self.new:
+            problems.append("the note is said to be written, and is not there")
+        self.work()
+        if noted(self.path) != self.new:
+            problems.append("the next hand's note is not there")
+        strange = {path.name for path in self.folder.iterdir()} - {self.path.name}
+        return [*problems, *(f"{name} is left" for name in strange)]
