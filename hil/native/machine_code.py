@@ -15,6 +15,8 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
+from rtloop.hil.trusted import open_own
+
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _engines: list[Any] = []
 """They own the machine code, one each: several may hold copies of one kernel."""
@@ -32,7 +34,8 @@ def keep(name: str, machine_code: bytes) -> None:
 def loaded(name: str) -> int | None:
     """Address of what was kept; None where nothing was, or not the whole of it."""
     try:
-        data = _path(name).read_bytes()
+        with os.fdopen(open_own(_path(name)), "rb") as file:
+            data = file.read()
     except OSError:
         return None
     machine_code = data[_DIGEST_BYTES:]

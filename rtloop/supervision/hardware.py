@@ -65,7 +65,7 @@ _AS_JSON = TypeAdapter(Hardware)
 def keep(path: Path, hardware: Hardware) -> None:
     """Write it to `path`. Raises OutputError, HostRefused for a folder that others may write to."""
     what = "the note of the hardware"
-    with open(new_file(path, what), "wb") as file, writing(f"{path}: cannot make {what}"):
+    with os.fdopen(new_file(path, what), "wb") as file, writing(f"{path}: cannot make {what}"):
         file.write(_AS_JSON.dump_json(hardware))
         file.flush()
 
@@ -73,7 +73,7 @@ def keep(path: Path, hardware: Hardware) -> None:
 def noted(path: Path) -> Hardware | None:
     """What stands there; None where nothing does, or nothing whole. Raises HostRefused for what others may have put."""
     try:
-        with open(open_file(path, os.O_RDONLY), "rb") as file:
+        with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
             return _AS_JSON.validate_json(file.read(LARGEST_BYTES))
     except Untrusted as error:
         raise refusal(error) from None
