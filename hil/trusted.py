@@ -210,7 +210,7 @@ def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool =
     Without `believes` any folder will do, and a link also counts where its maker alone may write.
     """
     believed, links = {0, os.geteuid()}, 0
-    left = list(reversed((Path.cwd() / path).parts[1:]))
+    left = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))
     fd, by_root, shared = os.open("/", _FOLDER), True, False
     try:
         while left:
