@@ -96,17 +96,18 @@ def _within(group: Any, path: str, links: int) -> Any:
     """
     import h5py
 
+    h5l = h5py.h5l  # type: ignore[attr-defined]
     place = group.file["/"] if path.startswith("/") else group
     for part in filter(lambda part: part not in ("", "."), path.split("/")):
         if not isinstance(place, h5py.Group):
             raise KeyError(part)
         key = part.encode("utf-8", "surrogateescape")
         kind = place.id.links.get_info(key).type
-        if kind == h5py.h5l.TYPE_HARD:
+        if kind == h5l.TYPE_HARD:
             place = place[part]
-        elif kind == h5py.h5l.TYPE_SOFT and links > 0:
+        elif kind == h5l.TYPE_SOFT and links > 0:
             place = _within(place, place.id.links.get_val(key).decode("utf-8", "surrogateescape"), links - 1)
-        elif kind == h5py.h5l.TYPE_SOFT:
+        elif kind == h5l.TYPE_SOFT:
             raise KeyError(part)
         else:
             raise _OtherFile(part)
