@@ -3,16 +3,26 @@
 A path is walked from the root, folder by folder and link by link, each held open while the next is looked at, so that
 nobody can exchange one meanwhile. A folder such as /tmp, where all may make things but none may touch another's, may
 stand above such a place; it is no such place itself.
+
+Recordings and reports lie where others may write too, such as a folder of a group. There a file is made or emptied only
+under a name that nobody else has laid (`make_file`, `remake_file`, `overwrite_file`), and opening one to read never
+waits (`open_named`, `open_found`, `open_own`). The product opens its files here; a test finds an open elsewhere.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_OVERWRITE = os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _MOST_LINKS = 40
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -51,13 +61,15 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     folder = open_folder(path.parent, shared=True)
     try:
         fd = os.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode, dir_fd=folder)
+    except OSError as error:
+        raise _without_link(error, path) from None
     finally:
         os.close(folder)
     status = os.fstat(fd)
     ours = group and status.st_gid in (os.getegid(), *os.getgroups())
     if not stat.S_ISREG(status.st_mode):
         reason = "not a regular file"
-    elif status.st_uid not in (0, os.geteuid()) and not ours:
+    elif not _is_own(status) and not ours:
         reason = _belongs(status)
     elif status.st_mode & (stat.S_IWOTH if ours else _OTHERS_WRITE):
         reason = "others may write to it"
@@ -67,10 +79,138 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     raise Untrusted(path, reason)
 
 
-def _walk(path: Path, mode: int | None, given: bool = False) -> tuple[int, set[int], bool]:
-    """Descriptor of the folder, whose files count there, and whether everybody may make some."""
+def open_named(path: Path | str) -> int:
+    """A regular file that a user named, to be read, through whatever links. Raises OSError."""
+    return _regular(os.open(path, _READ), path)
+
+
+def open_found(path: Path | str) -> int:
+    """A regular file of anybody's that a folder was found to hold, to be read. Raises OSError, Untrusted for a link."""
+    try:
+        fd = os.open(path, _READ | os.O_NOFOLLOW)
+    except OSError as error:
+        raise _without_link(error, path) from None
+    return _regular(fd, path)
+
+
+def open_own(path: Path | str) -> int:
+    """As `open_found`, a file of ours or root's. Raises OSError, Untrusted."""
+    fd = open_found(path)
+    if not _is_own(status := os.fstat(fd)):
+        os.close(fd)
+        raise Untrusted(path, _belongs(status))
+    return fd
+
+
+def is_own(path: Path) -> bool:
+    """Whether `path` is a regular file of ours or root's, and no link."""
+    try:
+        status = os.lstat(path)
+    except OSError:
+        return False
+    return stat.S_ISREG(status.st_mode) and _is_own(status)
+
+
+def make_file(path: Path, mode: int = 0o666) -> int:
+    """A new file, to be written and read. Raises OSError, Untrusted; FileExistsError where anything has its name."""
+    with _folder_of(path) as folder:
+        return os.open(path.name, _NEW, mode, dir_fd=folder)
+
+
+def remake_file(path: Path, mode: int = 0o666) -> int:
+    """As `make_file`; a file of ours that no process has locked gives way. Raises OSError, Untrusted.
+
+    BlockingIOError: a process has it locked.
+    """
+    with _folder_of(path) as folder:
+        try:
+            return os.open(path.name, _NEW, mode, dir_fd=folder)
+        except FileExistsError:
+            status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
+        if not _is_own(status):
+            raise Untrusted(path, f"{_belongs(status)}; remove it")
+        if not stat.S_ISREG(status.st_mode):
+            raise Untrusted(path, "not a regular file; remove it")
+        abandoned = os.open(path.name, _READ | os.O_NOFOLLOW, dir_fd=folder)
+        try:
+            fcntl.flock(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.unlink(path.name, dir_fd=folder)
+        finally:
+            os.close(abandoned)
+        return os.open(path.name, _NEW, mode, dir_fd=folder)
+
+
+def overwrite_file(path: Path, mode: int = 0o666) -> int:
+    """A file to be written from its beginning, made where there is none. Raises OSError, Untrusted.
+
+    Links of ours and root's are followed. Untrusted stands for links and files of others, and where others may write
+    also for a file that has more than one name.
+    """
+    for _ in range(_MOST_LINKS):
+        with _folder_of(path) as folder:
+            try:
+                return os.open(path.name, _NEW, mode, dir_fd=folder)
+            except FileExistsError:
+                status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
+            if not _is_own(status):
+                raise Untrusted(path, _belongs(status))
+            if not stat.S_ISLNK(status.st_mode):
+                return _emptied(os.open(path.name, _OVERWRITE | os.O_NOFOLLOW, dir_fd=folder), path, os.fstat(folder))
+            if status.st_dev == os.stat("/proc/self").st_dev:  # a descriptor of this process, as /dev/stdout leads to
+                return os.open(path.name, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, dir_fd=folder)
+            path = Path(os.readlink(f"/proc/self/fd/{folder}")) / os.readlink(path.name, dir_fd=folder)
+    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+
+
+def _emptied(fd: int, path: Path, folder: os.stat_result) -> int:
+    """An open file, emptied. Raises Untrusted, with the file closed and as it was."""
+    status = os.fstat(fd)
+    if not _is_own(status):
+        reason = _belongs(status)
+    elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1 and folder.st_mode & _OTHERS_WRITE:
+        reason = "has more than one name, in a folder where others may write; remove it"
+    else:
+        if stat.S_ISREG(status.st_mode):
+            os.ftruncate(fd, 0)
+        os.set_blocking(fd, True)
+        return fd
+    os.close(fd)
+    raise Untrusted(path, reason)
+
+
+def _without_link(error: OSError, path: Path | str) -> OSError:
+    """The error of an open that follows no link; Untrusted where that was the reason."""
+    return Untrusted(path, "a link, which is not followed here") if error.errno == errno.ELOOP else error
+
+
+def _regular(fd: int, path: Path | str) -> int:
+    """The descriptor of a regular file. Raises OSError for another kind of file, which is closed."""
+    mode = os.fstat(fd).st_mode
+    if stat.S_ISREG(mode):
+        return fd
+    os.close(fd)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "not a regular file", str(path))
+
+
+@contextmanager
+def _folder_of(path: Path) -> Iterator[int]:
+    """Descriptor of the folder of `path`, whoever else may write there. Raises OSError, Untrusted."""
+    fd, _, _ = _walk(path.parent, None, believes=False)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool = True) -> tuple[int, set[int], bool]:
+    """Descriptor of the folder, whose files count there, and whether everybody may make some.
+
+    Without `believes` any folder will do, and a link also counts where its maker alone may write.
+    """
     believed, links = {0, os.geteuid()}, 0
-    left = list(reversed((Path.cwd() / path).parts[1:]))
+    left = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))
     fd, by_root, shared = os.open("/", _FOLDER), True, False
     try:
         while left:
@@ -78,8 +218,8 @@ def _walk(path: Path, mode: int | None, given: bool = False) -> tuple[int, set[i
             status = _entry(name, fd, mode)
             if stat.S_ISLNK(status.st_mode):
                 links += 1
-                if status.st_uid not in believed:
-                    raise Untrusted(path, f"leads through a link that {_belongs(status)}")
+                if status.st_uid not in believed and (believes or not _is_alone(os.fstat(fd), status.st_uid)):
+                    raise Untrusted(path, f"leads through {_belongs(status)}")
                 if links > _MOST_LINKS:
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
                 target = Path(os.readlink(name, dir_fd=fd))
@@ -88,6 +228,8 @@ def _walk(path: Path, mode: int | None, given: bool = False) -> tuple[int, set[i
                 left += reversed([part for part in target.parts if part != "/"])
                 continue
             fd = _onward(fd, name)
+            if not believes:
+                continue
             status = os.fstat(fd)
             if given and by_root:
                 believed.add(status.st_uid)
@@ -122,5 +264,15 @@ def _onward(fd: int, name: str) -> int:
     return following
 
 
+def _is_alone(folder: os.stat_result, uid: int) -> bool:
+    """Whether a folder belongs to a user who alone may write there."""
+    return folder.st_uid == uid and not folder.st_mode & _OTHERS_WRITE
+
+
+def _is_own(status: os.stat_result) -> bool:
+    return status.st_uid in (0, os.geteuid())
+
+
 def _belongs(status: os.stat_result) -> str:
-    return f"belongs to user {status.st_uid}, not to us or root"
+    link = "a link that " if stat.S_ISLNK(status.st_mode) else ""
+    return f"{link}belongs to user {status.st_uid}, not to us or root"

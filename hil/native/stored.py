@@ -13,6 +13,8 @@ import select
 import tempfile
 from pathlib import Path
 
+from rtloop.hil.trusted import open_own
+
 DIGEST_BYTES = hashlib.sha256().digest_size
 MACHINE_CODE = ".o"
 SUFFIXES = (MACHINE_CODE, ".nbi", ".nbc")
@@ -39,7 +41,7 @@ def write(path: Path, data: bytes) -> None:
 def read(path: Path) -> bytes | None:
     """The contents of a file, without its digest; None where there is none, or a damaged one, which is set aside."""
     try:
-        data = path.read_bytes()
+        data = _contents(path)
     except FileNotFoundError:
         return None
     except OSError:
@@ -53,12 +55,18 @@ def read(path: Path) -> bytes | None:
 def damaged_files(folder: Path) -> list[Path]:
     """Files in or below `folder` that are damaged, not yet found so by who reads them. Raises OSError."""
     files = [path for path in sorted(folder.rglob("*")) if path.suffix in SUFFIXES and path.is_file()]
-    return [path for path in files if not _is_whole(path.read_bytes())]
+    return [path for path in files if not _is_whole(_contents(path))]
 
 
 def set_aside_files(folder: Path) -> list[Path]:
     """Files in or below `folder` that were damaged. Raises OSError."""
     return sorted(folder.rglob(f"*{DAMAGED}"))
+
+
+def _contents(path: Path) -> bytes:
+    """All bytes of a file of ours or root's. Raises OSError."""
+    with os.fdopen(open_own(path), "rb") as file:
+        return file.read()
 
 
 def _is_whole(data: bytes) -> bool:

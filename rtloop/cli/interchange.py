@@ -67,6 +67,8 @@ def import_command(
     for file in files:
         with Counter("ticks imported", sys.stderr) as counter:
             report = import_file(file, given, mapping, out, counter.show)
+        for left in report["in_other_files"]:
+            click.echo(f"{file}: {left}: left out, for its values are not in this file", err=True)
         if as_json:
             echo_json(report)
         elif isinstance(report, Shown):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 from typing import Any
 
 from rtloop.errors import OutputError, writing
+from rtloop.hil.trusted import make_file
 from rtloop.laws.registry import BUILT_IN, kinds, law_class, reference
 
 LAW = '''"""{title}: what it does, and where its equation is from.
@@ -119,10 +121,11 @@ def new_law(name: str, folder: Path) -> list[Path]:
     texts = {f"{name}.py": LAW, f"test_{name}.py": TEST, f"{name}.toml": EXAMPLE}
     paths = [folder / file for file in texts]
     for path in paths:
-        if path.exists():
+        if os.path.lexists(path):
             raise OutputError(f"{path}: is there already; it is not overwritten", errno.EEXIST)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in zip(paths, texts.values(), strict=True):
-            path.write_text(text.format(title=title, name=name), encoding="utf-8")
+            with os.fdopen(make_file(path), "w", encoding="utf-8") as file:
+                file.write(text.format(title=title, name=name))
     return paths

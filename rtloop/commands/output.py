@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import writing
+from rtloop.hil.trusted import overwrite_file
 
 
 def write_over(path: Path, content: bytes) -> None:
     """Write a file, and its folder where there is none. Raises OutputError."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        with os.fdopen(overwrite_file(path), "wb") as file:
+            file.write(content)
 
 
 def write_configuration(path: Path, text: str) -> None:

@@ -13,6 +13,7 @@ from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
 from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
+from rtloop.hil.trusted import open_own
 from rtloop.recording.file.recover import leftovers, recover
 from rtloop.recording.views.summary import Summary, summarise
 from rtloop.supervision.interruption import Interruption
@@ -89,7 +90,7 @@ def recover_leftovers(folder: Path) -> None:
     for part in leftovers(folder):
         try:
             with Counter("ticks recovered", sys.stderr) as counter:
-                report = recover(part, progress=counter.show)
+                report = recover(part, progress=counter.show, opener=open_own)
         except RtloopError as error:
             click.echo(f"warning: {error}", err=True)
             continue

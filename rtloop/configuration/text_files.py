@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import RtloopError
+from rtloop.hil.trusted import open_named
 
 
 class InputFileError(RtloopError):
@@ -27,7 +28,7 @@ _QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
     """All of a regular file. Raises OSError for another kind of file and for one that is larger."""
-    return _contents(os.open(path, _READ), limit_bytes)
+    return _contents(open_named(path), limit_bytes)
 
 
 def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
@@ -56,7 +57,7 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
 
 def _contents(fd: int, limit_bytes: int) -> bytes:
     """What `fd` holds, which is closed."""
-    with open(fd, "rb") as file:
+    with os.fdopen(fd, "rb") as file:
         status = os.fstat(fd)
         if stat.S_ISDIR(status.st_mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))

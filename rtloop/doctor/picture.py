@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 
 from rtloop.doctor.examine import Latency
 from rtloop.errors import MissingExtra, writing
+from rtloop.hil.trusted import overwrite_file
 
 FINEST_US = 0.01
 
@@ -39,5 +41,5 @@ def draw(latency: Latency, target: Path) -> None:
     panel.set_title(f"{latency.lateness_us.size:,} ticks at {pacing.rate_hz:g} Hz, spinning {pacing.spin_us:g} µs")
     panel.grid(visible=True, alpha=0.3)
     panel.legend()
-    with writing(target):
-        figure.savefig(target, format="png", dpi=110)
+    with writing(target), os.fdopen(overwrite_file(target), "wb") as file:
+        figure.savefig(file, format="png", dpi=110)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rtloop.configuration.file import Configuration, parse
 from rtloop.design.toml_text import section
 from rtloop.errors import writing
 from rtloop.experiments.procedure import Run, hold
+from rtloop.hil.trusted import overwrite_file
 
 MARK = "rtloop experiment "
 
@@ -61,7 +63,8 @@ def keep_tables(run: Run, folder: Path) -> None:
     for name, samples in run.tables.items():
         with writing(folder / name):
             folder.mkdir(parents=True, exist_ok=True)
-            np.save(folder / name, samples)
+            with os.fdopen(overwrite_file(folder / name), "wb") as file:
+                np.save(file, samples)
     references = run.timeline.references
     references[:] = [
         {**one, "file": str((folder / one["file"]).resolve())} if one.get("file") in run.tables else one

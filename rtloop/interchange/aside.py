@@ -2,8 +2,8 @@
 
     python -m rtloop.interchange.aside FILE [GROUP]
 
-prints a JSON object in a line, {"error", "kind"} or {"rows", "columns", "units", "time", "about"}, and behind it the
-columns' doubles, one column after the other.
+prints a JSON object in a line, {"error", "kind"} or {"rows", "columns", "units", "time", "about",
+"in_other_files"}, and behind it the columns' doubles, one column after the other.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _received(path: Path, stream: IO[bytes]) -> Table | None:
             rest = rest[count:]
         if len(rest):
             return None
-    return Table(columns, said["units"], said["time"], said["about"])
+    return Table(columns, said["units"], said["time"], said["about"], tuple(said["in_other_files"]))
 
 
 def _main(path: Path, group: str | None) -> None:
@@ -79,7 +79,8 @@ def _main(path: Path, group: str | None) -> None:
         _say(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})
         return
     about = {"rows": rows_of(table), "columns": [*table.columns], "units": dict(table.units)}
-    _say(out, about | {"time": table.time, "about": dict(table.about)})
+    about |= {"time": table.time, "about": dict(table.about), "in_other_files": [*table.in_other_files]}
+    _say(out, about)
     for values in table.columns.values():
         out.write(values.data.cast("B"))
     out.flush()

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError, writing
-from rtloop.interchange.hdf5_signals import append, begin
+from rtloop.hil.trusted import remake_file
+from rtloop.interchange.hdf5_signals import append, begin, path_of
 from rtloop.interchange.to_mat import write_mat
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.parts import Files, find_files
@@ -62,32 +64,34 @@ def export(
 
 
 @contextmanager
-def _new_file(target: Path) -> Iterator[Path]:
-    """A name to write to, which becomes `target` when all went well and disappears otherwise."""
+def _new_file(target: Path) -> Iterator[IO[bytes]]:
+    """A file to write to, which becomes `target` when all went well and disappears otherwise."""
     part = target.with_name(target.name + ".part")
-    if target.exists():
+    if os.path.lexists(target):
         raise OutputError(f"{target} exists already; it is not overwritten")
+    with writing(part):
+        fd = remake_file(part)
     try:
         with writing(target):
-            yield part
+            with os.fdopen(fd, "w+b") as file:
+                yield file
             os.replace(part, target)
     finally:
         part.unlink(missing_ok=True)
 
 
-def _write_csv(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
+def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
     """One line of names, then one line a tick; `float()` of each field gives the recorded number."""
     ticks, names = 0, selection.names(recording)
-    with path.open("w", encoding="ascii", newline="") as file:
-        file.write(",".join(names) + "\n")
-        for rows in selection.blocks(recording, names):
-            file.writelines(",".join(map(repr, row)) + "\n" for row in rows.tolist())
-            ticks += len(rows)
-            progress(ticks)
+    file.write((",".join(names) + "\n").encode("ascii"))
+    for rows in selection.blocks(recording, names):
+        file.write("".join(",".join(map(repr, row)) + "\n" for row in rows.tolist()).encode("ascii"))
+        ticks += len(rows)
+        progress(ticks)
     return ticks
 
 
-def _write_parquet(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
+def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
     """A column of doubles a signal, its unit in the field's metadata, header and events in the file's."""
     try:
         import pyarrow
@@ -100,23 +104,23 @@ def _write_parquet(recording: Recording, path: Path, selection: Selection, progr
     schema = pyarrow.schema(fields, metadata=about)
     ticks = 0
     try:
-        with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        with pyarrow.parquet.ParquetWriter(file, schema, compression="zstd") as writer:
             for rows in _grouped(selection.blocks(recording, names)):
                 columns = [np.ascontiguousarray(rows[:, index]) for index in range(rows.shape[1])]
                 writer.write_table(pyarrow.Table.from_arrays([pyarrow.array(c) for c in columns], schema=schema))
                 ticks += len(rows)
                 progress(ticks)
     except pyarrow.ArrowException as error:
-        raise OutputError(f"{path}: {error}") from None
+        raise OSError(errno.EIO, str(error)) from None
     return ticks
 
 
-def _write_npz(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
+def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
     """An array a signal, and `header_json` and `events_json`; several passes where memory asks for it."""
     everything = selection.names(recording)
     ticks = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
     at_once = max(PASS_BYTES // (8 * max(ticks, 1)), 1)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for name, value in (("header_json", recording.header), ("events_json", recording.events)):
             _add_array(archive, name, np.array(json.dumps(value)))
         for start in range(0, len(everything), at_once):
@@ -128,18 +132,18 @@ def _write_npz(recording: Recording, path: Path, selection: Selection, progress:
     return ticks
 
 
-def _write_hdf5(recording: Recording, path: Path, selection: Selection, progress: Progress) -> int:
+def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
     """A dataset a signal, its `unit` and `meaning` as attributes; header and events as JSON in two more."""
     try:
         import h5py
     except ImportError:
         raise MissingExtra("export to HDF5 needs h5py: pip install 'rtloop[data]'") from None
     names, ticks = selection.names(recording), 0
-    with h5py.File(path, "w", track_order=True) as file:
-        file.attrs["rate_hz"] = recording.header["rate_hz"]
+    with h5py.File(path_of(file), "w", track_order=True) as root:
+        root.attrs["rate_hz"] = recording.header["rate_hz"]
         for name, value in (("header_json", recording.header), ("events_json", recording.events)):
-            file[name] = json.dumps(value)
-        datasets = [begin(file, name) for name in names]
+            root[name] = json.dumps(value)
+        datasets = [begin(root, name) for name in names]
         for name, dataset in zip(names, datasets, strict=True):
             dataset.attrs.update({"unit": recording.units[name], "meaning": described(name).meaning})
         for rows in selection.blocks(recording, names):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Callable
 from fractions import Fraction
@@ -17,6 +18,7 @@ import numpy as np
 
 from rtloop import __version__
 from rtloop.hil.modal import Real
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.aside import read_table
 from rtloop.interchange.formats.groups import rows_of
 from rtloop.interchange.formats.table import Table, UnreadableData
@@ -56,7 +58,7 @@ def import_data(
     """Write the wanted columns of a file as the recording `output`, NAME.mcap beside it by default.
 
     All columns where nothing is wanted. `table` is what is in the file, if that was read already; `progress` is told
-    the ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about}.
+    the ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files}.
     Raises UnreadableData, MissingExtra, OutputError; nothing is left of an output that could not be written.
     """
     table = read_table(path, wanted.group) if table is None else table
@@ -77,11 +79,12 @@ def import_data(
         ],
         "notes": signals.notes,
         "about": dict(table.about),
+        "in_other_files": [*table.in_other_files],
     }
 
 
 def listing(path: Path, table: Table, wanted: Wanted) -> dict[str, Any]:
-    """What is in a file: {file, rows, time, time_column, rate_hz, notes, columns, about}."""
+    """What is in a file: {file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files}."""
     columns = [
         {"name": name, "unit": unit_in(table, name), **extremes(values)} for name, values in table.columns.items()
     ]
@@ -91,7 +94,9 @@ def listing(path: Path, table: Table, wanted: Wanted) -> dict[str, Any]:
         said |= {"time": found.said, "rate_hz": found.rate_hz, "notes": found.notes}
     except UnreadableData as fault:
         said["notes"] = [str(fault).removeprefix(f"{path}: ")]
-    return {"file": str(path), "rows": rows_of(table), **said, "columns": columns, "about": dict(table.about)}
+    return {"file": str(path), "rows": rows_of(table), **said, "columns": columns, "about": dict(table.about)} | {
+        "in_other_files": [*table.in_other_files]
+    }
 
 
 def extremes(values: Real) -> dict[str, float | None]:
@@ -167,7 +172,7 @@ def _ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
 
 
 def _header(path: Path, signals: Signals, found: Sampling) -> dict[str, Any]:
-    with path.open("rb") as file:
+    with os.fdopen(open_named(path), "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     first = int(signals.columns[OWN[0]][0])
     return {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.from_csv import read_csv
 from rtloop.interchange.formats.from_hdf5 import read_hdf5
 from rtloop.interchange.formats.from_mat import HDF5_AT, HDF5_MAGIC, read_mat
@@ -22,7 +24,7 @@ def read_here(path: Path, group: str | None = None) -> Table:
     Raises UnreadableData, MissingExtra.
     """
     try:
-        with path.open("rb") as file:
+        with os.fdopen(open_named(path), "rb") as file:
             head = file.read(HDF5_AT + len(HDF5_MAGIC))
     except OSError as error:
         raise UnreadableData(f"{path}: {error.strerror}") from None

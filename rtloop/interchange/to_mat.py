@@ -14,12 +14,12 @@ import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.interchange.hdf5_signals import append, begin
+from rtloop.interchange.hdf5_signals import append, begin, path_of
 from rtloop.recording.load import Recording
 from rtloop.recording.views.selection import Selection
 from rtloop.signals import PER_AXIS
@@ -34,7 +34,7 @@ RASTER = "tick"
 Progress = Callable[[int], None]
 
 
-def write_mat(recording: Recording, part: Path, target: Path, selection: Selection, progress: Progress) -> int:
+def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Selection, progress: Progress) -> int:
     """The ticks written to `part`, which will be called `target`. Raises RecordingError, OSError, MissingExtra."""
     names = selection.names(recording)
     count = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
@@ -52,7 +52,7 @@ def variable_of(path: Path) -> str:
     return (name if name[:1].isalpha() else f"rec_{name}")[:LONGEST_NAME]
 
 
-def _write_v5(recording: Recording, part: Path, variable: str, selection: Selection, count: int) -> None:
+def _write_v5(recording: Recording, part: IO[bytes], variable: str, selection: Selection, count: int) -> None:
     from scipy.io import savemat
 
     names, done = selection.names(recording), 0
@@ -68,13 +68,13 @@ def _write_v5(recording: Recording, part: Path, variable: str, selection: Select
     savemat(part, {variable: content}, appendmat=False, long_field_names=True)
 
 
-def _write_v73(recording: Recording, part: Path, variable: str, selection: Selection, progress: Progress) -> None:
+def _write_v73(recording: Recording, part: IO[bytes], variable: str, selection: Selection, progress: Progress) -> None:
     try:
         import h5py
     except ImportError:
         raise MissingExtra("MAT of version 7.3 needs h5py: pip install 'rtloop[data]'") from None
     names = selection.names(recording)
-    with h5py.File(part, "w", userblock_size=USER_BLOCK) as file:
+    with h5py.File(path_of(part), "w", userblock_size=USER_BLOCK) as file:
         content = _structure(file, variable)
         time = _structure(content, "X")
         times = _of_class(begin(time, "Data", column=True), "double")
@@ -90,8 +90,8 @@ def _write_v73(recording: Recording, part: Path, variable: str, selection: Selec
             append([times], rows[:, [names.index("deadline_ns")]] * 1e-9)
             ticks += len(rows)
             progress(ticks)
-    with part.open("r+b") as file:
-        file.write(HEADER.ljust(116) + bytes(8) + b"\x00\x02IM")
+    part.seek(0)
+    part.write(HEADER.ljust(116) + bytes(8) + b"\x00\x02IM")
 
 
 TIME: dict[str, str | float] = {"Name": "Time", "Unit": "s", "Raster": RASTER}

@@ -12,11 +12,13 @@ import argparse
 import json
 import sys
 import time
-from itertools import count
+from itertools import chain, count
+from os.path import lexists
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.hil.trusted import open_found
 from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.parts import files_of_run
@@ -97,7 +99,7 @@ def _holding(file: Path, tick: int) -> list[Path]:
     found = {*files_of_run(file, ".mcap"), *files_of_run(file, ".mcap.part")}
     files = sorted(found, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
     for place in reversed(range(len(files))):
-        with Reader(files[place], tolerant=True) as reader:
+        with Reader(files[place], tolerant=True, opener=open_found) as reader:
             if reader.first_tick <= tick:
                 return files[max(place - 1, 0) :]
     return files or [file]
@@ -107,7 +109,7 @@ def _free(file: Path, tick: int, folder: Path | None) -> Path:
     """A name that nothing has."""
     path = cut_path(file if folder is None else folder / file.name, tick, "capture")
     others = (path.with_name(f"{path.stem}-{number}.mcap") for number in count(2))
-    return path if not path.exists() else next(other for other in others if not other.exists())
+    return next(one for one in chain([path], others) if not lexists(one))
 
 
 def _verdict(path: Path) -> str:

@@ -28,6 +28,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
+from rtloop.hil.trusted import open_own
 from rtloop.recording.file.recover import leftovers, recover
 from rtloop.service.changing.building import expect_changes, prepare_limited
 from rtloop.service.changing.live import LiveLaw
@@ -314,7 +315,7 @@ class Service:
         """Complete what killed services left among the recordings; what cannot be is said and stays."""
         for part in leftovers(Path(self.configuration.recording.folder)):
             try:
-                report = recover(part)
+                report = recover(part, opener=open_own)
             except RtloopError as error:
                 log.warning("%s", error)
                 continue

@@ -92,7 +92,7 @@ def keep(path: Path, hardware: Hardware) -> None:
     """
     what, new = "the note of the hardware", path.with_name(f"{path.name}.new")
     with writing(f"{path}: cannot make {what}"):
-        with open(new_file(new, what), "wb") as file:
+        with os.fdopen(new_file(new, what), "wb") as file:
             file.write(_AS_JSON.dump_json(hardware))
         os.replace(new, path)
 
@@ -103,7 +103,7 @@ def noted(path: Path) -> Hardware | None:
     Raises UnusableNote, UnreadableNote, HostRefused for a file that others may have put there.
     """
     try:
-        with open(open_file(path, os.O_RDONLY), "rb") as file:
+        with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
             hardware = _AS_JSON.validate_json(file.read(LARGEST_BYTES))
     except FileNotFoundError:
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from os.path import lexists
 from pathlib import Path
 
 from rtloop.configuration.prepare import Prepared
@@ -17,6 +18,6 @@ def recording_path(prepared: Prepared, out: Path | None) -> Path:
     stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
     for number in range(1, 1000):
         path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")
-        if not path.exists() and not path.with_name(path.name + ".part").exists():
+        if not lexists(path) and not lexists(path.with_name(f"{path.name}.part")):
             return path
     raise OutputError(f"{folder}: no free name for {stem}.mcap")

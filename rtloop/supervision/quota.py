@@ -1,7 +1,7 @@
 """How much a configuration's recordings may take: the oldest files go first, and never one around a trip.
 
 What is removed are finished files of runs of this configuration, by their name and by what they say of themselves: not
-the newest one, none with ticks around a trip, not what a capture or somebody else put there, not what cannot be read.
+the newest one, none with ticks around a trip, not what a capture or another user put there, not what cannot be read.
 Where the disk fills before the quota is reached, they go as well: the run that is recorded needs the room.
 """
 
@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
+from rtloop.hil.trusted import is_own, open_own
 from rtloop.recording.file.around import Around
 from rtloop.recording.file.reader import Reader
+from rtloop.values import counted
 
 OTHERWISE_MADE = ("cut", "imported")
 """In the headers of what is no run's own file."""
@@ -121,13 +123,20 @@ class Quota:
         ]
 
     def _lying(self) -> list[Lying]:
-        found = []
+        found, foreign = [], []
         with os.scandir(self._folder) as entries:
             for entry in entries:
                 match = self._pattern.fullmatch(entry.name)
-                if match and entry.is_file(follow_symlinks=False):
-                    status, number = entry.stat(follow_symlinks=False), int(match[2] or 1)
-                    found.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
+                if not match or not entry.is_file(follow_symlinks=False):
+                    continue
+                if not is_own(Path(entry)):
+                    foreign.append(entry.name)
+                    continue
+                status, number = entry.stat(follow_symlinks=False), int(match[2] or 1)
+                found.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
+        if foreign:
+            what = f"{counted(len(foreign), 'recording')} of other users, such as {min(foreign)}"
+            self.failure = f"{self._folder}: {what}: not counted and never removed"
         return sorted(found)
 
     def _look(self, lying: list[Lying], budget_s: float) -> None:
@@ -146,7 +155,7 @@ class Quota:
     def _stored(self, one: Lying) -> Stored | None:
         """What a file says; None where it is damaged, or none of this configuration's recordings."""
         try:
-            with Reader(self._folder / one.name) as reader:
+            with Reader(self._folder / one.name, opener=open_own) as reader:
                 header, totals = reader.header, reader.totals
                 if totals is None or header["name"] != self._name or any(map(header.get, OTHERWISE_MADE)):
                     return None

@@ -15,6 +15,7 @@ from typing import Any
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
+from rtloop.hil.trusted import open_found
 from rtloop.recording.capture.names import Names
 from rtloop.recording.file.parts import files_of_run
 from rtloop.recording.file.recover import recover
@@ -182,7 +183,7 @@ class RecorderKeeper:
 
     def _repair(self, part: Path) -> None:
         try:
-            report = recover(part)
+            report = recover(part, opener=open_found)
         except RtloopError as error:
             self.notes.append(str(error))
             return

@@ -17,6 +17,7 @@ from rtloop.design.identification.hysteresis.identify_hysteresis import Hysteres
 from rtloop.design.identification.measured import Measured, UnsuitableData
 from rtloop.design.toml_text import roots, section
 from rtloop.errors import ConfigError, OutputError
+from rtloop.hil.trusted import make_file
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import PlayModel
 from rtloop.recording.errors import RecordingError
@@ -105,9 +106,10 @@ def write_new(path: Path, content: str) -> None:
     """Write a text file, never over an existing one. Raises OutputError."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        if path.exists():
+        if os.path.lexists(path):
             raise OutputError(f"{path} exists already; it is not overwritten")
-        part.write_text(content, "utf-8")
+        with os.fdopen(make_file(part), "w", encoding="utf-8") as file:
+            file.write(content)
         os.replace(part, path)
     except OSError as error:
         raise OutputError(f"{path}: {error.strerror or error}") from None

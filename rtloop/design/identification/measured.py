@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from rtloop.errors import RtloopError
 from rtloop.hil.modal import Real
+from rtloop.hil.trusted import open_named
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
 from rtloop.signals import trip_causes
@@ -161,7 +163,7 @@ def _which(axis: str | None) -> str:
 def _digest(paths: tuple[Path, ...]) -> str:
     digest = hashlib.sha256()
     for path in paths:
-        with open(path, "rb") as file:
+        with os.fdopen(open_named(path), "rb") as file:
             for block in iter(lambda: file.read(1 << 20), b""):
                 digest.update(block)
     return digest.hexdigest()

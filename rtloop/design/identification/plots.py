@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.hysteresis.judgement import Judgement
-from rtloop.errors import MissingExtra, OutputError
+from rtloop.errors import MissingExtra, writing
 from rtloop.hil.modal import Real
+from rtloop.hil.trusted import overwrite_file
 from rtloop.hysteresis.compensation import Residual, compensated
 from rtloop.laws.shipped.play_model import PlayModel
 
@@ -110,7 +112,5 @@ def label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> Non
 
 def save(figure: Any, output: Path) -> None:
     """Write the PNG. Raises OutputError."""
-    try:
-        figure.savefig(output, format="png", dpi=110)
-    except OSError as error:
-        raise OutputError(f"{output}: {error.strerror or error}") from None
+    with writing(output), os.fdopen(overwrite_file(output), "wb") as file:
+        figure.savefig(file, format="png", dpi=110)

@@ -8,12 +8,14 @@ writes 0 and not 0,0.
 from __future__ import annotations
 
 import csv
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.units import is_unit
 
@@ -104,7 +106,7 @@ def number_alone(text: Any) -> Any:
 def _sample(path: Path) -> tuple[str, list[str], list[str]]:
     """Encoding, the first lines, and some from the middle and the end. Raises UnreadableData."""
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with os.fdopen(open_named(path), "rb") as file:
         blocks = [file.read(SAMPLE_BYTES)]
         for place in (size // 2, size - SAMPLE_BYTES):
             if place > SAMPLE_BYTES:

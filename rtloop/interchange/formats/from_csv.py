@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
 from rtloop.interchange.formats.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
 from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
@@ -51,7 +53,7 @@ class _Lines(io.TextIOBase):
 
     def __init__(self, path: Path, dialect: Dialect) -> None:
         self._path, self._since = path, 0
-        self._file = path.open(encoding=dialect.encoding, errors="replace", newline=None)
+        self._file = os.fdopen(open_named(path), encoding=dialect.encoding, errors="replace", newline=None)
         for _ in range(dialect.first):
             self._file.readline()
 

@@ -13,4 +13,4 @@ def read_hdf5(path: Path, group: str | None = None) -> Table:
     """What was sampled together: `group`, else the only or the longest. Raises UnreadableData, MissingExtra."""
     found = Found(path)
     collect(found)
-    return one_of(path, found.tables(), group)
+    return one_of(path, found.tables(), group, found.in_other_files)

@@ -7,6 +7,7 @@ writes a matrix whose first row is the time. Objects (timeseries, Dataset, table
 
 from __future__ import annotations
 
+import os
 import warnings
 import zlib
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.groups import BYTES_AT_MOST, Found, one_of, unique
 from rtloop.interchange.formats.hdf5 import matlab_variables
 from rtloop.interchange.formats.table import Table, UnreadableData
@@ -30,7 +32,7 @@ VALUES = ("data", "values")
 
 def read_mat(path: Path, group: str | None = None) -> Table:
     """The signals of one raster or structure: `group`, else the only or the longest one. Raises UnreadableData."""
-    with path.open("rb") as file:
+    with os.fdopen(open_named(path), "rb") as file:
         head = file.read(HDF5_AT + len(HDF5_MAGIC))
     found = Found(path)
     variables = matlab_variables(found) if head[HDF5_AT:] == HDF5_MAGIC else _variables(path, head)
@@ -41,7 +43,7 @@ def read_mat(path: Path, group: str | None = None) -> Table:
                 tables[unique(raster or name, tables)] = table
         else:
             _walk(found, name, value, 0)
-    return one_of(path, tables | found.tables(), group)
+    return one_of(path, tables | found.tables(), group, found.in_other_files)
 
 
 def _variables(path: Path, head: bytes) -> dict[str, Any]:
@@ -55,7 +57,8 @@ def _variables(path: Path, head: bytes) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = loadmat(path, simplify_cells=True)
+            with os.fdopen(open_named(path), "rb") as file:
+                found = loadmat(file, simplify_cells=True)
     except Exception as fault:  # scipy lets through whatever a damaged element leads to
         raise UnreadableData(f"{path}: not a MAT file, or damaged ({_first_line(fault)})") from None
     return {name: value for name, value in found.items() if not name.startswith("__")}
@@ -64,7 +67,7 @@ def _variables(path: Path, head: bytes) -> dict[str, Any]:
 def _require_bounded(path: Path, order: str) -> None:
     """Go through the elements. Raise UnreadableData where one is damaged, or all together hold more than is allowed."""
     size, position, total = path.stat().st_size, HEADER_BYTES, 0
-    with path.open("rb") as file:
+    with os.fdopen(open_named(path), "rb") as file:
         while position < size:
             file.seek(position)
             kind, length = np.frombuffer(file.read(8).ljust(8, b"\0"), f"{order}u4").tolist()

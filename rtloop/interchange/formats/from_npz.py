@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.groups import Found, one_of
 from rtloop.interchange.formats.table import Table, UnreadableData
 
@@ -17,13 +19,13 @@ def read_npz(path: Path, group: str | None = None) -> Table:
     """The arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
     found = Found(path)
     try:
-        with zipfile.ZipFile(path) as archive:
+        with os.fdopen(open_named(path), "rb") as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
         if any(member.filename == WORKBOOK for member in members):
             raise UnreadableData(f"{path}: an Excel workbook; save its sheet as CSV")
         for member in members:
             found.room(member.filename, (-(-member.file_size // 8),))
-        with np.load(path, allow_pickle=False) as arrays:
+        with os.fdopen(open_named(path), "rb") as file, np.load(file, allow_pickle=False) as arrays:
             for name in arrays:
                 _add(found, name, arrays)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError) as fault:

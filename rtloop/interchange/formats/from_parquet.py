@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.groups import Found, one_of
 from rtloop.interchange.formats.table import Table, UnreadableData
 
@@ -22,7 +24,7 @@ def read_parquet(path: Path) -> Table:
         raise MissingExtra("Parquet needs pyarrow: pip install 'rtloop[data]'") from None
     found = Found(path)
     try:
-        with pyarrow.parquet.ParquetFile(path) as file:
+        with os.fdopen(open_named(path), "rb") as opened, pyarrow.parquet.ParquetFile(opened) as file:
             schema = file.schema_arrow
             for field in schema:
                 found.room(field.name, (file.metadata.num_rows,))

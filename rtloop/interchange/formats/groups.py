@@ -26,12 +26,16 @@ SHOWN = 8
 
 @dataclass
 class Found:
-    """What is found in a file before it is known what belongs together: columns by path, their units, their time."""
+    """What is found in a file before it is known what belongs together: columns by path, their units, their time.
+
+    `in_other_files` names what is left out because the file only points to it.
+    """
 
     path: Path
     columns: dict[str, Real] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
+    in_other_files: list[str] = field(default_factory=list)
     bytes: int = 0
 
     def room(self, name: str, shape: tuple[int, ...]) -> None:
@@ -91,13 +95,14 @@ class Found:
         return tables
 
 
-def one_of(path: Path, tables: Mapping[str, Table], group: str | None) -> Table:
+def one_of(path: Path, tables: Mapping[str, Table], group: str | None, in_other_files: Sequence[str] = ()) -> Table:
     """The group that is asked for; else the only one, or the longest, and what else there is in its `about`.
 
-    Raises UnreadableData where there is none.
+    `in_other_files` of the table is the one given. Raises UnreadableData where there is none.
     """
     if not tables:
-        raise UnreadableData(f"{path}: holds no column of numbers")
+        left = f"; in other files, and left out: {', '.join(in_other_files[:SHOWN])}" if in_other_files else ""
+        raise UnreadableData(f"{path}: holds no column of numbers{left}")
     if group is not None and group not in tables:
         raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
     name = (
@@ -110,10 +115,11 @@ def one_of(path: Path, tables: Mapping[str, Table], group: str | None) -> Table:
         for other, table in tables.items()
         if other != name
     ]
+    table = replace(tables[name], in_other_files=tuple(in_other_files))
     if not others:
-        return tables[name]
+        return table
     said = {"group": name, "other groups": ", ".join(others[:SHOWN]) + ", …" * (len(others) > SHOWN)}
-    return replace(tables[name], about={**tables[name].about, **said})
+    return replace(table, about={**table.about, **said})
 
 
 def rows_of(table: Table) -> int:

@@ -1,10 +1,14 @@
 """What an HDF5 file holds: its datasets by path, each object once, or the variables that MATLAB put into it.
 
-Groups may hold themselves, by links or by references; a path is followed to where it comes back.
+Groups may hold themselves, by links or by references; a path is followed to where it comes back. Links are followed
+here, one name at a time, and never by the library: a link into another file, external storage and a virtual dataset
+would bring in what some other file of the user holds. They are left out, and named.
 """
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -12,11 +16,15 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
+from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.groups import Found
 from rtloop.interchange.formats.table import UnreadableData
+from rtloop.interchange.hdf5_signals import path_of
 
 DEEPEST = 32
 OBJECTS_AT_MOST = 100_000
+CONTROL = r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]"
+"""Characters of a name that a terminal obeys, or cannot show."""
 UNITS = ("unit", "units", "Unit", "Units")
 
 
@@ -28,7 +36,7 @@ def opened(found: Found) -> Iterator[Any]:
     except ImportError:
         raise MissingExtra("HDF5, and MAT of version 7.3, need h5py: pip install 'rtloop[data]'") from None
     try:
-        with h5py.File(found.path, "r") as file:
+        with os.fdopen(open_named(found.path), "rb") as opened, h5py.File(path_of(opened), "r") as file:
             yield file
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as fault:
         raise UnreadableData(f"{found.path}: not an HDF5 file, or damaged ({str(fault)[:200]})") from None
@@ -54,18 +62,78 @@ def _collect(found: Found, datasets: dict[str, Any], group: Any, path: str, seen
     _see(group, seen)
     for key in group:
         name = f"{path}/{key}".lstrip("/")
-        try:
-            one = group.get(key)
-        except (KeyError, OSError, RuntimeError):
-            one = None
+        one = _member(found, group, key, name)
         if one is None:
-            found.left_out.append(f"{name} (a link that leads nowhere)")
-        elif not _see(one, seen):
+            continue
+        if not _see(one, seen):
             found.left_out.append(f"{name} (a link back to what is there already)")
         elif isinstance(one, h5py.Group):
             _collect(found, datasets, one, name, seen, depth + 1)
-        elif isinstance(one, h5py.Dataset) and one.shape is not None and one.dtype.kind not in "OSU":
+        elif (
+            isinstance(one, h5py.Dataset)
+            and not _is_elsewhere(found, one, name)
+            and one.shape is not None
+            and one.dtype.kind not in "OSU"
+        ):
             datasets[name] = one
+
+
+def _member(found: Found, group: Any, key: str, name: str) -> Any:
+    """The object of a group under `key`, if it is reached within the file; else None, and it is left out as `name`."""
+    try:
+        return _within(group, key, DEEPEST)
+    except _OtherFile:
+        _name_elsewhere(found, name, "a link into another file")
+    except (KeyError, OSError, RuntimeError):
+        found.left_out.append(f"{name} (a link that leads nowhere)")
+    return None
+
+
+def _within(group: Any, path: str, links: int) -> Any:
+    """The object at a path, reached by hard links and at most `links` soft ones within each other.
+
+    Raises _OtherFile where the path leaves the file, KeyError where it leads nowhere.
+    """
+    import h5py
+
+    h5l = h5py.h5l  # type: ignore[attr-defined]
+    place = group.file["/"] if path.startswith("/") else group
+    for part in filter(lambda part: part not in ("", "."), path.split("/")):
+        if not isinstance(place, h5py.Group):
+            raise KeyError(part)
+        key = part.encode("utf-8", "surrogateescape")
+        kind = place.id.links.get_info(key).type
+        if kind == h5l.TYPE_HARD:
+            place = place[part]
+        elif kind == h5l.TYPE_SOFT and links > 0:
+            place = _within(place, place.id.links.get_val(key).decode("utf-8", "surrogateescape"), links - 1)
+        elif kind == h5l.TYPE_SOFT:
+            raise KeyError(part)
+        else:
+            raise _OtherFile(part)
+    return place
+
+
+def _is_elsewhere(found: Found, dataset: Any, name: str) -> bool:
+    """Whether the values of a dataset are in other files; it is left out as `name` then."""
+    import h5py
+
+    made = dataset.id.get_create_plist()
+    if made.get_layout() == h5py.h5d.VIRTUAL:
+        _name_elsewhere(found, name, "a virtual dataset, made of others")
+    elif made.get_external_count():
+        _name_elsewhere(found, name, "values stored in another file")
+    else:
+        return False
+    return True
+
+
+def _name_elsewhere(found: Found, name: str, reason: str) -> None:
+    found.in_other_files.append(f"{re.sub(CONTROL, ' ', name)} ({reason})")
+
+
+class _OtherFile(Exception):
+    """A path leaves the file."""
 
 
 def _read(found: Found, dataset: Any, name: str) -> None:
@@ -96,7 +164,13 @@ def _word(value: Any) -> str:
 def matlab_variables(found: Found) -> dict[str, Any]:
     """Variables of a MAT file of version 7.3: structures as dicts, arrays as MATLAB shows them, text as str."""
     with opened(found) as file:
-        return {key: _value(found, file, file[key], key, 0) for key in file if not key.startswith("#")}
+        return _values(found, file, {key: key for key in file if not key.startswith("#")}, file, 0)
+
+
+def _values(found: Found, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
+    """The members of a group by key, for those of `names` (full name by key) that lie in the file."""
+    members = {key: _member(found, group, key, name) for key, name in names.items()}
+    return {key: _value(found, file, one, names[key], depth) for key, one in members.items() if one is not None}
 
 
 def _value(found: Found, file: Any, one: Any, name: str, depth: int) -> Any:
@@ -105,11 +179,13 @@ def _value(found: Found, file: Any, one: Any, name: str, depth: int) -> Any:
     if depth > DEEPEST:
         raise UnreadableData(f"{found.path}: {name}: nested more than {DEEPEST} deep: a reference leads back to itself")
     if isinstance(one, h5py.Group):
-        fields = {key: _value(found, file, one[key], f"{name}/{key}", depth + 1) for key in one}
+        fields = _values(found, file, {key: f"{name}/{key}" for key in one}, one, depth + 1)
         lengths = {len(field) for field in fields.values() if isinstance(field, list)}
         if fields and len(lengths) == 1 and all(isinstance(field, list) for field in fields.values()):
             return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
         return fields
+    if _is_elsewhere(found, one, name):
+        return np.empty(0)
     kind = _word(one.attrs.get("MATLAB_class", b"double"))
     if "MATLAB_empty" in one.attrs or one.shape is None:
         return "" if kind == "char" else np.empty(0)

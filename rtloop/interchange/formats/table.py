@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rtloop.errors import RtloopError
@@ -23,10 +23,12 @@ class Table:
     """Named columns of a file, each float64 of shape (rows,), that were sampled together.
 
     `units` as the file writes them, by column, where it does; `time` is the column that the file itself calls its time.
-    `about` is what else the file says of itself, for people.
+    `about` is what else the file says of itself, for people; `in_other_files` names what it only points to, with the
+    reason: that is never read.
     """
 
     columns: Mapping[str, Real]
     units: Mapping[str, str] = field(default_factory=dict)
     time: str | None = None
     about: Mapping[str, str] = field(default_factory=dict)
+    in_other_files: Sequence[str] = ()

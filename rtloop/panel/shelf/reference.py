@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from rtloop.hil.trusted import open_found
 from rtloop.panel.envelope import envelope
+from rtloop.panel.shelf.shelf import shown_name
 from rtloop.panel.stretch import index_of
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.wishes import MAX_PIXELS
@@ -38,7 +40,7 @@ class Wanted(BaseModel):
 
 def sweep(path: Path, wanted: Wanted) -> bytes:
     """The frame. Raises ValueError for what the recording does not have, RecordingError."""
-    with Reader(path, tolerant=True) as reader:
+    with Reader(path, tolerant=True, opener=open_found) as reader:
         seeker = Seeker(reader)
         first, end = _stretch(seeker, wanted)
         values = _values(seeker, [index_of(name, reader.columns) for name in wanted.signals], first, end)
@@ -49,7 +51,7 @@ def sweep(path: Path, wanted: Wanted) -> bytes:
             arrays |= {f"{name}:low": low, f"{name}:high": high}
         header = {"run": -1, "first": first, "trigger": trigger, "end": end, "cause": "recording", "uncertain_ticks": 0}
         beside = {"number": 0, "complete": True, "rate_hz": reader.header["rate_hz"], "signals": wanted.signals}
-        return pack("sweep", header | beside | {"file": path.name}, arrays)
+        return pack("sweep", header | beside | {"file": shown_name(path.name)}, arrays)
 
 
 def _stretch(seeker: Seeker, wanted: Wanted) -> tuple[int, int]:

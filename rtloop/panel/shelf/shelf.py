@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
+from rtloop.hil.trusted import open_found
 from rtloop.recording.cutting.seek import Seeker
 from rtloop.recording.file.reader import Reader
 
@@ -28,6 +29,11 @@ class Lying(NamedTuple):
     name: str
     bytes: int
     changed_ns: int
+
+
+def shown_name(name: str) -> str:
+    """A file's name as pages show and send it: bytes that are no UTF-8 are escaped as \\xNN."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 class Shelf:
@@ -55,13 +61,23 @@ class Shelf:
                     seen[one] = _summary(self.folder / one.name, one.bytes)
             self._seen = seen
             return [
-                {"file": one.name, "bytes": one.bytes, "captured": ".capture-" in one.name, **seen.get(one, UNKNOWN)}
+                {
+                    "file": shown_name(one.name),
+                    "bytes": one.bytes,
+                    "captured": ".capture-" in one.name,
+                    **seen.get(one, UNKNOWN),
+                }
                 for one in lying
             ]
 
     def path(self, name: str) -> Path | None:
-        """Of a recording by its name in the listing; None for everything else, wherever it may point."""
-        return self.folder / name if any(one.name == name for one in self._lying()) else None
+        """Of a recording by its name in the listing; None for everything else, wherever it may point.
+
+        A file of exactly this name goes before one whose name is escaped to it.
+        """
+        names = [one.name for one in self._lying()]
+        match = name if name in names else next((one for one in names if shown_name(one) == name), None)
+        return None if match is None else self.folder / match
 
     def _lying(self) -> list[Lying]:
         found = []
@@ -79,7 +95,7 @@ class Shelf:
 def _summary(path: Path, size: int) -> dict[str, Any]:
     """Of one file, from its beginning and its end."""
     try:
-        with Reader(path, tolerant=True) as reader:
+        with Reader(path, tolerant=True, opener=open_found) as reader:
             seeker = Seeker(reader)
             first, last, end, ticks, span_s = seeker.first(), seeker.last(), seeker.final(), 0, 0.0
             if first is not None and last is not None:

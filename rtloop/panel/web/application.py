@@ -27,7 +27,7 @@ from rtloop.panel.web.live import Live
 from rtloop.panel.web.loop import loop_for_pages
 from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy, decoded, limited_body
-from rtloop.panel.web.rates import Rate
+from rtloop.panel.web.rates import Rates, client_of
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
@@ -46,7 +46,7 @@ class Pages(StaticFiles):
 
 def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
     """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
-    feed, state, tries = Feed(service), State(service.client), Rate(per_s=5.0, burst=20)
+    feed, state, tries = Feed(service), State(service.client), Rates(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
     @asynccontextmanager
@@ -60,7 +60,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
     async def session(request: Request) -> Response:
-        if not tries.allows():
+        if not tries.allows(client_of(request.scope)):
             return JSONResponse({"error": f"more than {tries} tries; try again"}, status_code=429)
         try:
             body = await limited_body(request, MOST_TOKEN_BYTES)

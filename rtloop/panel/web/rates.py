@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from functools import partial
+from socket import inet_aton
+from sys import byteorder
+
+from starlette.types import Scope
+
+from rtloop.hil.trusted import open_named
+
+MAX_CLIENTS = 256
+CONNECTIONS = "/proc/self/net/tcp"
+"""The kernel's table: a connection a line, seen from each of its ends, with the user of that end."""
+ESTABLISHED, USER = "01", 7
+"""The state whose user is told; its place in a line."""
 
 
 class Rate:
@@ -25,3 +40,42 @@ class Rate:
             return False
         self._left -= 1
         return True
+
+
+class Rates:
+    """A Rate for each client, by whatever names it; that of the MAX_CLIENTS which came last."""
+
+    def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._new = partial(Rate, per_s, burst, now_s)
+        self._rates: OrderedDict[Hashable, Rate] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._rates)
+
+    def __str__(self) -> str:
+        return str(self._new())
+
+    def allows(self, client: Hashable) -> bool:
+        """Whether one more request of `client` is within its rate; it counts if it is."""
+        rate = self._rates.setdefault(client, self._new())
+        self._rates.move_to_end(client)
+        while len(self._rates) > MAX_CLIENTS:
+            self._rates.popitem(last=False)
+        return rate.allows()
+
+
+def client_of(scope: Scope) -> tuple[str, int | None]:
+    """Address of the client of a request, and the user who runs it, where that is on this host: there all have one.
+
+    What a request itself says of a client behind a proxy is not believed.
+    """
+    client, server = scope.get("client"), scope.get("server")
+    if not client or not server:
+        return "", None
+    try:
+        ends = [f"{int.from_bytes(inet_aton(host), byteorder):08X}:{port:04X}" for host, port in (client, server)]
+        with os.fdopen(open_named(CONNECTIONS), encoding="ascii") as file:
+            line = next((line for line in file if f" {ends[0]} {ends[1]} {ESTABLISHED} " in line), None)
+    except OSError:
+        line = None
+    return client[0], None if line is None else int(line.split()[USER])

@@ -5,11 +5,13 @@ What takes long runs in a process of its own, few at a time; a sweep reads of a 
 
 from __future__ import annotations
 
+import json
+import os
 import tempfile
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from urllib.parse import quote
 
 import anyio.to_thread
@@ -17,12 +19,14 @@ from anyio import CapacityLimiter
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
+from starlette.types import Receive, Scope, Send
 
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.hil.trusted import open_found, open_own
 from rtloop.panel.capture import Run, present_run
 from rtloop.panel.shelf.aside import Aside, Crowded
 from rtloop.panel.shelf.reference import Wanted, sweep
-from rtloop.panel.shelf.shelf import Shelf
+from rtloop.panel.shelf.shelf import Shelf, shown_name
 from rtloop.panel.views.link import Service
 from rtloop.panel.web.asked import LONGEST_S, CaptureBody, Span, checked
 from rtloop.panel.web.proxy import limited_body
@@ -31,6 +35,15 @@ READING_AT_A_TIME = 2
 MOST_BODY_BYTES = 4096
 AHEAD_S = 60.0
 BLOCK_BYTES = 1 << 16
+
+
+class PlainJSONResponse(JSONResponse):
+    """JSON in ASCII: a name that is no UTF-8 prevents no answer."""
+
+    def render(self, content: Any) -> bytes:
+        """Encode `content`, which holds finite numbers."""
+        return json.dumps(content, allow_nan=False).encode("ascii")
+
 
 Handler = Callable[[Any, Request], Awaitable[Response]]
 
@@ -53,7 +66,7 @@ def _answers(handler: Handler) -> Handler:
         except ClientDisconnect:
             return Response()
         except (Refused, Crowded, RtloopError, ValueError) as error:
-            return JSONResponse({"error": str(error)}, _code_of(error))
+            return PlainJSONResponse({"error": str(error)}, _code_of(error))
 
     return answering
 
@@ -93,17 +106,21 @@ class Recordings:
     async def download(self, request: Request) -> Response:
         """A file; of one that grows, what it holds now."""
         path = await self._path(request)
+        name = shown_name(path.name)
+        try:
+            file = await self._read(lambda: os.fdopen(open_found(path), "rb"))
+        except OSError as error:
+            raise Refused(404, f"{name}: {error.strerror}") from None
         if path.suffix == ".mcap":
-            return FileResponse(path, filename=path.name, media_type="application/octet-stream")
-        size = path.stat().st_size
-        named = f"attachment; filename*=utf-8''{quote(path.name)}"
-        headers = {"content-length": str(size), "content-disposition": named}
-        return StreamingResponse(_blocks(path, size), headers=headers, media_type="application/octet-stream")
+            return OpenFileResponse(file, name)
+        size = os.fstat(file.fileno()).st_size
+        headers = {"content-length": str(size), "content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
+        return StreamingResponse(_blocks(file, size), headers=headers, media_type="application/octet-stream")
 
     @_answers
     async def info(self, request: Request) -> Response:
         """What `rtloop info --json` says."""
-        return JSONResponse(await self._aside.run("rtloop", "info", await self._path(request), "--json"))
+        return PlainJSONResponse(await self._aside.run("rtloop", "info", await self._path(request), "--json"))
 
     @_answers
     async def plot(self, request: Request) -> Response:
@@ -114,7 +131,8 @@ class Recordings:
         with tempfile.TemporaryDirectory(prefix="rtloop-panel-") as folder:
             picture = Path(folder) / "plot.png"
             await self._aside.run("rtloop", "plot", path, "--out", picture, "--json", *span)
-            return Response(await anyio.to_thread.run_sync(picture.read_bytes), media_type="image/png")
+            with os.fdopen(open_own(picture), "rb") as file:
+                return Response(await anyio.to_thread.run_sync(file.read), media_type="image/png")
 
     @_answers
     async def sweep(self, request: Request) -> Response:
@@ -178,9 +196,23 @@ def routes(service: Service, run: Callable[[], int]) -> Sequence[BaseRoute]:
     return Recordings(service, run).routes()
 
 
-def _blocks(path: Path, size: int) -> Iterator[bytes]:
-    """The first `size` bytes of a file."""
-    with path.open("rb") as file:
+class OpenFileResponse(FileResponse):
+    """A download of an open file, which is closed afterwards; ranges of it may be requested."""
+
+    def __init__(self, file: IO[bytes], name: str) -> None:
+        path, status = f"/proc/self/fd/{file.fileno()}", os.fstat(file.fileno())
+        super().__init__(path, filename=name, media_type="application/octet-stream", stat_result=status)
+        self._file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file, or the ranges."""
+        with self._file:
+            await super().__call__(scope, receive, send)
+
+
+def _blocks(file: IO[bytes], size: int) -> Iterator[bytes]:
+    """The first `size` bytes of a file, which is closed afterwards."""
+    with file:
         while size > 0 and (block := file.read(min(size, BLOCK_BYTES))):
             size -= len(block)
             yield block

@@ -16,13 +16,15 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import OutputError, UnavailableError
+from rtloop.hil.trusted import Untrusted, open_file
 from rtloop.panel.viewers.foxglove import PATH, viewers_token
 from rtloop.panel.views.link import Service
 from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
-from rtloop.panel.web.application import application
+from rtloop.panel.web.application import MOST_TOKEN_BYTES, application
 from rtloop.panel.web.live import Stream
 from rtloop.panel.web.security import TOKEN_BYTES, Sessions
 from rtloop.service.api.connections import Bounded
+from rtloop.supervision.paths import refusal
 
 HOST = "127.0.0.1"
 NICE = 10
@@ -45,7 +47,8 @@ def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str]
 
     `foxglove` serves viewers as well; `say` is told theirs.
 
-    Raises UnavailableError where the port is taken, OutputError where the token's file cannot be read or made.
+    Raises UnavailableError where the port is taken, OutputError where the token's file cannot be read or made,
+    HostRefused where it is not believed.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else token_of(token_file)
     listener = _listen(port)
@@ -70,9 +73,19 @@ def serve(control: Path, port: int, token_file: Path | None, say: Callable[[str]
 
 
 def token_of(file: Path) -> str:
-    """The token in a file, which is made, with TOKEN_MODE, where there is none. Raises OutputError."""
+    """The token in a file, which is made, with TOKEN_MODE, where there is none.
+
+    Raises OutputError, and HostRefused for a file that another user made, or may change.
+    """
     try:
-        fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, TOKEN_MODE)
+        return _token_in(file)
+    except Untrusted as error:
+        raise refusal(error) from None
+
+
+def _token_in(file: Path) -> str:
+    try:
+        fd = open_file(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, TOKEN_MODE)
         try:
             os.fchmod(fd, TOKEN_MODE)
             os.write(fd, (secrets.token_urlsafe(TOKEN_BYTES) + "\n").encode())
@@ -80,10 +93,15 @@ def token_of(file: Path) -> str:
             os.close(fd)
     except FileExistsError:
         pass
+    except Untrusted:
+        raise
     except OSError as error:
         raise OutputError(f"{file}: cannot make the panel's token: {error.strerror}") from None
     try:
-        mode, token = file.stat().st_mode, file.read_text(encoding="ascii").strip()
+        with os.fdopen(open_file(file, os.O_RDONLY), encoding="ascii") as opened:
+            mode, token = os.fstat(opened.fileno()).st_mode, opened.read(MOST_TOKEN_BYTES).strip()
+    except Untrusted:
+        raise
     except (OSError, ValueError) as error:
         raise OutputError(f"{file}: cannot read the panel's token: {error}") from None
     if stat.S_IMODE(mode) & 0o007:

@@ -18,10 +18,11 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from rtloop.hil.trusted import open_named
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.account import Account
 from rtloop.recording.file.layout import layout_of
-from rtloop.recording.file.mcap.chunks import Entry, Source
+from rtloop.recording.file.mcap.chunks import Entry, Opener, Source
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.checked import Malformed, event_from
@@ -52,14 +53,15 @@ class Snapshot(NamedTuple):
 class Reader:
     """An open recording. `tolerant`: what is damaged is left out and named in `problems` instead of raising.
 
-    `left_out` are those of the problems for which something is missing from what is read.
+    `left_out` are those of the problems for which something is missing from what is read. `opener` opens the file:
+    `open_named` of `rtloop.hil.trusted` for one that a user named, another for one found in a folder.
 
     Raises RecordingError, here and while reading.
     """
 
-    def __init__(self, path: Path | str, *, tolerant: bool = False) -> None:
+    def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_named) -> None:
         self.path, self.tolerant = Path(path), tolerant
-        self._source = Source(self.path)
+        self._source = Source(self.path, opener)
         try:
             self._layout = layout_of(self._source)
         except BaseException:

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import writing
+from rtloop.hil.trusted import is_own, open_named
 from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.mcap.chunks import Opener
 from rtloop.recording.file.reader import Reader, Rows
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
@@ -33,9 +35,9 @@ def output_of(path: Path) -> Path:
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """Unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
-    parts = sorted(folder.glob("*.mcap.part"))
-    return [part for part in parts if not output_of(part).exists() and _is_left(part)]
+    """Our own unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
+    parts = [part for part in sorted(folder.glob("*.mcap.part")) if is_own(part)]
+    return [part for part in parts if not os.path.lexists(output_of(part)) and _is_left(part)]
 
 
 def _is_left(part: Path) -> bool:
@@ -111,8 +113,13 @@ class Recovery:
         self._end_ns = float(rows[-1, DEADLINE]) + 1e9 / self._reader.header["rate_hz"]
 
 
-def recover(path: Path | str, output: Path | str | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Write a complete file from `path`; `progress` is told the ticks so far.
+def recover(
+    path: Path | str,
+    output: Path | str | None = None,
+    progress: Progress | None = None,
+    opener: Opener = open_named,
+) -> dict[str, Any]:
+    """Write a complete file from `path`, opened by `opener`; `progress` is told the ticks so far.
 
     Returns {recording, output, ticks, gaps [(first tick, count)], problems, complete}. Raises RecordingError,
     OutputError where not all of it can be written; nothing of the output is left then.
@@ -121,7 +128,7 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
     output = output_of(path) if output is None else Path(output)
     if grows(path):
         raise RecordingError(f"{path}: is being written by a recorder right now")
-    with Reader(path, tolerant=True) as reader:
+    with Reader(path, tolerant=True, opener=opener) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         with writing(output):
             output.with_name(output.name + UNFINISHED).unlink(missing_ok=True)
@@ -150,7 +157,7 @@ def recover(path: Path | str, output: Path | str | None = None, progress: Progre
 def grows(path: Path) -> bool:
     """Whether a recorder holds its lock on the file. Raises RecordingError where the system does not say it."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = open_named(path)
     except OSError:
         return False  # the reader says it better
     try:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rtloop.errors import writing
+from rtloop.hil.trusted import overwrite_file
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import Band, Panel, Progress, kind_of, marks, panels, read_bands, title
@@ -44,8 +46,8 @@ def write_page(
         "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
     embedded = json.dumps(data).replace("<", "\\u003c")
-    with writing(target):
-        target.write_text(rendered(__package__, title=title(recording), data=embedded), "utf-8")
+    with writing(target), os.fdopen(overwrite_file(target), "w", encoding="utf-8") as file:
+        file.write(rendered(__package__, title=title(recording), data=embedded))
     return target
 
 

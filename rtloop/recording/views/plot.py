@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rtloop.errors import MissingExtra, OutputError, writing
+from rtloop.hil.trusted import overwrite_file
 from rtloop.recording.file.parts import Files
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import (
@@ -71,8 +73,8 @@ def plot(
             for panel in figure.axes:
                 panel.axvspan(max(begin, time_s[0]), min(end, time_s[-1]), color=KEPT, alpha=0.25, linewidth=0)
     figure.suptitle(title(recording), fontsize=11, parse_math=False)
-    with writing(target):
-        figure.savefig(target, format=target.suffix[1:], dpi=110)
+    with writing(target), os.fdopen(overwrite_file(target), "wb") as file:
+        figure.savefig(file, format=target.suffix[1:], dpi=110)
     return target
 
 

@@ -5,25 +5,30 @@ The panel here has no service: what is handed on is answered by 503, what is not
 
 from __future__ import annotations
 
+import http.client
 import json
+import os
 import socket
 import stat
+import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from starlette.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from rtloop.errors import OutputError
+from rtloop.errors import HostRefused, OutputError
 from rtloop.panel.web.live import MAX_STREAMS
-from rtloop.panel.web.rates import Rate
-from rtloop.panel.web.security import host_name
+from rtloop.panel.web.rates import MAX_CLIENTS, Rate, Rates, client_of
+from rtloop.panel.web.security import MAX_SESSIONS, Sessions, host_name
 from rtloop.panel.web.server import token_of
 from tests.faults.bench import Bench
 from tests.panel.web.browser import Browser, unpacked
+from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
 
 STOP = ("POST", "/api/stop")
 HANDED_ON, REFUSED, UNKNOWN = 503, 403, 401
@@ -110,13 +115,68 @@ def test_tokens_that_are_none(browser: Browser):
     for said in (*({"token": token} for token in wrong), [], b"{", b"[" * 4000, b""):
         status, headers, _ = browser.request("POST", "/session", said, {"Cookie": None})
         assert (status, "set-cookie" in headers) == (UNKNOWN, False)
-    codes = {browser.request("POST", "/session", {"token": "guess"})[0] for _ in range(40)}
-    assert codes == {401, 429}
-    time.sleep(1.0)
     status, headers, _ = browser.request("POST", "/session", {"token": browser.token}, {"Cookie": None})
     cookie = headers["set-cookie"].lower()
     assert status == 204
     assert all(word in cookie for word in ("httponly", "samesite=strict", "path=/"))
+
+
+def try_token(browser: Browser, token: str, source: str = "127.0.0.1") -> int:
+    """The answer to one try of a token from an address of the loopback."""
+    connection = http.client.HTTPConnection("127.0.0.1", browser.port, timeout=60, source_address=(source, 0))
+    with closing(connection):
+        connection.request("POST", "/session", json.dumps({"token": token}), {"Origin": browser.origin})
+        return connection.getresponse().status
+
+
+def locked_out(browser: Browser, source: str) -> bool:
+    """Guess until guesses are not answered any more; whether the token is refused as well then."""
+    codes = {try_token(browser, "guess", source) for _ in range(60)}
+    return codes == {401, 429} and try_token(browser, browser.token, source) == 429
+
+
+def test_guesses_lock_out_the_client_that_makes_them_alone(browser: Browser):
+    assert locked_out(browser, "127.0.0.2")
+    assert try_token(browser, browser.token, "127.0.0.3") == 204
+
+
+@ROOT_ONLY
+def test_guesses_of_another_user_lock_out_nobody_else(browser: Browser):
+    """On this host all clients have one address."""
+    assert as_user(ATTACKER, lambda: locked_out(browser, "127.0.0.4"))
+    assert try_token(browser, browser.token, "127.0.0.4") == 204
+
+
+def test_the_newest_sessions_are_kept():
+    sessions = Sessions("token", 1)
+    begun = [sessions.begin("token") for _ in range(MAX_SESSIONS + 1)]
+    known = [sessions.knows(Headers({"cookie": f"{sessions.cookie}={session}"})) for session in begun]
+    assert known == [False] + [True] * MAX_SESSIONS
+    assert len(set(begun)) == MAX_SESSIONS + 1
+
+
+def test_each_client_has_a_rate_of_its_own_and_few_are_remembered():
+    now = [0.0]
+    rates = Rates(1.0, 2, lambda: now[0])
+    assert [rates.allows("one") for _ in range(3)] == [True, True, False]
+    assert [rates.allows("two") for _ in range(3)] == [True, True, False]
+    for number in range(10 * MAX_CLIENTS):
+        rates.allows(number)
+        rates.allows("one")  # seen last, it is not forgotten
+    assert len(rates) == MAX_CLIENTS
+    assert not rates.allows("one")
+    now[0] = 1.0
+    assert rates.allows("one")
+
+
+def test_a_client_is_known_by_its_address_and_its_user():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        with socket.create_connection(listener.getsockname(), source_address=("127.0.0.5", 0)) as one:
+            scope = {"client": one.getsockname(), "server": listener.getsockname()}
+            assert client_of(scope) == ("127.0.0.5", os.geteuid())
+        assert client_of(scope) == ("127.0.0.5", None)
+    assert client_of({"client": None, "server": ("/run/rtloop/panel.sock", None)}) == ("", None)
+    assert client_of({"client": ("::1", 5), "server": ("::1", 6)}) == ("::1", None)
 
 
 def test_what_pages_may_do(browser: Browser):
@@ -247,6 +307,30 @@ def test_the_tokens_file(tmp_path: Path):
         token_of(tmp_path / "short")
     with pytest.raises(OutputError, match="cannot make"):
         token_of(tmp_path / "no" / "token")
+
+
+@ROOT_ONLY
+def test_a_token_that_another_user_laid_is_not_believed():
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o1777)
+        known = folder / "known"
+        as_user(ATTACKER, lambda: known.write_text("x" * 40) and known.chmod(0o640))
+        as_user(ATTACKER, lambda: (folder / "link").symlink_to(known))
+        os.chown(folder / "known", ATTACKER, VICTIM)  # of a group that the victim may read by
+        as_user(VICTIM, lambda: (folder / "group").write_text("x" * 40) and (folder / "group").chmod(0o660))
+        for file in ("known", "link", "group"):
+            with pytest.raises(Raised, match=r"token|link|user|write") as caught:
+                as_user(VICTIM, lambda file=file: token_of(folder / file))
+            assert caught.value.exit_code == 77, caught.value.message
+            assert str(folder / file) in caught.value.message
+        assert as_user(VICTIM, lambda: token_of(folder / "own")) == as_user(VICTIM, lambda: token_of(folder / "own"))
+
+
+def test_a_token_is_no_pipe(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(HostRefused, match="not a regular file"):
+        token_of(tmp_path / "pipe")
 
 
 def test_a_rate_is_kept():

@@ -20,6 +20,7 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
+from rtloop.hil.trusted import Untrusted, remake_file
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     MAGIC,
@@ -85,12 +86,11 @@ class ChunkFile:
     def is_there(self) -> bool:
         """Whether the unfinished file still lies under its name: a removed one can be written, and is lost."""
         try:
-            os.stat(self.part)
+            return os.path.samestat(os.lstat(self._name), self._made)
         except (FileNotFoundError, NotADirectoryError):
             return False
         except OSError:
             return True  # nobody knows; writing will tell
-        return True
 
     def append(self, content: Content) -> None:
         """Compress and write one chunk and its index records, if it has any."""
@@ -141,7 +141,9 @@ class ChunkFile:
         """
         try:
             self._make_durable()
-            if self.path.exists():
+            if not self.is_there():
+                raise OutputError(f"{self.part}: was removed while it was written", errno.ENOENT)
+            if os.path.lexists(self.path):
                 message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
             os.rename(self.part, self.path)
@@ -179,12 +181,14 @@ class ChunkFile:
         """Of a file that nobody takes for a recording yet; one that was left so is begun anew."""
         self._refuse_to_replace()
         try:
-            fd = os.open(self._name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            fd = remake_file(self._name, 0o644)
         except OSError as error:
             raise self._refused(error) from None
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
-            os.ftruncate(fd, 0)
+            self._made = os.fstat(fd)
+            if not self.is_there():
+                raise BlockingIOError(errno.EWOULDBLOCK, "another process began it as well")
         except OSError as error:
             os.close(fd)
             raise self._refused(error) from None
@@ -208,7 +212,7 @@ class ChunkFile:
 
     def _refuse_to_replace(self) -> None:
         try:
-            is_finished, is_begun = self.path.exists(), self.part.exists()
+            is_finished, is_begun = os.path.lexists(self.path), os.path.lexists(self.part)
         except OSError as error:
             raise self._refused(error) from None
         if is_finished:
@@ -249,4 +253,5 @@ class ChunkFile:
         )
 
     def _refused(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.part}: {error.strerror}", error.errno or 0)
+        where = error.filename if isinstance(error, Untrusted) else self.part
+        return OutputError(f"{where}: {error.strerror}", error.errno or 0)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
+from rtloop.hil.trusted import open_named
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
@@ -26,6 +28,8 @@ from rtloop.recording.file.mcap.container import (
 
 SEARCH_BYTES = 1 << 20
 INDEX_HEAD_BYTES = PREFIX.size + 6
+Opener = Callable[[Path], int]
+"""`open_named`, `open_found` or `open_own` of `rtloop.hil.trusted`."""
 LARGEST_SUMMARY_BYTES = 16 << 20
 """Beyond the size of what it sums up: a chunk takes more room than its index."""
 
@@ -43,12 +47,15 @@ class Entry(NamedTuple):
 
 
 class Source:
-    """A file opened for reading at any place from any thread. Raises RecordingError when it cannot be an MCAP file."""
+    """A file opened, by `opener`, for reading at any place from any thread.
 
-    def __init__(self, path: Path) -> None:
+    Raises RecordingError when it cannot be an MCAP file.
+    """
+
+    def __init__(self, path: Path, opener: Opener = open_named) -> None:
         self.path = path
         try:
-            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self._fd = opener(path)
             self.size = os.fstat(self._fd).st_size
             magic = os.pread(self._fd, len(MAGIC), 0)
         except FileNotFoundError:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
+from rtloop.hil.trusted import open_found
 from rtloop.recording.file.mcap.chunks import Entry, Source, scanned_chunks
 from rtloop.recording.file.mcap.container import (
     MESSAGE_HEAD,
@@ -64,7 +65,7 @@ def read_chunk(source: Source, entry: Entry) -> bytes:
 
 def contents_behind(path: Path, position: int) -> Iterator[bytes]:
     """What the whole chunks hold from a record at `position` of a file on. Raises RecordingError."""
-    with closing(Source(path)) as source:
+    with closing(Source(path, open_found)) as source:
         for entry in scanned_chunks(source, position)[0]:
             with suppress(DamagedChunk):
                 yield unpack_chunk(read_chunk(source, entry))

@@ -1,0 +1,302 @@
+"""A folder that a group shares: its members record there, and nothing is read or written through what others laid."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import stat
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import h5py  # noqa: F401  (these three are imported once, and not in each process of another user)
+import numpy as np
+import pyarrow.parquet  # noqa: F401
+import pytest
+import scipy.io  # noqa: F401
+
+from rtloop.commands.law import new_law
+from rtloop.commands.output import write_over
+from rtloop.design.identification.identified import write_new
+from rtloop.design.identification.plots import save
+from rtloop.errors import OutputError, RtloopError
+from rtloop.interchange.export import export
+from rtloop.interchange.formats.table import Table
+from rtloop.interchange.importing import import_data
+from rtloop.interchange.wanted import Wanted
+from rtloop.recording.cutting.cut import cut
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.recover import leftovers, recover
+from rtloop.recording.file.writer import Writer
+from rtloop.recording.load import load
+from rtloop.recording.views.page import write_page
+from rtloop.supervision.quota import Quota
+from tests.recording.hand_made_loop import START_UNIX_NS, final_message, make_header, make_rows, write_recording
+from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
+
+GROUP = 54323
+PRECIOUS = b"the only copy"
+PATIENCE_S = 20
+
+
+@pytest.fixture(autouse=True)
+def patience() -> Iterator[None]:
+    """An open that never returns is a failure, not a test run that never ends."""
+
+    def give_up(*_: object) -> None:
+        raise AssertionError(f"still waiting after {PATIENCE_S} s")
+
+    previous = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(PATIENCE_S)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
+
+
+@pytest.fixture
+def shared() -> Iterator[Path]:
+    """A folder in which all members of a group may write: 2775."""
+    above = Path(tempfile.mkdtemp())
+    above.chmod(0o755)
+    folder = above / "shared"
+    folder.mkdir()
+    os.chown(folder, 0, GROUP)
+    folder.chmod(0o2775)
+    yield folder
+    shutil.rmtree(above)
+
+
+@pytest.fixture
+def precious(shared: Path) -> Path:
+    """A file of the victim's, which nobody else may write."""
+    path = shared.parent / "precious"
+    path.write_bytes(PRECIOUS)
+    os.chown(path, VICTIM, VICTIM)
+    path.chmod(0o600)
+    return path
+
+
+def member(uid: int, function: Callable[[], Any]) -> Any:
+    """What `function` returns in a process of a member of the group, with the umask that such members have."""
+
+    def as_member() -> Any:
+        os.umask(0o002)
+        return function()
+
+    return as_user(uid, as_member, groups=(GROUP,))
+
+
+def recorded(path: Path, count: int = 1_000) -> Callable[[], str]:
+    return lambda: str(write_recording(path, make_rows(count)))
+
+
+def unfinished(path: Path) -> Callable[[], None]:
+    """A recording whose recorder died."""
+
+    def begin() -> None:
+        writer = Writer(path, make_header(), START_UNIX_NS)
+        writer.write_ticks(make_rows(1_000))
+        writer.close()
+
+    return begin
+
+
+def imported(folder: Path) -> Any:
+    table = Table({"time": np.arange(100) * 1e-3, "drive": np.arange(100.0)}, {"time": "s", "drive": "V"}, "time")
+    return import_data(folder / "scan.csv", Wanted(everything=True), table=table)
+
+
+FIGURE = SimpleNamespace(savefig=lambda file, **_: file.write(b"png"))
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "run.mcap.part.new": lambda folder: write_recording(folder / "run.mcap", make_rows(100)),
+    "cut.mcap.cutting.new": lambda folder: cut(folder / "old.mcap", output=folder / "cut.mcap"),
+    "old-recovered.mcap.recovering.new": lambda folder: recover(folder / "old.mcap"),
+    "scan.mcap.importing.new": imported,
+    **{
+        f"old.{end}{part}": lambda folder, to=to: export(folder / "old.mcap", to)
+        for to, end in (("csv", "csv"), ("npz", "npz"), ("mat", "mat"), ("hdf5", "h5"), ("parquet", "parquet"))
+        for part in ("", ".part")
+    },
+    "old.html": lambda folder: write_page(folder / "old.mcap"),
+    "fit.png": lambda folder: save(FIGURE, folder / "fit.png"),
+    "design.toml": lambda folder: write_over(folder / "design.toml", b"new"),
+    "found.toml": lambda folder: write_new(folder / "found.toml", "new"),
+    "lead.py": lambda folder: new_law("lead", folder),
+}
+"""How each file comes to be written, in a folder that holds old.mcap and scan.csv."""
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recording(tmp_path_factory.mktemp("old") / "old.mcap", make_rows(1_000))
+
+
+def outcomes(shared: Path, old: Path, lay: Callable[[Path], None]) -> dict[str, int]:
+    """The exit code of each writer at whose file `lay` had put something before; 0 where it wrote."""
+    for name in WRITERS:
+        folder = shared / name.replace(".", "_")
+        folder.mkdir()
+        os.chown(folder, 0, GROUP)
+        folder.chmod(0o2775)
+        shutil.copy(old, folder / "old.mcap")
+        (folder / "scan.csv").touch()
+        lay(folder / name)
+
+    def write_all() -> dict[str, int]:
+        codes = {}
+        for name, write in WRITERS.items():
+            folder = shared / name.replace(".", "_")
+            codes[name] = 0
+            try:
+                write(folder)
+            except RtloopError as error:
+                codes[name] = error.exit_code
+                if not str(error).startswith(str(folder)) or "\n" in str(error):
+                    raise
+        return codes
+
+    return member(VICTIM, write_all)
+
+
+def laid_by_the_attacker(lay: Callable[[Path], Any]) -> Callable[[Path], None]:
+    def laid(path: Path) -> None:
+        lay(path)
+        os.chown(path, ATTACKER, GROUP, follow_symlinks=False)
+
+    return laid
+
+
+@ROOT_ONLY
+@pytest.mark.parametrize("target", ["precious", "new"])
+def test_nothing_is_written_through_a_link_of_another_user(shared: Path, old: Path, precious: Path, target: str):
+    lay = laid_by_the_attacker(lambda path: path.symlink_to(precious.with_name(target)))
+    assert outcomes(shared, old, lay) == dict.fromkeys(WRITERS, OutputError.exit_code)
+    assert precious.read_bytes() == PRECIOUS
+    assert not precious.with_name("new").exists()
+
+
+@ROOT_ONLY
+def test_a_file_of_another_user_is_not_overwritten(shared: Path, old: Path):
+    def lay(path: Path) -> None:
+        path.write_bytes(b"theirs")
+        path.chmod(0o666)
+
+    assert outcomes(shared, old, laid_by_the_attacker(lay)) == dict.fromkeys(WRITERS, OutputError.exit_code)
+    assert all((shared / name.replace(".", "_") / name).read_bytes() == b"theirs" for name in WRITERS)
+
+
+@ROOT_ONLY
+def test_a_file_with_two_names_keeps_its_content(shared: Path, old: Path, precious: Path):
+    codes = outcomes(shared, old, lambda path: os.link(precious, path))
+    assert precious.read_bytes() == PRECIOUS
+    assert {name for name, code in codes.items() if not code} == {
+        name for name in WRITERS if name.endswith((".new", ".part"))
+    }
+
+
+@ROOT_ONLY
+def test_what_one_wrote_oneself_is_written_again(shared: Path, old: Path):
+    def lay(path: Path) -> None:
+        path.write_bytes(b"ours, and longer than what comes")
+        os.chown(path, VICTIM, GROUP)
+
+    codes = outcomes(shared, old, lay)
+    again = {"old.html", "fit.png", "design.toml", *(name for name in WRITERS if name.endswith((".new", ".part")))}
+    assert {name for name, code in codes.items() if not code} == again
+    assert (shared / "design_toml" / "design.toml").read_bytes() == b"new"
+
+
+@ROOT_ONLY
+def test_a_recording_is_not_begun_through_a_folder_that_another_user_linked(shared: Path, precious: Path):
+    own = precious.with_name("own")
+    own.mkdir()
+    os.chown(own, VICTIM, VICTIM)
+    member(ATTACKER, lambda: (shared / "recordings").symlink_to(own))
+    with pytest.raises(Raised) as caught:
+        member(VICTIM, recorded(shared / "recordings" / "run.mcap"))
+    assert caught.value.exit_code == OutputError.exit_code, caught.value.message
+    assert f"user {ATTACKER}" in caught.value.message
+    assert os.listdir(own) == []
+
+
+@ROOT_ONLY
+def test_honest_members_of_a_group_record_side_by_side(shared: Path):
+    first, second = shared / "first.mcap", shared / "second.mcap"
+    member(VICTIM, recorded(first))
+    member(ATTACKER, recorded(second))
+    for path, uid in ((first, VICTIM), (second, ATTACKER)):
+        status = path.stat()
+        assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (uid, GROUP, 0o644)
+    member(VICTIM, unfinished(shared / "third.mcap"))
+    assert member(VICTIM, lambda: recover(shared / "third.mcap.part")["ticks"]) == 1_000
+    assert member(VICTIM, lambda: cut(second, output=shared / "cut.mcap")["ticks"]) == 1_000
+    assert member(VICTIM, lambda: export(second, "csv", shared / "mine.csv")["ticks"]) == 1_000
+    assert (shared / "mine.csv").stat().st_gid == GROUP
+    assert stat.S_IMODE((shared / "mine.csv").stat().st_mode) == 0o664
+    for _ in range(2):  # the second time over the first
+        member(VICTIM, lambda: str(write_page(second, shared / "mine.html")))
+        member(VICTIM, lambda: write_over(shared / "design.toml", b"new"))
+    assert member(ATTACKER, lambda: len(load(first))) == 1_000
+
+
+def test_a_pipe_among_unfinished_recordings_stops_nobody(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.mcap.part")
+    os.mkfifo(tmp_path / "pipe.mcap")
+    unfinished(tmp_path / "run.mcap")()
+    assert leftovers(tmp_path) == [tmp_path / "run.mcap.part"]
+    for name in ("pipe.mcap.part", "pipe.mcap"):
+        with pytest.raises(RecordingError, match=r"pipe\.mcap.*: not a regular file"):
+            recover(tmp_path / name)
+        with pytest.raises(RecordingError, match="not a regular file"):
+            load(tmp_path / name)
+
+
+@ROOT_ONLY
+def test_unfinished_recordings_of_others_are_not_completed_in_our_name(shared: Path, precious: Path):
+    private = precious.with_name("private")
+    private.mkdir()
+    os.chown(private, VICTIM, VICTIM)
+    member(VICTIM, unfinished(private / "secret.mcap"))
+    member(VICTIM, unfinished(shared / "own.mcap"))
+    member(ATTACKER, unfinished(shared / "theirs.mcap"))
+    member(ATTACKER, lambda: (shared / "laid.mcap.part").symlink_to(private / "secret.mcap.part"))
+    assert member(VICTIM, lambda: [path.name for path in leftovers(shared)]) == ["own.mcap.part"]
+    assert member(VICTIM, lambda: recover(shared / "theirs.mcap.part")["ticks"]) == 1_000  # named, it is recovered
+
+
+@ROOT_ONLY
+def test_a_recording_goes_on_in_its_own_file_alone(shared: Path, precious: Path):
+    """Somebody puts another file in the place of the one that grows."""
+
+    def recorded_meanwhile() -> tuple[bool, list[str]]:
+        writer = Writer(shared / "run.mcap", make_header(), START_UNIX_NS)
+        writer.write_ticks(make_rows(1_000))
+        writer.part.rename(shared / "away")
+        writer.part.symlink_to(precious)
+        lost = not writer.is_there()
+        with pytest.raises(OutputError, match="was removed"):
+            writer.write_ticks(make_rows(1_000, first=1_000))
+        with pytest.raises(OutputError, match="was removed"):
+            writer.finish(lambda logged: final_message(logged, logged))
+        return lost, sorted(os.listdir(shared))
+
+    assert member(VICTIM, recorded_meanwhile) == (True, ["away", "run.mcap.part"])
+    assert precious.read_bytes() == PRECIOUS
+
+
+@ROOT_ONLY
+def test_a_quota_counts_and_removes_no_file_of_another_user(shared: Path):
+    names = [f"test-2025010{day}T000000.mcap" for day in range(1, 4)]
+    for name in names[1:]:
+        member(VICTIM, recorded(shared / name))
+    member(ATTACKER, lambda: shutil.copyfile(shared / names[1], shared / names[0]) and None)
+    member(ATTACKER, lambda: os.truncate(shared / names[0], 1 << 40))
+
+    def removed() -> tuple[list[str], int]:
+        quota = Quota(shared, "test", 1 << 30, 0)
+        return [gone.file.name for gone in quota.keep()], quota.bytes
+
+    assert member(VICTIM, removed) == ([], sum((shared / name).stat().st_size for name in names[1:]))

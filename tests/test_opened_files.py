@@ -1,0 +1,108 @@
+"""Files are opened by `rtloop.hil.trusted`: every other open in the product is found, and has its reason here.
+
+A descriptor becomes a file by `os.fdopen`, which takes nothing else.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import rtloop
+
+PACKAGE = Path(rtloop.__file__).parent
+TRUSTED = "hil/trusted.py"
+OPENS = {"open", "io.open", "os.open", "codecs.open", "os.mkfifo", "os.mknod"}
+METHODS = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "touch", "tofile", "savefig"}
+"""Of a path, an array, a figure."""
+LIBRARIES = {
+    *(f"np.{name}" for name in ("load", "save", "savez", "savez_compressed", "memmap", "fromfile", "loadtxt", "savetxt",
+                                "genfromtxt")),
+    "loadmat", "savemat", "pandas.read_csv", "h5py.File", "zipfile.ZipFile", "gzip.open", "tarfile.open",
+    "pyarrow.parquet.ParquetFile", "pyarrow.parquet.ParquetWriter", "logging.FileHandler", "FileResponse",
+    "shutil.copy", "shutil.copy2", "shutil.copyfile", "shutil.copytree", "click.File", "click.open_file",
+}  # fmt: skip
+"""Functions that take a path, or an open file."""
+FILES = ("file", "opened", "part", "lines", "path_of(", "io.BytesIO(", "HeldFile")
+"""How the first argument of such a function begins where it is an open file."""
+VERBS = {"driver.open", "self._driver.open", "self.open", "loop.open", "self.loop.open", "self.model.open"}
+"""Of a driver, and the open loop's frequency response: no files."""
+
+OF_THE_KERNEL = "a fixed path, which the kernel serves"
+OF_THE_PACKAGE = "a file of the installed package"
+ALLOWED = {
+    ("cli/adapt.py", "click.File"): "named on the command line, or standard input",
+    ("cli/ctl.py", "click.File"): "named on the command line, or standard input",
+    ("configuration/text_files.py", "os.open"): "below a folder that is held open, through no link; kind looked at",
+    ("doctor/host.py", "(self.root / path.lstrip('/')).read_text"): OF_THE_KERNEL,
+    ("doctor/host.py", "(self.root / 'proc/config.gz').read_bytes"): OF_THE_KERNEL,
+    ("doctor/remedy.py", "path.write_text"): OF_THE_KERNEL,
+    ("engine/realtime.py", "os.open"): OF_THE_KERNEL,
+    ("supervision/description.py", "open"): OF_THE_KERNEL,
+    ("supervision/supervisor.py", "Path('/proc/self/stat').read_text"): OF_THE_KERNEL,
+    ("hil/native/cache.py", "path.read_bytes"): OF_THE_PACKAGE,
+    ("laws/registry.py", "Path(file or '').read_text"): OF_THE_PACKAGE,
+    ("panel/web/application.py", "FileResponse"): OF_THE_PACKAGE,
+    ("panel/web/server.py", "webbrowser.open"): "an address, no file",
+    ("interchange/export.py", "archive.open"): "a member of an archive that is open",
+    ("recording/file/mcap/chunkfile.py", "os.open"): "a folder, to be synchronised; nothing is read of it",
+    ("supervision/paths.py", "os.open"): "made anew in a folder that `open_folder` holds",
+}
+"""(module, called): why it opens by itself."""
+
+
+def opens(text: str) -> Iterator[tuple[int, str]]:
+    """Line and function of each call in a source that opens a file by its path."""
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Call) or (called := ast.unparse(node.func)) in VERBS:
+            continue
+        method = called.rpartition(".")[2] if isinstance(node.func, ast.Attribute) else ""
+        given = ast.unparse(node.args[0]) if node.args else ""
+        is_library = called in LIBRARIES or method in ("savefig", "tofile")
+        if called in OPENS or (is_library and not given.startswith(FILES)) or (method in METHODS and not is_library):
+            yield node.lineno, called
+
+
+def sources() -> list[Path]:
+    """Of the whole product; `drivers` and `hil` are links, into which rglob of what is above does not go."""
+    rooms = [path for path in PACKAGE.iterdir() if path.is_dir()]
+    return sorted([*PACKAGE.glob("*.py"), *(path for room in rooms for path in room.rglob("*.py"))])
+
+
+def test_every_file_is_opened_by_the_module_that_looks_at_owners_and_links():
+    assert {path.relative_to(PACKAGE).parts[0] for path in sources()} >= {"drivers", "hil", "panel", "recording"}
+    found = {
+        (module, called, line)
+        for path in sources()
+        if (module := path.relative_to(PACKAGE).as_posix()) != TRUSTED
+        for line, called in opens(path.read_text("utf-8"))
+    }
+    unexplained = sorted(
+        f"{module}:{line}: {called}" for module, called, line in found if (module, called) not in ALLOWED
+    )
+    assert unexplained == [], f"open it by {TRUSTED}, or say in ALLOWED why not"
+    stale = ALLOWED.keys() - {(module, called) for module, called, _ in found}
+    assert stale == set(), "these open nothing any more"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["open(path)", "io.open(path)", "os.open(path, 0)", "path.open()", "(folder / name).open('w')", "path.read_text()",
+     "path.write_bytes(b'')", "np.load(path)", "np.save(folder / name, a)", "rows.tofile(path)", "h5py.File(path, 'w')",
+     "zipfile.ZipFile(path)", "figure.savefig(target, format='png')", "FileResponse(path)", "loadmat(path)",
+     "with pyarrow.parquet.ParquetFile(path) as file: pass"],
+)  # fmt: skip
+def test_an_open_by_a_path_is_found(text: str):
+    assert [line for line, _ in opens(text)] == [1]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["os.fdopen(open_named(path))", "np.load(file)", "driver.open()", "loop.open(hz)", "figure.savefig(file, dpi=110)",
+     "h5py.File(path_of(opened), 'r')", "read_text(path)", "load(config)"],
+)  # fmt: skip
+def test_an_open_file_is_none(text: str):
+    assert list(opens(text)) == []
