@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import OutputError, writing
+from rtloop.errors import ConfigError, OutputError, writing
 from rtloop.hil.trusted import make_file
+from rtloop.laws.limited.first import try_first
 from rtloop.laws.registry import BUILT_IN, kinds, law_class, reference
 
 LAW = '''"""{title}: what it does, and where its equation is from.
@@ -106,11 +107,15 @@ def known_laws() -> list[dict[str, Any]]:
             "problem": None,
         }
         try:
+            if kind not in BUILT_IN:
+                try_first(f"law {kind!r}", reference, kind)
             law = law_class(reference(kind))
             about = next(iter((law.__doc__ or "").strip().splitlines()), None)
             entry |= {"slot": law.records().slot, "about": about}
         except ValueError as error:
             entry["problem"] = str(error)
+        except ConfigError as error:
+            entry["problem"] = "; ".join(error.faults)
         found.append({**entry, "shipped": kind in BUILT_IN, "defined_in": where})
     return found
 

@@ -17,6 +17,7 @@ from rtloop.configuration.text_files import read_text
 from rtloop.drivers.base import Driver
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
+from rtloop.laws.limited.first import try_first
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
@@ -52,9 +53,15 @@ def replay_on_the_rig(
 
 
 def trust_in(files: Sequence[Path], recorded: bool) -> Trust:
-    """What a replay may run: the laws in these files, and those in the recording itself. Raises RecordingError."""
+    """What a replay may run: the laws in these files, and those in the recording itself.
+
+    Raises RecordingError, and ConfigError for a law that does not come to an end, or ends the process.
+    """
+    texts = {str(path): read_text(path) for path in files}
+    for file, text in texts.items():
+        try_first(file, laws_in, text, file)
     try:
-        laws = [law for path in files for law in laws_in(read_text(path), str(path))]
+        laws = [law for file, text in texts.items() for law in laws_in(text, file)]
     except ValueError as error:
         raise RecordingError(str(error)) from None
     return Trust(tuple(laws), recorded)

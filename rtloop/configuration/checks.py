@@ -21,6 +21,7 @@ from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
 from rtloop.hil.options import RigOptions
 from rtloop.laws.contract import Controller, CoupledController
+from rtloop.laws.limited.first import must_be_limited, run_limited
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import ControllerOptions
 from rtloop.laws.shipped.transfer import TransferController
@@ -129,7 +130,15 @@ class AxisCheck:
 
 
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
-    """Of every axis, in their order; what is wrong with one goes to `findings`."""
+    """Of every axis, in their order; what is wrong with one goes to `findings`.
+
+    In the limited process where a law is somebody's own. Raises ConfigError for what its code does wrong there.
+    """
+    if must_be_limited(configuration.laws):
+        checks, limited = run_limited(configuration.source, _checks_and_findings, configuration)
+        findings.faults += limited.faults
+        findings.warnings += limited.warnings
+        return checks
     found = list[AxisCheck]()
     for number, axis in enumerate(configuration.axes):
         if len(configuration.together(number)) == 1:
@@ -142,6 +151,12 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
             with findings.at(f"axis.{axis.name}.controller: "):
                 connect(law, owned, list(configuration.inputs), configuration.outputs)
     return found
+
+
+def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck], Findings]:
+    """As `check_axes`, for another process."""
+    findings = Findings()
+    return check_axes(configuration, findings), findings
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:

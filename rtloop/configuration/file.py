@@ -16,7 +16,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from rtloop.configuration.axis import AxisOptions, ReferenceOptions
 from rtloop.configuration.extras import NAME, ExtraInputOptions, ExtraOutputOptions, extra_faults
-from rtloop.configuration.laws import DEFAULT_LAWS, Library
+from rtloop.configuration.laws import DEFAULT_LAWS, Library, names_own_laws
 from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.drivers.base import Wiring
@@ -26,6 +26,7 @@ from rtloop.errors import ConfigError
 from rtloop.hil.options import LARGEST_INTEGER, Options
 from rtloop.law.layout import MAX_LAWS
 from rtloop.laws.contract import ANY_NUMBER
+from rtloop.laws.limited.first import must_be_limited, try_first
 from rtloop.laws.registry import LawReference, law_class
 from rtloop.recording.capture.conditions import comparison_of
 
@@ -186,11 +187,16 @@ def load(path: str | Path) -> Configuration:
 
 def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:
     """Check a configuration's text; relative paths in it start at `folder`, where laws are found, too, unless a
-    `library` is given. Raises ConfigError with all faults."""
+    `library` is given. Raises ConfigError with all faults.
+
+    Where it names somebody's own laws, it is checked in the limited process first: checking runs their files.
+    """
     try:
         raw = parse_toml(text)
     except ValueError as error:
         raise ConfigError(source, [str(error)]) from None
+    if names_own_laws(raw) if library is None else must_be_limited(library.loaded or ()):
+        try_first(source, parse, text, name, folder, source, library)
     driver = raw.pop("driver", None)
     faults: list[str] = []
     library = library or Library(folder)

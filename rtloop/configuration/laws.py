@@ -13,7 +13,7 @@ from rtloop.configuration.text_files import InputFileError, read_text
 from rtloop.law.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER, Controller, CoupledController, Feedforward, Law
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
-from rtloop.laws.registry import LawReference, from_text, law_class, reference
+from rtloop.laws.registry import BUILT_IN, LawReference, from_text, kinds, law_class, reference
 
 FEEDFORWARD, CONTROLLER = "prandtl_ishlinskii", "transfer"
 """Where a table names no law."""
@@ -44,6 +44,21 @@ class Library:
             there = ", ".join(law.kind for law in loaded)
             raise ValueError(f"{file or kind or default!r} is no law that the running loop has loaded; it has {there}")
         return wanted[0]
+
+
+def names_own_laws(raw: Mapping[str, Any]) -> bool:
+    """Whether a configuration's plain values name a law that is not shipped: a file, or an installed kind."""
+    axes, loop = raw.get("axis"), raw.get("loop")
+    tables = [table for axis in (axes if isinstance(axes, list) else ()) if isinstance(axis, Mapping)
+              for table in (axis.get("feedforward"), axis.get("controller")) if isinstance(table, Mapping)]  # fmt: skip
+    standing_by = loop.get("laws") if isinstance(loop, Mapping) else None
+    names = [*(table.get("kind") for table in tables), *(standing_by if isinstance(standing_by, list) else ())]
+    others = {name for name in names if isinstance(name, str)} - BUILT_IN.keys()
+    return (
+        any(table.get("file") for table in tables)
+        or any(name.endswith(".py") for name in others)
+        or not others.isdisjoint(kinds() if others else ())
+    )
 
 
 HERE = Library()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
 from rtloop.laws.binding import functions_of
 from rtloop.laws.contract import Controller
+from rtloop.laws.limited.first import must_be_limited, run_limited
 from rtloop.signals import Mode
 
 MOST_TICKS = 2**53
@@ -43,7 +45,13 @@ class Prepared:
 
 
 def prepare(configuration: Configuration, *, duration_s: float | None = None, paced: bool = True) -> Prepared:
-    """Build law, references and schedule. Raises ConfigError with all faults, DriverError for a missing library."""
+    """Build law, references and schedule; in the limited process where a law is somebody's own.
+
+    Raises ConfigError with all faults, DriverError for a missing library.
+    """
+    if must_be_limited(configuration.laws):
+        job = partial(prepare, duration_s=duration_s, paced=paced)
+        return run_limited(configuration.source, job, configuration, compiles=True)
     findings, rate_hz = Findings(), configuration.loop.rate_hz
     facts = _facts(configuration, paced, findings)
     if configuration.loop.enable_input is not None:

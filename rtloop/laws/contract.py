@@ -31,6 +31,7 @@ import numpy as np
 
 from rtloop.law.layout import whole_lines
 from rtloop.law.memory import LawRecords, Rules
+from rtloop.laws.limited.announced import announce
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOptions
 
 ANY_NUMBER = -1
@@ -164,8 +165,16 @@ def _record(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
     return whole_lines(sorted(found, key=lambda field: -int(np.prod(field[2]))))
 
 
+def _announce(law: Law) -> None:
+    """Say that functions of a law are called next, where it is of somebody's own."""
+    if not law.shipped:
+        of = getattr(law.options, "law", None)
+        announce(law.kind, of.file if of is not None else type(law).__module__)
+
+
 def record_of(law: Law) -> Any:
     """The coefficients that a law builds, shape (1,). Raises ValueError for a name or a shape that does not fit."""
+    _announce(law)
     dtype = law.records().coefficients
     found = np.zeros(1, dtype)
     for name, value in law.build().items():

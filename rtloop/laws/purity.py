@@ -7,12 +7,21 @@ from typing import Any
 
 _DEFINED = re.compile(r'^define [^@]*@"?([^"(]+)"?\(.*?^\}', re.MULTILINE | re.DOTALL)
 _CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
+_CALLED_BY_ADDRESS = re.compile(r'\b(?:call|invoke)\b[^@"\n]*?(?:%"?[\w.$-]+"?\(|inttoptr \()')
+ADDRESS = "an address"
 LIBM = "differs between processors in its last bits, so that a replay might"
+UNKNOWN = "is outside of the law, and may wait"
 _MATHEMATICS = {
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "sincos"),
     *("exp", "exp2", "exp10", "log", "log2", "log10", "pow", "powi", "ldexp", "frexp"),
 }
 """Of LLVM's intrinsics, those that become calls of the processor's own library."""
+_LIBRARY = _MATHEMATICS | {
+    *("asinh", "acosh", "atanh", "atan2", "expm1", "log1p", "logb", "cbrt", "hypot", "erf", "erfc", "gamma"),
+    *("lgamma", "tgamma", "fmod", "remainder", "modf", "fma", "nextafter", "copysign", "fabs", "sqrt"),
+    *("floor", "ceil", "round", "rint", "trunc", "nearbyint"),
+}
+"""Of the C library, the mathematics; each also for numbers of 32 bits, with an `f` behind it."""
 
 
 def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, str]:
@@ -26,6 +35,8 @@ def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, 
         if name in seen:
             continue
         seen.add(name)
+        if _CALLED_BY_ADDRESS.search(bodies[name]):
+            outside.add(ADDRESS)
         for called in _CALLED.findall(bodies[name]):
             if called in bodies:
                 pending.append(called)
@@ -36,6 +47,7 @@ def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, 
 
 
 def _reason(name: str) -> str:
+    """Why a law may not call what has this name; empty where it may."""
     if name.startswith("llvm."):
         function = name.split(".")[1]
         return LIBM if function in _MATHEMATICS else ""
@@ -43,4 +55,4 @@ def _reason(name: str) -> str:
         return "takes memory, which may wait"
     if name.startswith(("Py", "numba_")):
         return "needs the interpreter, which may wait"
-    return LIBM
+    return LIBM if name in _LIBRARY or name.removesuffix("f") in _LIBRARY else UNKNOWN

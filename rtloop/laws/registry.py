@@ -6,6 +6,7 @@ travels as its text, so that every process runs the very same.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import sys
@@ -19,6 +20,7 @@ from types import ModuleType
 
 from rtloop.law.memory import Layout
 from rtloop.laws.contract import Law
+from rtloop.laws.limited.announced import announce, is_limited
 
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
@@ -64,6 +66,7 @@ def reference(kind: str) -> LawReference:
     if kind not in known:
         raise ValueError(f"{kind!r} is not a known law; there are {', '.join(known)}")
     module = known[kind].partition(":")[0]
+    announce(kind, module)
     try:
         file = inspect.getsourcefile(import_module(module))
         return from_text(Path(file or "").read_text(encoding="utf-8"), str(file), kind)
@@ -73,12 +76,18 @@ def reference(kind: str) -> LawReference:
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
     """All laws that a text defines. Raises ValueError where it cannot be run."""
+    announce(Path(file).stem, file)
+    return _laws_in(text, file)
+
+
+def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
     return tuple(LawReference(kind, text, file) for kind in sorted(_classes(_module(text, file))))
 
 
 def from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     """The law that a text defines; `kind` says which, where there are several. Raises ValueError."""
-    found = {law.kind: law for law in laws_in(text, file)}
+    announce(kind or Path(file).stem, file)
+    found = {law.kind: law for law in _laws_in(text, file)}
     if kind is None and len(found) == 1:
         return next(iter(found.values()))
     if kind not in found:
@@ -90,6 +99,7 @@ def from_text(text: str, file: str, kind: str | None = None) -> LawReference:
 def law_class(law: LawReference) -> type[Law]:
     """The class of a law. Raises ValueError where its text cannot be run."""
     if law.text:
+        announce(law.kind, law.file)
         return _classes(_module(law.text, law.file))[law.kind]
     module, _, name = BUILT_IN[law.kind].partition(":")
     return getattr(import_module(module), name)
@@ -108,7 +118,9 @@ def _module(text: str, file: str) -> ModuleType:
     module.__file__ = file
     sys.modules[name] = module
     try:
-        exec(compile(text, file, "exec"), module.__dict__)
+        # stdout belongs to the command, or to the supervisor; a limited process has none of its own
+        with contextlib.nullcontext() if is_limited() else contextlib.redirect_stdout(sys.stderr):
+            exec(compile(text, file, "exec"), module.__dict__)
     except Exception as error:
         del sys.modules[name]
         raise ValueError(f"{file}: cannot be run: {_said(error)}") from error

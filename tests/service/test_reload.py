@@ -96,3 +96,19 @@ def test_a_reference_that_was_refused_is_played_by_the_next_reload(live):
     live._staging.desk.refuses.clear()
     assert live.replace_all(other) == [f"axis.{SECOND}"]
     assert live._staging.desk.taken == [(Kind.SET_REFERENCE, 0), (Kind.SET_REFERENCE, 1)]
+
+
+def test_undo_leaves_the_reference_that_came_after_the_change(live, monkeypatch: pytest.MonkeyPatch):
+    """A tuned limit, then a reload of which the reference of that axis was taken: the limit alone goes back."""
+    monkeypatch.setattr("rtloop.service.changing.live.prepare_limited", prepare)
+    live.tune(FIRST, "interlocks", {"position_um": 50.0})
+    text = TEXT.replace("levels = [10.0, 0.0]", "levels = [5.0, 0.0]").replace("amplitude = 20.0", "amplitude = 9.0")
+    text = text.replace(*TIGHTER)
+    other = prepare(parse(text, "lab", DEPLOY, "lab.toml"), paced=False)
+    live._staging.desk.refuses.add((Kind.SET_REFERENCE, 1))
+    with pytest.raises(Refused, match="changed already"):
+        live.replace_all(other)
+    live.undo(FIRST)
+    first = live.as_it_runs["values"]["axis"][0]
+    assert first["reference"] == other.configuration.axes[0].reference.model_dump(mode="json", exclude_unset=True)
+    assert positions_um(live) == [60.0, 50.0]

@@ -12,6 +12,7 @@ from typing import Any
 
 from rtloop.law.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER
+from rtloop.laws.limited.first import try_first
 from rtloop.laws.registry import BUILT_IN, LawReference, kinds, law_class, layout_of, reference
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
@@ -79,9 +80,10 @@ def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawR
             f"{where}: is not installed here as it ran there (sha256 {str(digest)[:12]}…); --law FILE names the file, "
             "and --trust-recorded-law runs the text that the recording holds"
         )
-    law = LawReference(name, str(text), f"law {name!r} in {recording.paths[0]}")
+    law = LawReference(name, str(text), str(recording.paths[0]))
     if law.sha256 != digest:
         raise RecordingError(f"{where}: its recorded text is not the one that ran: the sha256 differs")
+    try_first(law.file, law_class, law)
     try:
         layout_of([law])
     except (ValueError, KeyError) as error:
@@ -92,6 +94,7 @@ def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawR
 def _installed(name: str) -> tuple[LawReference, ...]:
     if name in BUILT_IN or name not in kinds():
         return ()
+    try_first(f"law {name!r}", reference, name)
     try:
         return (reference(name),)
     except ValueError:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from rtloop.configuration.file import describe
 from rtloop.configuration.references import read_samples
 from rtloop.errors import ConfigError
 from rtloop.recording.file.topics.events import OPERATOR
-from rtloop.service.api.asking import asking, lock
+from rtloop.service.api.asking import asking, lock, watching_client
 from rtloop.service.api.bodies import (
     MAX_BODY_BYTES,
     Body,
@@ -247,10 +247,13 @@ async def _read(request: Request) -> bytes:
 async def _answer(service: Service, lanes: Lanes, connection: HTTPConnection, path: str, data: bytes | str) -> Response:
     """Validate, act in a thread, and answer."""
     body, _, action = ACTIONS[path]
+    lane = LANES.get(path, Lane.ORDINARY)
+    measures = lane is Lane.MEASUREMENT and isinstance(connection, Request)
     try:
         wanted = None if body is None else body.model_validate_json(data)
         with asking(service, connection, path, wanted):
-            return JSONResponse(await lanes.run(LANES.get(path, Lane.ORDINARY), action, service, wanted))
+            async with watching_client(connection) if measures else nullcontext():
+                return JSONResponse(await lanes.run(lane, action, service, wanted))
     except asyncio.CancelledError:  # whoever still waits as the server comes to its end
         return refused(503, f"{path.removeprefix('/')}: the service ends")
     except Exception as error:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+import asyncio
+import threading
+from collections.abc import AsyncIterator
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from typing import Any
 from urllib.parse import parse_qs
 
-from starlette.requests import HTTPConnection
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 
 from rtloop.errors import ConfigError
@@ -14,6 +17,7 @@ from rtloop.recording.file.topics.events import OPERATOR, name_fault
 from rtloop.service.api.bodies import LockBody
 from rtloop.service.api.refusals import refusal
 from rtloop.service.desk import NOBODY, Asker, asked_by
+from rtloop.service.measuring.client_presence import on_behalf_of
 from rtloop.service.service import Service
 
 
@@ -45,6 +49,24 @@ def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -
         return asked_by(Asker(_name(connection)))
     except ConfigError:
         return asked_by(NOBODY)
+
+
+@asynccontextmanager
+async def watching_client(request: Request) -> AsyncIterator[None]:
+    """Work on a request whose body was read; the work in between can ask whether the client's connection stands."""
+    gone = threading.Event()
+
+    async def watch() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+        gone.set()
+
+    watcher = asyncio.create_task(watch())
+    try:
+        with on_behalf_of(lambda: not gone.is_set()):
+            yield
+    finally:
+        watcher.cancel()
 
 
 def lock(service: Service, connection: HTTPConnection, data: bytes | None) -> Response:

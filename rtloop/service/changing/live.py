@@ -6,6 +6,7 @@ import threading
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError, RtloopError
+from rtloop.laws.limited.first import must_be_limited, try_first
 from rtloop.service.changing.building import figures_limited, prepare_limited
 from rtloop.service.changing.changes import Change, Changes
 from rtloop.service.changing.preview import Figures
@@ -184,6 +186,8 @@ class LiveLaw:
         """An axis with the laws that the loop has loaded. Raises ConfigError."""
         configuration = self.prepared.configuration
         library = Library(configuration.folder, configuration.laws)
+        if must_be_limited(configuration.laws):
+            try_first("change", partial(AxisOptions.model_validate, context={"library": library}), raw)
         try:
             return AxisOptions.model_validate(raw, context={"library": library})
         except ValidationError as error:

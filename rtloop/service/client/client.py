@@ -7,7 +7,6 @@ import json
 import socket
 import struct
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -87,8 +86,10 @@ class Client:
         except KeyboardInterrupt:
             if held is None:
                 raise LoopFault("interrupted") from None
-            with suppress(RtloopError):
+            try:
                 self.post("/setpoint", {"axis": axis, "value": held})
+            except RtloopError as error:
+                raise LoopFault(f"interrupted; the service ends it, and no setpoint was taken: {error}") from None
             raise LoopFault(f"interrupted; axis {axis} holds {held:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:

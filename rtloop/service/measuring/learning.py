@@ -15,6 +15,7 @@ from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
+from rtloop.service.measuring.client_presence import client_waits, require_client
 from rtloop.service.measuring.playing import Player
 from rtloop.signals import FEED, POSITION, REFERENCE
 from rtloop.supervision.supervisor import Supervisor
@@ -60,7 +61,8 @@ def learn(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Lea
 
     Raises ConfigError for what can be granted in no state, and for a loop in which learning would not converge; Refused
     for what this state does not allow, and where it was given up: the loop then plays the best table, or holds what it
-    held, unless it tripped or somebody else has set a reference.
+    held, unless it tripped or somebody else has set a reference. Raises ClientGone where the client went away before
+    the end: the loop then holds what it held, for nobody has seen what a table does.
     """
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
@@ -76,15 +78,21 @@ def learn(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Lea
         player.read(player.play(glide), len(glide))
         ended = _taught(player, teacher, asked, settle, judged, tried)
         player.play(tried.best, repeat=True)
-    except RtloopError:
+        require_client("learn")
+    except Exception:
         if player.ours:
             with suppress(RtloopError):
-                if tried.tables:
-                    player.play(tried.best, repeat=True)
-                else:
-                    player.hold(player.hold_um)
+                _leave(player, tried)
         raise
     return Learned(tried.cycles, tried.best, ended)
+
+
+def _leave(player: Player, tried: _Tried) -> None:
+    """Play the best table that was judged, for a client that still waits; else hold what was held. Raises Refused."""
+    if tried.tables and client_waits():
+        player.play(tried.best, repeat=True)
+    else:
+        player.hold(player.hold_um)
 
 
 class _Tried:

@@ -1,7 +1,8 @@
 """The response of a loop that runs: multisines about the reference that it holds, played, watched, taken back.
 
-What is played ends at the value that was held, so that the loop comes back to it whatever becomes of who asked, and of
-the service. What is measured is read off the ring that the recorder reads, and is in the recording.
+What is played ends at the value that was held, so that the loop comes back to it whatever becomes of the service; a
+client that goes away ends it at once. What is measured is read off the ring that the recorder reads, and is in the
+recording.
 """
 
 from __future__ import annotations

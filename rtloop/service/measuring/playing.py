@@ -15,6 +15,7 @@ from rtloop.engine.ring import drain
 from rtloop.hil.modal import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
+from rtloop.service.measuring.client_presence import require_client
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 
@@ -24,10 +25,11 @@ REST_S, POLL_S, PATIENCE_S = 0.2, 0.02, 2.0
 class Player:
     """Plays on axis `number` about the constant that it holds; `doing` says what for in every refusal.
 
-    Raises Refused where the reference is none that is held.
+    Raises Refused where the reference is none that is held, ClientGone where nobody waits for what it would play.
     """
 
     def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, doing: str) -> None:
+        require_client(doing)
         self._supervisor, self._live, self._number, self._doing = supervisor, live, number, doing
         self.axis = live.prepared.plan.axes[number]
         self.rate_hz = live.prepared.configuration.loop.rate_hz
@@ -61,7 +63,8 @@ class Player:
         return rows[:, signals.axis_column(self._number, signal)]
 
     def read(self, first: int, count: int, judge: Callable[[Real], None] = lambda _: None) -> Real:
-        """Records of `count` ticks from `first` on, as they come. Raises Refused as soon as one is not fit.
+        """Records of `count` ticks from `first` on, as they come. Raises Refused as soon as one is not fit, and
+        ClientGone as soon as nobody waits for them.
 
         `judge` may refuse, too: it is handed the position of the records that have come.
         """
@@ -69,6 +72,7 @@ class Player:
         rows = np.empty((count, ring.slots.shape[1]))
         there, deadline_s = 0, time.monotonic() + (first + count - self.tick) / self.rate_hz + PATIENCE_S
         while there < count:
+            require_client(self._doing)
             copied, _, lost = drain(ring, first + there, rows[there:])
             if lost:
                 raise Refused(f"{self._doing}: ticks were lost before they could be read")

@@ -1,0 +1,138 @@
+"""Whatever the code of somebody's own law does: one sentence that names it, exit code 78, and this process goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rtloop.cli import main
+from rtloop.configuration.file import parse
+from rtloop.configuration.prepare import prepare
+from rtloop.errors import ConfigError
+from rtloop.laws.limited import first
+from rtloop.laws.limited.process import MOST_PRINTED, PROCESS, LimitedProcess
+from rtloop.laws.registry import from_text
+from rtloop.service.service import Service
+from tests.faults.evidence import wait_for
+from tests.laws.failing import text as law_text
+from tests.laws.test_replay import CONFIGURATION, recorded
+from tests.paper_configuration import PAPER, TEXT
+
+LIMIT_S = 0.5
+"""For a law that does not end."""
+BUILD = "    def build(self):\n"
+NASTY = "class Nasty(Exception):\n    def __str__(self):\n        raise OSError('no words')\nraise Nasty\n"
+THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daemon=True).start()\n"
+PROCESS_LEFT = "import os, time\nif not (pid := os.fork()):\n    time.sleep(1e6)\nopen('pid', 'w').write(str(pid))\n"
+AT_IMPORT = {
+    "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was given up"),
+    "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+    "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt"),
+    "raises what has no words": (NASTY, "raised OSError: no words"),
+    "ends its process": ("import os\nos._exit(0)\n", "ended its process (exit code 0)"),
+    "reads where nothing is": ("import ctypes\nctypes.string_at(0)\n", "ended its process (SIGSEGV)"),
+    "prints for ever": ("while True:\n    print('x' * 1000)\n", f"printed more than {MOST_PRINTED >> 10} KiB"),
+    "closes stdout": ("import sys\nsys.stdout.close()\n", "closed stdout"),
+    "closes the file of stdout": ("import os\nos.close(1)\n", "closed stdout"),
+    "replaces stdout": ("import io, sys\nsys.stdout = io.StringIO()\n", "replaced stdout"),
+    "leaves a thread": (THREAD, "left 1 thread running"),
+}
+IN_BUILD = {
+    "never ends": ("while True: pass", f"took longer than {LIMIT_S:g} s and was given up"),
+    "reads where nothing is": ("import ctypes; ctypes.string_at(0)", "ended its process (SIGSEGV)"),
+    "looks for what is not there": ("{}['gain']", "raised KeyError: 'gain'"),
+}
+
+
+@pytest.fixture(autouse=True)
+def limit() -> Iterator[None]:
+    """The limit is as it was after each test."""
+    limit_s = PROCESS.limit_s
+    yield
+    PROCESS.limit_s = limit_s
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """A configuration with a law of this text."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(text: str) -> Path:
+        Path("mine.py").write_text(text)
+        Path("lab.toml").write_text(CONFIGURATION)
+        return Path("lab.toml")
+
+    return write
+
+
+def is_refused(sentence: str, *arguments: object, file: object = "mine.py") -> None:
+    """The command ends with 78, and with one sentence that names the law and what it did."""
+    ran = CliRunner().invoke(main, [str(one) for one in arguments])
+    assert (ran.exit_code, f"law 'mine' ({file}): {sentence}" in ran.stderr) == (78, True), ran.output
+    assert isinstance(ran.exception, SystemExit)
+    assert "Traceback" not in ran.output
+
+
+@pytest.mark.parametrize("name", AT_IMPORT)
+def test_a_file_that_does_as_it_is_read(name: str):
+    """By itself: what commands do with it is below."""
+    text, sentence = AT_IMPORT[name]
+    PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
+    with pytest.raises(ConfigError) as refusal:
+        first.try_first("lab.toml", from_text, text + law_text(), "mine.py", "mine")
+    assert refusal.value.faults == [f"law 'mine' (mine.py): {sentence}"]
+    assert refusal.value.exit_code == 78
+
+
+@pytest.mark.parametrize("name", IN_BUILD)
+def test_a_law_that_does_as_it_is_built(own: Callable[[str], Path], name: str):
+    line, sentence = IN_BUILD[name]
+    PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
+    is_refused(sentence, "design", "verify", own(law_text().replace(BUILD, f"{BUILD}        {line}\n")))
+
+
+def test_every_command_that_reads_a_law_is_protected(own: Callable[[str], Path]):
+    config = own("raise SystemExit\n" + law_text())
+    for command in (("run", config), ("design", "verify", config), ("doctor", config), ("park", config)):
+        is_refused("raised SystemExit", *command)
+    with pytest.raises(ConfigError, match=r"law 'mine' \(mine.py\): raised SystemExit"):
+        Service(config)
+
+
+def test_a_law_that_is_built_for_a_run_is_protected(own: Callable[[str], Path]):
+    config = own(law_text().replace(BUILD, f"{BUILD}        raise SystemExit\n"))
+    is_refused("raised SystemExit", "run", config)
+
+
+def test_a_replay_reads_a_law_as_carefully(own: Callable[[str], Path], tmp_path: Path):
+    """The file that is named, and the recorded text that is trusted: it ended well when it was recorded."""
+    trigger = tmp_path / "trigger"
+    text = f"import pathlib\nif pathlib.Path({str(trigger)!r}).exists():\n    raise SystemExit\n" + law_text()
+    run = recorded(tmp_path, text)
+    trigger.touch()
+    is_refused("raised SystemExit", "replay", run, "--trust-recorded-law", file=run)
+    Path("mine.py").write_text(text + "# as it is now\n")
+    is_refused("raised SystemExit", "replay", run, "--law", "mine.py")
+
+
+def test_what_a_refused_law_started_is_ended(own: Callable[[str], Path]):
+    is_refused("left a process running", "check", own(PROCESS_LEFT + law_text()))
+    status = Path("/proc", Path("pid").read_text(), "status")
+    wait_for(lambda: not status.exists() or "State:\tZ" in status.read_text(), "the end of the process", 10.0)
+
+
+def test_what_build_prints_is_shown_and_no_part_of_an_answer(own: Callable[[str], Path]):
+    config = own("print('read')\n" + law_text().replace(BUILD, f"{BUILD}        print('built')\n"))
+    ran = CliRunner().invoke(main, ["check", str(config), "--json"])
+    assert (ran.exit_code, "built" in ran.stderr, ran.stdout[:1]) == (0, True, "{"), ran.output
+    assert "read" not in ran.stdout
+
+
+def test_a_shipped_law_needs_no_process(monkeypatch: pytest.MonkeyPatch):
+    process = LimitedProcess()
+    monkeypatch.setattr(first, "PROCESS", process)
+    prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
+    assert process.pid is None
