@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.references import extent, volts
@@ -88,10 +88,11 @@ def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
 
 def _latency(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     """A model that knows less delay than the simulated rig has."""
-    if axis.model is not None and check.delay_ticks > axis.model.delay_ticks:
+    of_rig = rig_delay_ticks(configuration)
+    if axis.model is not None and axis.model.delay_ticks < of_rig:
         yield (
             f"axis.{axis.name}.model.delay_ticks: {axis.model.delay_ticks}, but the simulated rig has "
-            f"driver.latency_ticks = {check.delay_ticks}; the loop is judged with that"
+            f"driver.latency_ticks = {of_rig}; the loop is judged with {check.delay_ticks}"
         )
 
 
