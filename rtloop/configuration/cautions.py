@@ -11,8 +11,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.references import extent, volts
-from rtloop.engine.messages import ALL_AXES, Kind
+from rtloop.configuration.references import extent, planned_references, volts
 from rtloop.hil.options import RigOptions
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.law.reference import Generator
@@ -52,15 +51,7 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
     """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
     limits, plan = axis.limits, prepared.plan
-    number, mode = plan.axes.index(axis.name), plan.mode
-    generator = plan.generators[number]
-    asked = [("reference", mode, [float(generator["kind"]), *generator["parameters"].tolist()])]
-    for command in plan.schedule:
-        if command["kind"] == Kind.SET_MODE:
-            mode = Mode(int(command["values"][0]))
-        elif command["kind"] == Kind.SET_REFERENCE and command["axis"] in (ALL_AXES, number):
-            asked.append((f"reference from tick {command['tick']} on", mode, command["values"].tolist()))
-    for where, mode, values in asked:
+    for where, mode, values in planned_references(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
         added = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
         lowest, highest = extent(values, plan.table[first : first + count])
