@@ -23,6 +23,11 @@ PROVOKED = [
     ((("gain = 0.016", "gain = 0.030"),), "controller: gain margin 1.37, below margins.gain = 1.5"),
     (((INTERLOCKS, f"[axis.margins]\nphase_deg = 80.0\n{INTERLOCKS}"),), "controller: phase margin 73.1°, below"),
     (((INTERLOCKS, f"[axis.margins]\nsensitivity = 1.2\n{INTERLOCKS}"),), "controller: max |S| 1.65, above"),
+    (
+        (("gain = 0.016", "gain = -1e-5"),),
+        "controller: a step of 1 µm ends at -0.6 µm: the loop's gain at 0 Hz has the wrong",
+    ),
+    ((("gain = 0.016", "gain = 1e-9"),), "µm: the loop does not follow its reference"),
     (((LIMITS, "command_um = 19.0"),), "reference: reaches 20 µm, beyond limits.command_um = 19"),
     (((LIMITS, "command_um = 44.0"),), "limits.command_um: 44 µm; the drive's limits end at 43.02 µm"),
     (((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"), RAW), "reference: -20 V … 20 V, beyond the drive's limits"),

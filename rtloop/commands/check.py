@@ -23,6 +23,7 @@ from rtloop.errors import ConfigError
 from rtloop.supervision.host_delay import SpentMargin, measured_delay, spent_margin
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console as _console
+from rtloop.terminal.table import figure
 from rtloop.values import counted
 
 ROWS = (
@@ -32,8 +33,8 @@ ROWS = (
     ("gain margin", lambda loop: f"{loop.gain_margin:.3f}"),
     ("max |S|", lambda loop: f"{loop.max_sensitivity:.3f} at {loop.max_sensitivity_hz:.1f} Hz"),
     ("static error", lambda loop: f"{loop.static_error_percent:.4f} %"),
-    ("settling (5 %)", lambda loop: f"{1e3 * loop.settling_time_s:.2f} ms"),
-    ("overshoot", lambda loop: f"{loop.overshoot_percent:.2f} %"),
+    ("settling (5 %)", lambda loop: figure(1e3 * loop.settling_time_s, 2, " ms")),
+    ("overshoot", lambda loop: figure(loop.overshoot_percent, 2, " %")),
     ("peak of v per unit step", lambda loop: f"{loop.peak_command:.4f}"),
 )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.analysis.step_response import SETTLING_BAND
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
@@ -40,12 +41,27 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     found, asked = check.margins, axis.margins
     if found is None or check.on_model is None or not check.on_model.is_stable:
         return  # there is no margin, and preparing it has said so
+    if (problem := tracking_problem(check)) is not None:
+        yield f"controller: {problem}"
     if found.gain_margin < asked.gain:
         yield f"controller: gain margin {found.gain_margin:.3g}, below margins.gain = {asked.gain:g}"
     if found.phase_margin_deg < asked.phase_deg:
         yield f"controller: phase margin {found.phase_margin_deg:.3g}°, below margins.phase_deg = {asked.phase_deg:g}"
     if found.max_sensitivity > asked.sensitivity:
         yield f"controller: max |S| {found.max_sensitivity:.3g}, above margins.sensitivity = {asked.sensitivity:g}"
+
+
+def tracking_problem(check: AxisCheck) -> str | None:
+    """Why a stable loop does not follow its reference at rest; None where it does, or where no loop is known."""
+    if check.on_model is None or not check.on_model.is_stable:
+        return None
+    final, _ = check.on_model.final
+    if abs(1 - final) <= SETTLING_BAND:
+        return None
+    share = f"a step of 1 µm ends at {final:.3g} µm"
+    if final < 0 or final > 1:
+        return f"{share}: the loop's gain at 0 Hz has the wrong sign"
+    return f"{share}: the loop does not follow its reference"
 
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
