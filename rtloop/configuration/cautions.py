@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,23 +19,39 @@ from rtloop.hysteresis.plays import loading_curve
 from rtloop.law.reference import Generator
 from rtloop.signals import Mode
 
+HIGHEST_MEASURED_HZ = 100_000
+"""Of a loop that sleeps or spins until its ticks."""
 SAME_SCALE = 0.01
 """Scales that differ by more than this part are different."""
 
 
 def cautions(prepared: Prepared) -> list[str]:
     """Warnings about every axis of a configuration that can run."""
-    configuration, found = prepared.configuration, []
+    configuration = prepared.configuration
+    found = [f"loop.{line}" for line in _pacing(configuration)]
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
         channel = configuration.channels[axis.name]
         lines = (
             *_margins(axis, check),
             *_references(prepared, axis),
             *_reach(axis, channel),
+            *_stroke(configuration, axis),
         )
         found += [f"axis.{axis.name}.{line}" for line in lines]
         found += [*_sensor(configuration, axis, channel), *_latency(configuration, axis, check)]
     return found
+
+
+def _pacing(configuration: Configuration) -> Iterator[str]:
+    """A processor that this machine does not have, and a rate that no measured machine kept."""
+    cpu, processors = configuration.loop.cpu, os.cpu_count() or 1
+    if cpu is not None and cpu >= processors:
+        yield f"cpu: {cpu}; this machine has processors 0 … {processors - 1}: the loop would run on any of them"
+    if configuration.loop.rate_hz > HIGHEST_MEASURED_HZ:
+        yield (
+            f"rate_hz: {configuration.loop.rate_hz:g} Hz; paced ticks were never measured to keep more than "
+            f"{HIGHEST_MEASURED_HZ:g} Hz (docs/benchmarks.md)"
+        )
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
@@ -74,17 +91,53 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
         if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{where}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
-        if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP) and max(-lowest, highest) > limits.command_um:
-            yield f"{where}: reaches {max(-lowest, highest):g} µm, beyond limits.command_um = {limits.command_um:g}"
+        if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
+            yield from (f"{where}: {line}" for line in _unreachable(axis, lowest, highest))
         if (most := float(np.max(np.abs(added), initial=0.0))) > limits.command_um:
             yield f"{where}: adds {most:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
+
+
+def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
+    """Limits that a reference from `lowest_um` to `highest_um` goes beyond."""
+    limits, position_um = axis.limits, axis.interlocks.position_um
+    farthest_um = max(-lowest_um, highest_um)
+    if farthest_um > limits.command_um:
+        yield f"reaches {farthest_um:g} µm, beyond limits.command_um = {limits.command_um:g}"
+        return
+    if farthest_um > position_um:
+        yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
+    down_um, up_um = _ends_um(axis)
+    if lowest_um < down_um or highest_um > up_um:
+        yield (
+            f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
+            f"end at {down_um:.4g} µm and {up_um:.4g} µm"
+        )
+
+
+def _ends_um(axis: AxisOptions) -> tuple[float, float]:
+    """Where the feedforward's model puts the actuator, from rest, at the drive's lower and upper limit."""
+    ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
+    down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
+    return float(down_um), float(up_um)
+
+
+def _stroke(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """Weights with which the whole drive does not move the actuator out of the simulated sensor's noise."""
+    options = configuration.driver_options
+    if not isinstance(options, RigOptions):
+        return
+    sensor, reach_um = options.plants.get(axis.name, options.plant).sensor, max(np.abs(_ends_um(axis)))
+    if reach_um < sensor.noise_um:
+        yield (
+            f"feedforward.weights_um_per_v: the drive's limits end at {reach_um:.3g} µm, within the simulated sensor's "
+            f"noise of {sensor.noise_um:g} µm"
+        )
 
 
 def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     """Limits that nothing can come to."""
     limits, interlocks = axis.limits, axis.interlocks
-    model = axis.feedforward.actuator()
-    reach_um = float(np.max(np.abs(loading_curve(model, np.array([limits.drive_v, -limits.lowest_v])))))
+    reach_um = max(np.abs(_ends_um(axis)))
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
