@@ -87,6 +87,14 @@ ONE_FAULT = [
     (('kind = "steps"', 'kind = "stairs"'), "axis.x.reference.kind: 'stairs': allowed are 'hold', 'steps', .*"),
     (('kind = "steps"', ""), "axis.x.reference.kind: missing; it is needed"),
     ((REFERENCE, 'kind = "table"\nfile = "absent.csv"\n\n'), "axis.x.reference.file: .*absent.csv: No such file .*"),
+    ((REFERENCE, 'kind = "sine"\namplitude = 1.0\nfrequency_hz = 9999.0\n\n'),
+     "axis.x.reference.frequency_hz: 9999 Hz; below half of the loop's rate, 5000 Hz, is allowed"),
+    ((REFERENCE, 'kind = "triangle"\namplitude = 1.0\nfrequency_hz = 5000.0\n\n'),
+     "axis.x.reference.frequency_hz: 5000 Hz; .*"),
+    ((REFERENCE, 'kind = "chirp"\namplitude = 1.0\nstart_hz = 1.0\nend_hz = 6e3\nduration_s = 1.0\n\n'),
+     "axis.x.reference.end_hz: 6000 Hz; .*"),
+    ((REFERENCE, 'kind = "hold"\nvalue = -60.5\n\n'),
+     r"axis.x.reference: -60.5 µm; within ±60 µm \(interlocks.position_um\) is allowed, beyond it trips"),
     ((REFERENCE, 'kind = "input"\nchannel = "knob"\nper_v = 1.0\n\n'), "axis.x.reference.*'knob' is not a .* adc0"),
 ]  # fmt: skip
 
@@ -106,12 +114,21 @@ def test_one_mistake_one_line(change, message):
         ('at_tick = 1\nmode = "off"\nreset_trip = true', "schedule.0: 2 changes; exactly one of .*"),
         ('at_tick = 1\naxis = "x"\nmode = "off"', "schedule.0: axis 'x': allowed with a reference only; .*"),
         ('at_tick = 1\naxis = "z"\nreference = {kind = "hold"}', "schedule.axis: 'z' is not an axis; there are x"),
+        ('at_tick = 1\nreference = {kind = "sine", amplitude = 1.0, frequency_hz = 9999.0}',
+         "schedule, at_tick 1: frequency_hz: 9999 Hz; below half .*"),
+        ('at_tick = 7\nreference = {kind = "hold", value = 61.0}',
+         "axis.x.reference from tick 7 on: 61 µm; within ±60 µm .*"),
         ('at_tick = 1\nreference = {kind = "table", file = "no.npy"}', "schedule, at_tick 1: file: .*no.npy: No .*"),
     ],
 )  # fmt: skip
 def test_one_mistake_in_the_schedule(lines, message):
     (found,) = faults(more=entry(lines))
     assert re.fullmatch(message, found), found
+
+
+def test_volts_of_mode_raw_are_no_setpoint_in_micrometres():
+    changes = ((RATE, RATE + 'mode = "raw"\n'), (REFERENCE, 'kind = "hold"\nvalue = 9.0\n\n'))
+    built(*changes, ("position_um = 60.0", "position_um = 6.0"))
 
 
 def test_all_mistakes_at_once():

@@ -70,6 +70,34 @@ def test_middle_and_worst_of_several() -> None:
     assert found.overshoot_percent_worst == pytest.approx(percents[0], abs=0.2)
 
 
+@pytest.mark.parametrize(
+    "position",
+    [np.zeros(DWELL), np.full(DWELL, -20.0), np.full(DWELL, 18.9)],
+    ids=["still", "wrong way", "5.5 % short"],
+)
+def test_a_step_that_ends_away_from_its_reference_has_no_settling_time_and_no_overshoot(position: np.ndarray) -> None:
+    reference = np.repeat([0.0, 20.0], [10, DWELL])
+    found = step_metrics(reference, np.concatenate([np.zeros(10), position]), RATE_HZ)
+    assert found is not None
+    assert (found.steps, found.unreached) == (1, 1)
+    assert np.isinf(found.settling_time_ms)
+    assert np.isnan(found.overshoot_percent)
+    assert found.static_error_percent == pytest.approx(100 * abs(position[-1] - 20.0) / 20.0)
+    said = found.as_dict()
+    assert said["settling_time_ms"] is None
+    assert said["overshoot_percent_worst"] is None
+
+
+def test_one_step_of_three_that_is_not_reached_counts_as_the_worst() -> None:
+    reference = np.repeat([0.0, 10.0, 0.0, 10.0], [10, DWELL, DWELL, DWELL])
+    position = np.where(np.arange(reference.size) < 10 + 2 * DWELL, reference, 0.0)
+    found = step_metrics(reference, position, RATE_HZ)
+    assert found is not None
+    assert (found.steps, found.unreached) == (3, 1)
+    assert found.settling_time_ms == 0.0
+    assert np.isinf(found.settling_time_ms_worst)
+
+
 def test_where_there_are_no_steps_there_are_no_figures() -> None:
     assert step_metrics(np.zeros(100), np.zeros(100), RATE_HZ) is None
     assert step_metrics(np.repeat([0.0, 1.0], [95, 5]), np.zeros(100), RATE_HZ) is None

@@ -15,6 +15,7 @@ from scipy.linalg import expm
 from rtloop.analysis.closed_loop import Loop
 from rtloop.hil.modal import Real
 
+SETTLING_BAND = 0.05
 COUNT = 1 << 16
 """Samples of a response; the first 1/64 of continuous time is sampled 64 times as densely once more."""
 
@@ -33,6 +34,9 @@ class StepResponse(NamedTuple):
 class StepMetrics(NamedTuple):
     """Of a unit step: settling to within 5 % of the final value, overshoot over it, how far that is from 1, the largest
     |v|, x at the times asked for.
+
+    Settling time and overshoot are NaN where the final value is further than that from the reference: a loop that does
+    not follow has neither.
     """
 
     settling_time_s: float
@@ -58,10 +62,10 @@ def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
     final, command = loop.final
-    overshoot = 100 * max(0.0, float(np.max(response.position / final)) - 1) if final else math.nan
+    follows = abs(1 - final) <= SETTLING_BAND
     return StepMetrics(
-        _settling(response, final),
-        overshoot,
+        _settling(response, final) if follows else math.nan,
+        100 * max(0.0, float(np.max(response.position / final)) - 1) if follows else math.nan,
         100 * abs(1 - final),
         float(np.max(np.abs(response.command), initial=abs(command))),
         tuple(position_at(loop, t) for t in times_s),
@@ -81,7 +85,7 @@ def position_at(loop: Loop, time_s: float) -> float:
 
 def _settling(response: StepResponse, final: float) -> float:
     """Where the response enters the band of ±5 % for the last time, between samples by a straight line."""
-    outside = np.abs(response.position - final) - 0.05 * abs(final)
+    outside = np.abs(response.position - final) - SETTLING_BAND * abs(final)
     last = np.flatnonzero(outside > 0)
     if not last.size:
         return 0.0

@@ -2,45 +2,64 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from rtloop.analysis.step_response import SETTLING_BAND
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import AxisCheck
+from rtloop.configuration.checks import AxisCheck, rig_delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.references import extent, volts
-from rtloop.engine.messages import ALL_AXES, Kind
+from rtloop.configuration.references import extent, planned_references, volts
 from rtloop.hil.options import RigOptions
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.law.reference import Generator
 from rtloop.signals import Mode
 
+HIGHEST_MEASURED_HZ = 100_000
+"""Of a loop that sleeps or spins until its ticks."""
 SAME_SCALE = 0.01
 """Scales that differ by more than this part are different."""
 
 
 def cautions(prepared: Prepared) -> list[str]:
     """Warnings about every axis of a configuration that can run."""
-    configuration, found = prepared.configuration, []
+    configuration = prepared.configuration
+    found = [f"loop.{line}" for line in _pacing(configuration)]
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
         channel = configuration.channels[axis.name]
         lines = (
             *_margins(axis, check),
             *_references(prepared, axis),
             *_reach(axis, channel),
+            *_stroke(configuration, axis),
         )
         found += [f"axis.{axis.name}.{line}" for line in lines]
         found += [*_sensor(configuration, axis, channel), *_latency(configuration, axis, check)]
     return found
 
 
+def _pacing(configuration: Configuration) -> Iterator[str]:
+    """A processor that this machine does not have, and a rate that no measured machine kept."""
+    cpu, processors = configuration.loop.cpu, os.cpu_count() or 1
+    if cpu is not None and cpu >= processors:
+        yield f"cpu: {cpu}; this machine has processors 0 … {processors - 1}: the loop would run on any of them"
+    if configuration.loop.rate_hz > HIGHEST_MEASURED_HZ:
+        yield (
+            f"rate_hz: {configuration.loop.rate_hz:g} Hz; paced ticks were never measured to keep more than "
+            f"{HIGHEST_MEASURED_HZ:g} Hz (docs/benchmarks.md)"
+        )
+
+
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     found, asked = check.margins, axis.margins
     if found is None or check.on_model is None or not check.on_model.is_stable:
         return  # there is no margin, and preparing it has said so
+    if (problem := tracking_problem(check)) is not None:
+        yield f"controller: {problem}"
     if found.gain_margin < asked.gain:
         yield f"controller: gain margin {found.gain_margin:.3g}, below margins.gain = {asked.gain:g}"
     if found.phase_margin_deg < asked.phase_deg:
@@ -49,35 +68,76 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
         yield f"controller: max |S| {found.max_sensitivity:.3g}, above margins.sensitivity = {asked.sensitivity:g}"
 
 
+def tracking_problem(check: AxisCheck) -> str | None:
+    """Why a stable loop does not follow its reference at rest; None where it does, or where no loop is known."""
+    if check.on_model is None or not check.on_model.is_stable:
+        return None
+    final, _ = check.on_model.final
+    if abs(1 - final) <= SETTLING_BAND:
+        return None
+    share = f"a step of 1 µm ends at {final:.3g} µm"
+    if final < 0 or final > 1:
+        return f"{share}: the loop's gain at 0 Hz has the wrong sign"
+    return f"{share}: the loop does not follow its reference"
+
+
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
     """Every reference with the mode that it begins in: that of the axis, then those of the schedule."""
     limits, plan = axis.limits, prepared.plan
-    number, mode = plan.axes.index(axis.name), plan.mode
-    generator = plan.generators[number]
-    asked = [("reference", mode, [float(generator["kind"]), *generator["parameters"].tolist()])]
-    for command in plan.schedule:
-        if command["kind"] == Kind.SET_MODE:
-            mode = Mode(int(command["values"][0]))
-        elif command["kind"] == Kind.SET_REFERENCE and command["axis"] in (ALL_AXES, number):
-            asked.append((f"reference from tick {command['tick']} on", mode, command["values"].tolist()))
-    for where, mode, values in asked:
+    for where, mode, values in planned_references(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
         added = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
         lowest, highest = extent(values, plan.table[first : first + count])
         if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{where}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
-        if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP) and max(-lowest, highest) > limits.command_um:
-            yield f"{where}: reaches {max(-lowest, highest):g} µm, beyond limits.command_um = {limits.command_um:g}"
+        if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
+            yield from (f"{where}: {line}" for line in _unreachable(axis, lowest, highest))
         if (most := float(np.max(np.abs(added), initial=0.0))) > limits.command_um:
             yield f"{where}: adds {most:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
+
+
+def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
+    """Limits that a reference from `lowest_um` to `highest_um` goes beyond."""
+    limits, position_um = axis.limits, axis.interlocks.position_um
+    farthest_um = max(-lowest_um, highest_um)
+    if farthest_um > limits.command_um:
+        yield f"reaches {farthest_um:g} µm, beyond limits.command_um = {limits.command_um:g}"
+        return
+    if farthest_um > position_um:
+        yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
+    down_um, up_um = _ends_um(axis)
+    if lowest_um < down_um or highest_um > up_um:
+        yield (
+            f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
+            f"end at {down_um:.4g} µm and {up_um:.4g} µm"
+        )
+
+
+def _ends_um(axis: AxisOptions) -> tuple[float, float]:
+    """Where the feedforward's model puts the actuator, from rest, at the drive's lower and upper limit."""
+    ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
+    down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
+    return float(down_um), float(up_um)
+
+
+def _stroke(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
+    """Weights with which the whole drive does not move the actuator out of the simulated sensor's noise."""
+    options = configuration.driver_options
+    if not isinstance(options, RigOptions):
+        return
+    sensor, reach_um = options.plants.get(axis.name, options.plant).sensor, max(np.abs(_ends_um(axis)))
+    if reach_um < sensor.noise_um:
+        yield (
+            f"feedforward.weights_um_per_v: the drive's limits end at {reach_um:.3g} µm, within the simulated sensor's "
+            f"noise of {sensor.noise_um:g} µm"
+        )
 
 
 def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
     """Limits that nothing can come to."""
     limits, interlocks = axis.limits, axis.interlocks
-    model = axis.feedforward.actuator()
-    reach_um = float(np.max(np.abs(loading_curve(model, np.array([limits.drive_v, -limits.lowest_v])))))
+    reach_um = max(np.abs(_ends_um(axis)))
     if limits.command_um > reach_um:
         yield f"limits.command_um: {limits.command_um:g} µm; the drive's limits end at {reach_um:.4g} µm"
     ends_v = np.array([interlocks.sensor_min_v, interlocks.sensor_max_v])
@@ -88,10 +148,11 @@ def _reach(axis: AxisOptions, channel: ChannelOptions) -> Iterator[str]:
 
 def _latency(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
     """A model that knows less delay than the simulated rig has."""
-    if axis.model is not None and check.delay_ticks > axis.model.delay_ticks:
+    of_rig = rig_delay_ticks(configuration)
+    if axis.model is not None and axis.model.delay_ticks < of_rig:
         yield (
             f"axis.{axis.name}.model.delay_ticks: {axis.model.delay_ticks}, but the simulated rig has "
-            f"driver.latency_ticks = {check.delay_ticks}; the loop is judged with that"
+            f"driver.latency_ticks = {of_rig}; the loop is judged with {check.delay_ticks}"
         )
 
 

@@ -160,15 +160,25 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
-    """Samples of delay in an axis's loop: what its model says, and no fewer than the simulated rig has."""
+    """Samples of delay in an axis's loop: those that its model states, else those of the simulated rig."""
+    return loop_delay_ticks(axis, rig_delay_ticks(configuration))
+
+
+def rig_delay_ticks(configuration: Configuration) -> int:
+    """Samples of delay that the simulated rig adds within the loop's tick; 0 for any other driver."""
     options = configuration.driver_options
-    of_rig = options.latency_ticks if configuration.driver_kind == "sim" and isinstance(options, RigOptions) else 0
-    return delay_with(of_rig, axis)
+    return options.latency_ticks if configuration.driver_kind == "sim" and isinstance(options, RigOptions) else 0
 
 
-def delay_with(of_rig: int, axis: AxisOptions) -> int:
-    """As `delay_ticks`, on a rig that delays by so many samples."""
-    return max(of_rig, 0 if axis.model is None else axis.model.delay_ticks)
+def loop_delay_ticks(axis: AxisOptions, rig_delay_ticks: int) -> int:
+    """Samples of delay that the axis's model states, else `rig_delay_ticks`.
+
+    Never their sum or larger one: a model that states its delay was identified with it, and what the rig delays
+    beyond that is in the model's dynamics.
+    """
+    if axis.model is None or "delay_ticks" not in axis.model.model_fields_set:
+        return rig_delay_ticks
+    return axis.model.delay_ticks
 
 
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:

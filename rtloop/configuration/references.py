@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,11 @@ from rtloop.configuration.axis import (
 )
 from rtloop.configuration.text_files import read_below, read_regular
 from rtloop.drivers.base import Channel, index_of
+from rtloop.engine.messages import ALL_AXES, Kind
+from rtloop.engine.plan import Plan
 from rtloop.law.reference import Generator
 from rtloop.law.safety import USABLE_MAGNITUDE
+from rtloop.signals import Mode
 
 MAX_TABLE_BYTES = 64 << 20
 MAX_SAMPLES = MAX_TABLE_BYTES // 8
@@ -71,12 +74,21 @@ def generator_values(
             raise ValueError(f"hold_ticks: {options.hold_ticks}; at most {MAX_HOLD_TICKS} are allowed")
         return table_values(read_samples(folder / options.file), options.hold_ticks, options.repeat, table)
     if isinstance(options, ChirpOptions):
+        _require_below_half_rate("start_hz", options.start_hz, rate_hz)
+        _require_below_half_rate("end_hz", options.end_hz, rate_hz)
         sweep = (options.amplitude, options.start_hz, options.end_hz, options.duration_s, options.offset)
         return Generator.CHIRP, *sweep, float(options.logarithmic)
     if isinstance(options, InputOptions):
         return Generator.INPUT, index_of(inputs, options.channel), options.per_v, options.offset
+    _require_below_half_rate("frequency_hz", options.frequency_hz, rate_hz)
     kind = Generator.SINE if options.kind == "sine" else Generator.TRIANGLE
     return kind, options.amplitude, options.frequency_hz, options.offset, options.phase_deg / 360
+
+
+def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> None:
+    """Raise ValueError for a frequency that the loop's samples cannot show: another one, below it, would be played."""
+    if not frequency_hz < rate_hz / 2:
+        raise ValueError(f"{key}: {frequency_hz:g} Hz; below half of the loop's rate, {rate_hz / 2:g} Hz, is allowed")
 
 
 def table_values(
@@ -130,6 +142,25 @@ def _numbers(text: str) -> npt.NDArray[np.float64]:
             if len(rows[-1]) > 2 or len(rows[-1]) != len(rows[0]):
                 raise _NotANumber(count)
     return np.array(rows)
+
+
+def planned_references(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[float]]]:
+    """Every reference of an axis that a plan begins or schedules: its place in words, the mode that it begins in, and
+    its generator's kind and parameters."""
+    mode, generator = plan.mode, plan.generators[axis]
+    yield "reference", mode, [float(generator["kind"]), *generator["parameters"].tolist()]
+    for command in plan.schedule:
+        if command["kind"] == Kind.SET_MODE:
+            mode = Mode(int(command["values"][0]))
+        elif command["kind"] == Kind.SET_REFERENCE and command["axis"] in (ALL_AXES, axis):
+            yield f"reference from tick {command['tick']} on", mode, command["values"].tolist()
+
+
+def setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
+    """Why the generator `values` cannot be a setpoint in µm; None where it can, and for generators that move."""
+    if values[0] != Generator.HOLD or abs(values[1]) <= position_limit_um:
+        return None
+    return f"{values[1]:g} µm; within ±{position_limit_um:g} µm (interlocks.position_um) is allowed, beyond it trips"
 
 
 def volts(lowest: float, highest: float) -> str:

@@ -29,8 +29,8 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether what is asked is met; None where nothing is, or nothing was found."""
-        return None if self.limit is None or not math.isfinite(self.run) else bool(self.limit.met(self.run))
+        """Whether what is asked is met; None where nothing is asked, or the run did not show the quantity (NaN)."""
+        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.met(self.run))
 
     @property
     def as_claimed(self) -> bool | None:

@@ -45,8 +45,8 @@ def print_resonance(content: dict[str, Any]) -> None:
     mode = content["resonance"]
     console().print(
         f"resonance {mode['hz']:.3f} ± {mode['hz_std']:.2g} Hz, damping {mode['damping']:.5f} ± "
-        f"{mode['damping_std']:.2g} (1σ; {mode['from_hz']:g} … {mode['to_hz']:g} Hz, residuals {mode['misfit']:.2g} "
-        "of what the uncertainty explains)"
+        f"{mode['damping_std']:.2g} (1σ; {mode['from_hz']:g} … {mode['to_hz']:g} Hz; the residuals are "
+        f"{mode['misfit']:.2g} times as large as the measurement's uncertainty explains)"
     )
 
 

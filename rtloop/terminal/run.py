@@ -15,11 +15,11 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class, kinds
 from rtloop.errors import RtloopError
 from rtloop.recording.load import load
-from rtloop.recording.views.steps import step_metrics
+from rtloop.recording.views.steps import SETTLING_BAND, step_metrics
 from rtloop.recording.views.summary import Summary
 from rtloop.signals import Mode
 from rtloop.terminal.progress import StatusLine
-from rtloop.terminal.table import console, table
+from rtloop.terminal.table import console, figure, table
 from rtloop.values import counted
 
 if TYPE_CHECKING:
@@ -186,10 +186,21 @@ def _print_steps(prepared: Prepared, recording: str) -> None:
         metrics = step_metrics(loaded[f"{name}_reference_um"][driven], loaded[f"{name}_position_um"][driven], rate_hz)
         if metrics is None:
             continue
-        shown.add_row(f"{name}: median of {metrics.steps}", f"{metrics.overshoot_percent:.2f}",
-                      f"{metrics.settling_time_ms:.2f}", f"{metrics.static_error_percent:.3f}")  # fmt: skip
-        shown.add_row(f"{name}: worst", f"{metrics.overshoot_percent_worst:.2f}",
-                      f"{metrics.settling_time_ms_worst:.2f}", f"{metrics.static_error_percent_worst:.3f}")  # fmt: skip
+        shown.add_row(
+            f"{name}: median of {metrics.steps}",
+            figure(metrics.overshoot_percent, 2),
+            figure(metrics.settling_time_ms, 2),
+            figure(metrics.static_error_percent, 3),
+        )
+        shown.add_row(
+            f"{name}: worst",
+            figure(metrics.overshoot_percent_worst, 2),
+            figure(metrics.settling_time_ms_worst, 2),
+            figure(metrics.static_error_percent_worst, 3),
+        )
+        if metrics.unreached:
+            shown.add_row(f"  [red]{metrics.unreached} of {metrics.steps} ended more than "
+                          f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
         for label, values in _asked(prepared.configuration, axis):
             shown.add_row(label, *values)
     if shown.row_count:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from rich.console import Console
 from rich.table import Table
 
@@ -11,6 +13,11 @@ WIDEST = 10_000
 def console() -> Console:
     """Standard output, unhighlighted; long lines are left to the terminal, and no number is cut to fit it."""
     return Console(highlight=False, soft_wrap=True, width=WIDEST)
+
+
+def figure(value: float, digits: int, unit: str = "") -> str:
+    """A number with so many digits behind the point and its unit; "–" for one that is infinite or does not exist."""
+    return f"{value:.{digits}f}{unit}" if math.isfinite(value) else "–"
 
 
 def table(*headings: str) -> Table:

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from rtloop.design.identification.dynamics.identify_delay import Candidate, simplest
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
+from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import build_rig
@@ -12,14 +14,19 @@ from tests.design.rigs import _record
 PERIOD_S, GAIN_UM_PER_V = 1e-4, 2.0
 
 
-def excitation(hz: float, damping: float, delay_ticks: int, drive_v: np.ndarray) -> Excitation:
-    """A linear rig of one mode, 10 nm of noise and resolution, behind its converters."""
+def excitation(
+    hz: float, damping: float, delay_ticks: int, drive_v: np.ndarray, lag_hz: float | None = None
+) -> Excitation:
+    """A linear rig of one mode and perhaps a lag, 10 nm of noise and resolution, behind its converters."""
     omega = 2 * np.pi * hz
+    lag_rad_s = () if lag_hz is None else (2 * np.pi * lag_hz,)
     rig = RigOptions(
         plant=PlantOptions(
             hysteresis=HysteresisOptions(truth="custom", thresholds_v=(0.0,), weights_um_per_v=(GAIN_UM_PER_V,)),
             dynamics=DynamicsOptions(
-                form="factors", gain=omega**2, denominator=((1.0, 2 * damping * omega, omega**2),)
+                form="factors",
+                gain=float(np.prod((omega**2, *lag_rad_s))),
+                denominator=((1.0, 2 * damping * omega, omega**2), *((1.0, rate) for rate in lag_rad_s)),
             ),
             sensor=SensorOptions(um_per_v=10.0, noise_um=0.010),
         ),
@@ -56,3 +63,32 @@ def test_a_noisy_drive_tells_the_delay_too() -> None:
     drive_v = np.random.default_rng(5).uniform(-5, 5, 4000)
     drive_v[:200] = 0.0
     assert identify_dynamics(excitation(300.0, 0.01, 2, drive_v)).delay_ticks == 2
+
+
+def test_a_fast_lag_does_not_stand_in_for_a_sample_of_delay() -> None:
+    fit = identify_dynamics(excitation(800.0, 0.02, 2, up_and_down(0.3), 4000.0), criterion="held-out")
+    assert fit.delay_ticks == 2
+    lag = max(fit.modes, key=lambda mode: mode.damping)
+    assert abs(lag.frequency_hz - 4000.0) < 4 * lag.frequency_std_hz
+
+
+def candidate(ticks: int, poles: int, rms_um: float, independent: bool = True) -> Candidate:
+    """A model of real poles behind `ticks` samples of delay."""
+    numbers = np.zeros(poles, dtype=complex)
+    return Candidate(ticks, Innovations(PERIOD_S, numbers - 1.0, numbers, numbers), rms_um, independent)
+
+
+def test_a_candidate_whose_errors_follow_from_the_input_counts_only_where_there_is_no_other() -> None:
+    dependent, sound = candidate(0, 4, 0.0297, independent=False), candidate(3, 3, 0.0302)
+    assert delays_of(simplest([dependent, sound])) == [3]
+    assert delays_of(simplest([dependent])) == [0]
+
+
+def test_fewer_poles_win_among_equally_good_predictions_and_lose_against_a_clearly_better_one() -> None:
+    equal = [candidate(0, 4, 0.0300), candidate(1, 3, 0.0302), candidate(2, 3, 0.0301)]
+    assert delays_of(simplest(equal)) == [1, 2]
+    assert delays_of(simplest([candidate(0, 3, 0.0300), candidate(1, 2, 0.0310)])) == [0]
+
+
+def delays_of(candidates: list[Candidate]) -> list[int]:
+    return [candidate.ticks for candidate in candidates]

@@ -17,7 +17,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SimulationOptions
 from rtloop.design.verification.bench import Bench, Stand
 from rtloop.design.verification.judgement import described
-from rtloop.design.verification.simulated import between_ticks, simulate
+from rtloop.design.verification.simulated import between_ticks, kept_by_most, simulate
 from rtloop.errors import ConfigError
 from rtloop.hil.options import Options
 from rtloop.hysteresis.leftover import with_hysteresis_left
@@ -261,3 +261,10 @@ def test_as_many_steps_keep_what_is_said_of_them() -> None:
         overshoots.append(100 * (upwards.max(axis=1) - upwards[:, -720:].mean(axis=1)))
     assert 0.92 < np.mean(np.array(overshoots) <= said.overshoot_percent) < 0.98
     assert 0.4 < np.mean(np.array(overshoots) <= said.typical[0]) < 0.6
+
+
+def test_steps_that_did_not_reach_their_reference_count_as_the_worst() -> None:
+    """95 of 100 steps keep what is promised; where fewer reach their reference there is no promise."""
+    good, unreached = [1.0, 2.0, 0.1], [np.nan, np.inf, 100.0]
+    assert kept_by_most(np.array([good] * 97 + [unreached] * 3)) == tuple(good)
+    assert kept_by_most(np.array([good] * 90 + [unreached] * 10)) == (np.inf, np.inf, 100.0)

@@ -236,7 +236,19 @@ def test_delay_and_prefilter_are_in_the_loop_as_it_runs(tmp_path) -> None:
     assert running.static_error_percent == pytest.approx(rows["static_error_percent"].running)
     assert running.overshoot_percent == pytest.approx(rows["overshoot_percent"].running)
     (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
-    assert late.startswith("axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 2")
+    assert late == (
+        "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 2; the loop is judged with 2"
+    )
+
+
+def test_a_delay_that_the_model_states_is_not_raised_to_that_of_the_rig() -> None:
+    """A model identified behind no delay holds the rig's in its dynamics: it would count twice."""
+    config = (DEPLOY / "paper.toml").read_text().replace("latency_ticks = 0", "latency_ticks = 2")
+    config = config.replace("[axis.model]", "[axis.model]\ndelay_ticks = 1")
+    prepared = prepare(parse(config, "paper", DEPLOY, "paper.toml"))
+    assert prepared.checks[0].delay_ticks == 1
+    (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
+    assert late.endswith("the loop is judged with 1")
 
 
 def test_faults_of_the_user(tmp_path, monkeypatch) -> None:

@@ -26,6 +26,7 @@ from tests.service.http import GOOD_CONTROLLER, answer, exchange
     ("/setpoint", {"axis": "x", "value": float("nan")}),
     ("/waveform", {"axis": "x", "samples": [0.0, float("inf")]}),
     ("/reference", {"axis": "x", "reference": {"kind": "sine", "amplitude": 30.0, "frequency_hz": 1.0, "offset": 20}}),
+    ("/reference", {"axis": "x", "reference": {"kind": "sine", "amplitude": 1.0, "frequency_hz": 3999.0}}),
     ("/reference", {"axis": "x", "reference": {"kind": "sawtooth"}}),
     ("/waveform", {"axis": "x", "samples": []}),
     ("/waveform", {"axis": "x", "samples": [99.0]}),

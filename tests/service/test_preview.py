@@ -9,7 +9,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.changes import Change, Changes
 from rtloop.service.changing.preview import figures
 from tests.faults.bench import Bench
-from tests.paper_configuration import PAPER, TEXT
+from tests.paper_configuration import PAPER, TEXT, built
 from tests.service.http import answer
 
 
@@ -94,3 +94,20 @@ def test_a_refused_change_is_none_to_undo(running: Bench):
     assert answer(running, "POST", "/tune", {"axis": "x", "section": "controller", "values": {"gain": 5.0}})[0] == 422
     assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
     assert answer(running, "POST", "/undo", {"axis": "y"})[0] == 422
+
+
+@pytest.mark.parametrize(
+    ("gain", "problem"),
+    [("1e-9", "the loop does not follow its reference"), ("-1e-5", "the loop's gain at 0 Hz has the wrong sign")],
+)
+def test_a_loop_that_does_not_control_is_a_problem_and_has_no_step_figures(gain: str, problem: str) -> None:
+    found = figures(built(("gain = 0.016", f"gain = {gain}")), 0)
+    assert any(line.startswith("axis.x.controller: ") and line.endswith(problem) for line in found["problems"])
+    assert (found["settling_ms"], found["overshoot_percent"], found["step"]) == (None, None, None)
+    assert found["static_error_percent"] > 99.0
+
+
+def test_a_loop_that_controls_has_no_problem() -> None:
+    found = figures(built(), 0)
+    assert found["problems"] == []
+    assert found["static_error_percent"] == pytest.approx(0.166384, abs=1e-5)

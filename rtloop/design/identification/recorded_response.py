@@ -9,7 +9,7 @@ from pathlib import Path
 from rtloop.analysis.measured.measurement import IN_STEP, SIGNALS, Measurement, measurement
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.checks import delay_with, promised_loop
+from rtloop.configuration.checks import loop_delay_ticks, promised_loop
 from rtloop.design.identification.measured import UnsuitableData, axis_of
 from rtloop.hil.modal import Real
 from rtloop.recording.load import load
@@ -40,7 +40,7 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     model, known, taps = None, None, described.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
         options = AxisOptions.model_validate(described)
-        model = promised_loop(options, rate_hz, delay_with(of_rig, options))
+        model = promised_loop(options, rate_hz, loop_delay_ticks(options, of_rig))
         known = options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (known[0] if known else None)
     try:

@@ -169,17 +169,28 @@ def _run(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, 
 def _summary(height_um: float, runs: Sequence[_Run]) -> SimulatedStep:
     steps = np.vstack([run.steps for run in runs])
     ever = reduce(or_, (run.flags for run in runs))
-    overshoot_percent, settling_ms, static_error_percent = np.quantile(steps, KEPT, axis=0).tolist()
+    overshoot_percent, settling_ms, static_error_percent = kept_by_most(steps)
     return SimulatedStep(
         height_um,
         overshoot_percent,
         settling_ms,
         static_error_percent,
-        tuple(np.median(steps, axis=0).tolist()),
+        tuple(np.median(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist()),
         max(run.peak_drive_v for run in runs),
         tuple(name for flag, name in LIMITED.items() if ever & flag),
         tuple(trip_causes(ever)),
     )
+
+
+def kept_by_most(steps: Real) -> tuple[float, float, float]:
+    """Overshoot %, settling time ms, static error % that the part KEPT of `steps` (n, 3) of `every_step` keep.
+
+    A step that did not reach its reference keeps no overshoot and no settling time: infinite where there are too many.
+    """
+    ranked = np.where(np.isnan(steps), np.inf, steps)
+    method = "linear" if np.all(np.isfinite(ranked)) else "higher"
+    overshoot_percent, settling_ms, static_error_percent = np.quantile(ranked, KEPT, axis=0, method=method).tolist()
+    return overshoot_percent, settling_ms, static_error_percent
 
 
 def between_ticks(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: float) -> Real:

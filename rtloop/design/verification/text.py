@@ -168,12 +168,17 @@ def shifts(found: Verification) -> list[tuple[str, str]]:
 
 
 def span(found: Range | None) -> str:
-    """Downwards … upwards; an end that was not found is left open."""
+    """Downwards … upwards; an end that was not found is left open.
+
+    "unlimited" says that no change in the range searched leads there.
+    """
     if found is None:
         return "nothing is met"
     if found == Range(0.0, 0.0):
         return "none"
-    down, up = ("no limit found" if end is None else f"{end:.2f} %" for end in found)
+    if found.down is None and found.up is None:
+        return "unlimited in the range searched"
+    down, up = ("unlimited" if end is None else f"{end:.2f} %" for end in found)
     return f"{'' if found.down is None else '−'}{down} … {'' if found.up is None else '+'}{up}"
 
 

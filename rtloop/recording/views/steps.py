@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,9 +16,14 @@ SMALLEST_DWELL_TICKS = 20
 
 @dataclass(frozen=True)
 class StepMetrics:
-    """Medians and worst cases over the steps of one axis; percentages refer to the height of the step."""
+    """Medians and worst cases over the steps of one axis; percentages refer to the height of the step.
+
+    A step that ends further than SETTLING_BAND of its height from its reference never settles: its settling time is
+    infinite and it has no overshoot. `unreached` counts such steps.
+    """
 
     steps: int
+    unreached: int
     overshoot_percent: float
     overshoot_percent_worst: float
     settling_time_ms: float
@@ -26,8 +32,8 @@ class StepMetrics:
     static_error_percent_worst: float
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
+        """For JSON; None for a settling time that is infinite and an overshoot that does not exist."""
+        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
 
 
 def step_metrics(
@@ -37,8 +43,10 @@ def step_metrics(
     table = every_step(reference_um, position_um, rate_hz)
     if table is None:
         return None
+    unreached = int(np.count_nonzero(np.isinf(table[:, 1])))
     middle, worst = np.median(table, axis=0), np.max(table, axis=0)
-    return StepMetrics(len(table), *(float(value) for pair in zip(middle, worst, strict=True) for value in pair))
+    pairs = (float(value) for pair in zip(middle, worst, strict=True) for value in pair)
+    return StepMetrics(len(table), unreached, *pairs)
 
 
 def every_step(
@@ -46,7 +54,8 @@ def every_step(
 ) -> npt.NDArray[np.float64] | None:
     """Overshoot %, settling time ms, static error % of each step, (steps, 3); None where there are no such steps.
 
-    Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth.
+    Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth. Where
+    it is further than that from the reference, the settling time is infinite and the overshoot NaN.
     """
     starts = np.flatnonzero(np.diff(reference_um) != 0) + 1
     if starts.size == 0 or starts.size > MAX_STEPS:
@@ -65,11 +74,14 @@ def _one_step(
 ) -> tuple[float, float, float]:
     """Overshoot %, settling time ms, static error %."""
     final_um = float(np.mean(position_um[-max(1, position_um.size // 5) :]))
+    static_error = abs(final_um - level_um) / abs(height_um)
+    if static_error > SETTLING_BAND:
+        return math.nan, math.inf, 100 * static_error
     beyond = (position_um - final_um) * np.sign(height_um)
     outside = np.flatnonzero(np.abs(position_um - final_um) > SETTLING_BAND * abs(height_um))
     settled_ticks = int(outside[-1]) + 1 if outside.size else 0
     return (
         max(0.0, 100 * float(np.max(beyond)) / abs(height_um)),
         1000 * settled_ticks / rate_hz,
-        100 * abs(final_um - level_um) / abs(height_um),
+        100 * static_error,
     )

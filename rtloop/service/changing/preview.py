@@ -10,6 +10,7 @@ import numpy as np
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import changes, until_unstable
 from rtloop.analysis.step_response import step_response
+from rtloop.configuration.cautions import tracking_problem
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.prepare import Prepared
 
@@ -24,15 +25,18 @@ Figures = dict[str, Any]
 def figures(prepared: Prepared, number: int) -> Figures:
     """Of the loop of axis `number` as it will run on its model; null for what does not exist.
 
-    The shift of the resonance is looked for up to ∓50 %. `problems` are warnings of the axis.
+    The shift of the resonance is looked for up to ∓50 %. `problems` are the axis's warnings, among them that the loop
+    does not follow its reference.
     """
     axis = prepared.configuration.axes[number]
     check = prepared.checks[number]
     found: Figures = dict.fromkeys(
         ("gain_margin_db", "phase_margin_deg", "modulus_margin", "crossover_hz", "tolerated_shift_percent",
-         "overshoot_percent", "settling_ms", "step")
+         "overshoot_percent", "settling_ms", "static_error_percent", "step")
     )  # fmt: skip
     found["problems"] = [warning for warning in prepared.warnings if warning.startswith(f"axis.{axis.name}.")]
+    if (problem := tracking_problem(check)) is not None:
+        found["problems"].append(f"axis.{axis.name}.controller: {problem}")
     running = check.running
     if running is None:
         return found
@@ -43,6 +47,7 @@ def figures(prepared: Prepared, number: int) -> Figures:
         "modulus_margin": 1 / running.max_sensitivity,
         "overshoot_percent": running.overshoot_percent,
         "settling_ms": 1e3 * running.settling_time_s,
+        "static_error_percent": running.static_error_percent,
         "tolerated_shift_percent": _tolerated_shift_percent(check),
         "step": _step(check, running),
     }

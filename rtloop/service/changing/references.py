@@ -11,7 +11,14 @@ from pydantic import TypeAdapter, ValidationError
 from rtloop.configuration.axis import ReferenceOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.prepare import Prepared
-from rtloop.configuration.references import TableOfSamples, extent, generator_values, table_values, volts
+from rtloop.configuration.references import (
+    TableOfSamples,
+    extent,
+    generator_values,
+    setpoint_fault,
+    table_values,
+    volts,
+)
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.law.reference import Generator
@@ -94,7 +101,8 @@ class LiveReferences:
 
         Raises ConfigError, Refused.
         """
-        limits = self._prepared().configuration.axes[number].limits
+        options = self._prepared().configuration.axes[number]
+        limits = options.limits
         lowest, highest = extent(values, samples)
         if self._staging.in_raw_mode:
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
@@ -103,6 +111,8 @@ class LiveReferences:
         elif not (most := max(-lowest, highest)) <= limits.command_um:
             limit = limits.command_um
             raise unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
+        elif fault := setpoint_fault(values, options.interlocks.position_um):
+            raise unsuitable(f"reference: {fault}")
         if samples.size:
             return self._submit_table(number, values, samples)
         return self._submit(number, [float(value) for value in values])

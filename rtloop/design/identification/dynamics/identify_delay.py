@@ -2,20 +2,24 @@
 
     y_k = Σ a_i y_k−i + Σ b_i u_k−i + constant,     b_1 … b_d = 0      a delay of d samples           ARX
 
-A delay that is left out of a model comes back as real poles near the sampling rate. So models are fitted behind each
-delay that a long ARX model leaves possible, to the first part of the recording, and the delay is that of the model
-which predicts the rest best; among equals, of the one with the fewest poles.
+A delay that is left out of a model comes back as real poles near the sampling rate, and a whole sample of it moves the
+modes. So models are fitted behind each delay that a long ARX model leaves possible, to the first part of the recording.
+Models whose errors follow from the input count only where all do. Those that predict the rest as well as the best one
+does are compared by their number of poles, then by Akaike's criterion over the whole recording.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
-from rtloop.design.identification.dynamics.prediction_error import WORTH, Excitation, model_at_gap
+from rtloop.design.identification.dynamics.prediction_error import WORTH, Excitation, models_at_gap, refined, rms_error
+from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.hil.modal import Real
 
 MOST_TICKS = 5
@@ -30,21 +34,60 @@ def delayed(run: Excitation, ticks: int) -> Excitation:
     return replace(run, input=np.concatenate([np.zeros(ticks), run.input[: run.input.size - ticks]]))
 
 
+class Candidate(NamedTuple):
+    """A model behind `ticks` samples of delay, its rms prediction error in the part that it was not fitted to, and
+    whether the errors of the part that it was fitted to are independent of the past input."""
+
+    ticks: int
+    model: Innovations
+    rms_um: float
+    independent: bool
+
+
 def identified_delay(run: Excitation, orders: Sequence[int]) -> int:
     """Samples of delay, 0 to MOST_TICKS; without a second part to judge by, as the fit itself tells."""
     possible = _possible(run)
     if len(possible) == 1:
         return possible[0]
     start = held_out_from(run)
-    found: list[tuple[float, int, int]] = []
-    for ticks in possible:
-        late = delayed(run, ticks)
-        model = model_at_gap(first_part(late, start), orders)
-        errors = model and model.errors(late.input, late.position_um)
-        if model is not None and errors is not None:
-            found.append((float(np.sqrt(np.mean(errors[start or 0 :] ** 2))), model.order, ticks))
-    limit = min((rms for rms, _, _ in found), default=0.0) * (1 + WORTH)
-    return min(((order, ticks) for rms, order, ticks in found if rms <= limit), default=(0, possible[-1]))[1]
+    candidates = [
+        _candidate(ticks, model, delayed(run, ticks), start)
+        for ticks in possible
+        for model in models_at_gap(first_part(delayed(run, ticks), start), orders)
+    ]
+    if not candidates:
+        return possible[-1]
+    return min(simplest(candidates), key=lambda one: _refitted_rms_um(one.model, delayed(run, one.ticks))).ticks
+
+
+def simplest(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Those of the fewest poles among the candidates that predict as well as the best one.
+
+    A candidate whose errors follow from the input counts only where there is no other.
+    """
+    sound = [candidate for candidate in candidates if candidate.independent] or candidates
+    limit_um = min(candidate.rms_um for candidate in sound) * (1 + WORTH)
+    predictive = [candidate for candidate in sound if candidate.rms_um <= limit_um]
+    fewest_poles = min(candidate.model.order for candidate in predictive)
+    return [candidate for candidate in predictive if candidate.model.order == fewest_poles]
+
+
+def _candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
+    """Judge a model that was fitted to the samples before `start`; `run` has its input `ticks` samples later."""
+    errors = model.errors(run.input, run.position_um)
+    if errors is None:
+        return Candidate(ticks, model, np.inf, False)
+    tests = residual_tests(run.input[:start], errors[:start], model.pack(noise=True).size)
+    return Candidate(ticks, model, float(np.sqrt(np.mean(errors[start or 0 :] ** 2))), tests.independent)
+
+
+def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
+    """Rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite where that fails.
+
+    Models with equally many unknowns are in the order of Akaike's criterion.
+    """
+    fitted = refined(model, run)
+    return np.inf if fitted is None else rms_error(fitted, run)
 
 
 def first_part(run: Excitation, start: int | None) -> Excitation:

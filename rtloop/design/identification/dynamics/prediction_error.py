@@ -71,11 +71,18 @@ def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     return found
 
 
-def model_at_gap(run: Excitation, orders: Sequence[int]) -> Innovations | None:
-    """One model, of the order within `orders` that the impulse response shows; None where none is stable."""
+def models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
+    """Models of the order within `orders` that the impulse response shows, and of one pole more: a fast real pole
+    hides below the gap. Empty where none is stable."""
     guesses = _guesses(run)
-    start = guesses.model(guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0])
-    return start and refined(with_residues(start, run.input, run.position_um), run)
+    at_gap = guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0]
+    fitted: list[Innovations] = []
+    for order in [order for order in (at_gap, at_gap + 1) if order in orders]:
+        start = guesses.model(order) or (_grown(fitted[-1]) if fitted else None)
+        model = start and refined(with_residues(start, run.input, run.position_um), run)
+        if model is not None:
+            fitted.append(model)
+    return fitted
 
 
 def _guesses(run: Excitation) -> Guesses:

@@ -116,13 +116,13 @@ export class Spectrum {
     }
     this.#chart.show();
     for (const [place, line] of this.#lines.entries()) line.place(this.#band_hz[place], frequency(this.#band_hz[place]));
-    const averages = averages_least === averages_most ? `${averages_least ?? "—"}` : `${averages_least} … ${averages_most}`;
+    const segments = averages_least === averages_most ? `${averages_least ?? "—"}` : `${averages_least} (lowest Hz) … ${averages_most}`;
     showFigures($("spectrum-figures"), {
       [`rms, ${frequency(low_hz, 3)} … ${frequency(high_hz, 3)}`]: `${significant(rms, 4)} ${unit === "1" ? "" : unit}`,
-      averages,
+      "segments averaged": segments,
       "at “from”": `${significant(this.#at(0), 3)} ${perRoot(unit)}`,
       "at “to”": `${significant(this.#at(1), 3)} ${perRoot(unit)}`,
-      ...(bridged ? { "ticks bridged": String(bridged) } : {}),
+      ...(bridged ? { "missing ticks interpolated": String(bridged) } : {}),
     });
   }
 

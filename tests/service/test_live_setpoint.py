@@ -1,0 +1,36 @@
+"""A setpoint that would trip the position interlock is refused before it is sent."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtloop.errors import ConfigError
+from rtloop.law.reference import Generator
+from rtloop.service.changing.references import LiveReferences
+from tests.paper_configuration import built
+
+
+def references(in_raw_mode: bool, sent: list[list[float]]) -> LiveReferences:
+    """Live references of the paper's axis with a position interlock of 15 µm; what they send goes to `sent`."""
+    prepared = built(("position_um = 60.0", "position_um = 15.0"))
+    desk = SimpleNamespace(submit=lambda kind, axis, values: sent.append(values) or 1)
+    staging: Any = SimpleNamespace(in_raw_mode=in_raw_mode, desk=desk)
+    return LiveReferences(lambda: prepared, staging)
+
+
+@pytest.mark.parametrize("value", [15.5, -15.5])
+def test_a_setpoint_beyond_the_position_interlock_is_refused(value: float) -> None:
+    sent: list[list[float]] = []
+    with pytest.raises(ConfigError, match=r"reference: -?15\.5 µm; within ±15 µm \(interlocks\.position_um\)"):
+        references(False, sent).play(0, [Generator.HOLD, value], built().plan.table[:0])
+    assert sent == []
+
+
+@pytest.mark.parametrize(("in_raw_mode", "value"), [(False, 15.0), (True, -9.0)])
+def test_a_setpoint_within_it_and_volts_are_sent(in_raw_mode: bool, value: float) -> None:
+    sent: list[list[float]] = []
+    references(in_raw_mode, sent).play(0, [Generator.HOLD, value], built().plan.table[:0])
+    assert sent == [[Generator.HOLD, value]]
