@@ -179,7 +179,7 @@ def _value(found: Found, file: Any, one: Any, name: str, depth: int) -> Any:
     if depth > DEEPEST:
         raise UnreadableData(f"{found.path}: {name}: nested more than {DEEPEST} deep: a reference leads back to itself")
     if isinstance(one, h5py.Group):
-        fields = _values(found, file, {key: f"{name}/{key}" for key in one}, one, depth + 1)
+        fields = _values(found, file, {str(key): f"{name}/{key}" for key in one}, one, depth + 1)
         lengths = {len(field) for field in fields.values() if isinstance(field, list)}
         if fields and len(lengths) == 1 and all(isinstance(field, list) for field in fields.values()):
             return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -244,15 +244,21 @@ async def _read(request: Request) -> bytes:
     return data
 
 
+def _watching(lane: Lane, connection: HTTPConnection) -> AbstractAsyncContextManager[None]:
+    """Watch the client of a measurement, which ends with it; other requests are finished without their client."""
+    if lane is Lane.MEASUREMENT and isinstance(connection, Request):
+        return watching_client(connection)
+    return nullcontext()
+
+
 async def _answer(service: Service, lanes: Lanes, connection: HTTPConnection, path: str, data: bytes | str) -> Response:
     """Validate, act in a thread, and answer."""
     body, _, action = ACTIONS[path]
     lane = LANES.get(path, Lane.ORDINARY)
-    measures = lane is Lane.MEASUREMENT and isinstance(connection, Request)
     try:
         wanted = None if body is None else body.model_validate_json(data)
         with asking(service, connection, path, wanted):
-            async with watching_client(connection) if measures else nullcontext():
+            async with _watching(lane, connection):
                 return JSONResponse(await lanes.run(lane, action, service, wanted))
     except asyncio.CancelledError:  # whoever still waits as the server comes to its end
         return refused(503, f"{path.removeprefix('/')}: the service ends")
