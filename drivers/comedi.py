@@ -69,7 +69,7 @@ class ComediOptions(Options):
 
 def _call_in_python(function: int, device: int, line: tuple[int, ...], last: Any) -> int:
     """As `_call`: `last` is of type uint32 where it is a code."""
-    last_type = ctypes.c_uint32 if isinstance(last, np.uint32) else ctypes.c_ssize_t
+    last_type = ctypes.c_uint32 if last.dtype == np.uint32 else ctypes.c_ssize_t
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
     return prototype(int(function))(int(device), *map(int, line), int(last))
 

@@ -28,7 +28,7 @@ class WholeFiles(IndexDataCacheFile):
         return super()._load_data(name)
 
     @contextmanager
-    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
         """What is written here is stored at once and whole; numba reads no further than what it has written."""
         buffer = io.BytesIO()
         yield buffer
