@@ -8,6 +8,7 @@ import queue
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
 from rtloop.recording.capture.names import Names
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import Flag
+from rtloop.supervision import quota as quota_module
 from rtloop.supervision import recorder_keeper
 from rtloop.supervision.quota import SPARE_BYTES, Quota
 from rtloop.supervision.recorder_keeper import RecorderKeeper
@@ -176,3 +179,21 @@ def test_the_rows_that_are_written_here_can_be_read(tmp_path: Path):
 
     (path,) = run_of(tmp_path, "20260101T000001", 1, trip=20)
     assert np.array_equal(load(path)["tick"], np.arange(1_000))
+
+
+def test_a_run_with_a_file_that_cannot_be_read_stays_for_a_trip_may_be_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run_of(tmp_path, "20260101T000001", 2)
+    tripped = run_of(tmp_path, "20260102T000002", 2, trip=PART + 1)
+    run_of(tmp_path, "20260103T000003", 1)
+    enter = quota_module.Reader.__init__
+
+    def refuse(reader: Any, path: Path, **options: Any) -> None:
+        if path == tripped[1]:
+            raise RecordingError(f"{path}: Input/output error")
+        enter(reader, path, **options)
+
+    monkeypatch.setattr(quota_module.Reader, "__init__", refuse)
+    keep(tmp_path, 0)
+    assert all(path.exists() for path in tripped)
