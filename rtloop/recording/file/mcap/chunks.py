@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -69,7 +70,8 @@ class Source:
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._fd)
+        with contextlib.suppress(OSError):  # it is closed all the same, and nothing was written
+            os.close(self._fd)
 
 
 def _hint(path: Path) -> str:
