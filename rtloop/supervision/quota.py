@@ -113,7 +113,7 @@ class Quota:
     def _removable(self, lying: list[Lying]) -> list[Lying]:
         """The oldest first."""
         finished = [one for one in lying if one.name.endswith(".mcap")]
-        unseen = {one.started for one in finished if one not in self._known and one not in self._strange}
+        unseen = {one.started for one in finished if one not in self._known}  # or could not be read
         return [
             one
             for one in finished[:-1]

@@ -9,6 +9,7 @@ import time
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
 from rtloop.recording.capture.names import Names
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import event_of
 from rtloop.recording.file.topics.format import EVENTS
@@ -201,3 +203,21 @@ def test_nothing_of_a_run_goes_before_all_of_it_was_looked_at(tmp_path: Path, mo
     quota.keep(budget_s=2.5)
     quota.keep(budget_s=2.5)
     assert left(tmp_path) == [path.name for path in (*files[1:3], files[-1])]
+
+
+def test_a_run_with_a_file_that_cannot_be_read_stays_for_a_trip_may_be_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run_of(tmp_path, "20260101T000001", 2)
+    tripped = run_of(tmp_path, "20260102T000002", 2, trip=PART + 1)
+    run_of(tmp_path, "20260103T000003", 1)
+    enter = quota_module.Reader.__init__
+
+    def refuse(reader: Any, path: Path, **options: Any) -> None:
+        if path == tripped[1]:
+            raise RecordingError(f"{path}: Input/output error")
+        enter(reader, path, **options)
+
+    monkeypatch.setattr(quota_module.Reader, "__init__", refuse)
+    keep(tmp_path, 0)
+    assert all(path.exists() for path in tripped)

@@ -9,6 +9,7 @@ import fcntl
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -168,5 +169,6 @@ def grows(path: Path) -> bool:
         reason = f"cannot be locked ({error.strerror}), so a recorder may be writing it"
         raise RecordingError(f"{path}: {reason}") from None
     finally:
-        os.close(fd)
+        with suppress(OSError):  # it is closed all the same
+            os.close(fd)
     return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -76,7 +77,8 @@ class Source:
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._fd)
+        with contextlib.suppress(OSError):  # it is closed all the same, and nothing was written
+            os.close(self._fd)
 
 
 def _hint(path: Path) -> str:
