@@ -45,6 +45,8 @@ ALLOWED = {
     ("supervision/supervisor.py", "Path('/proc/self/stat').read_text"): OF_THE_KERNEL,
     ("hil/native/cache.py", "path.read_bytes"): OF_THE_PACKAGE,
     ("laws/registry.py", "Path(file or '').read_text"): OF_THE_PACKAGE,
+    ("laws/limited/process.py", "self._file.read_text"): OF_THE_KERNEL,
+    ("laws/limited/worker.py", "os.open"): OF_THE_KERNEL,
     ("panel/web/application.py", "FileResponse"): OF_THE_PACKAGE,
     ("panel/web/server.py", "webbrowser.open"): "an address, no file",
     ("interchange/export.py", "archive.open"): "a member of an archive that is open",

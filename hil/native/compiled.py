@@ -130,9 +130,13 @@ def borrowed(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
     return Name(name, lambda compiler: compiler.type_of(getattr(compiler.numba, name)), uncompiled)
 
 
-def external(name: str, signature: str) -> Any:
-    """A function of the C library, for kernels."""
-    return Name(name, lambda compiler: compiler.types.ExternalFunction(name, compiler.signature_of(signature)))
+def external(name: str, signature: str, uncompiled: Callable[..., Any] | None = None) -> Any:
+    """A function of the C library, for kernels; `uncompiled` does the same where they run as they are written."""
+
+    def meaning(compiler: Any) -> Any:
+        return compiler.types.ExternalFunction(name, compiler.signature_of(signature))
+
+    return Name(name, meaning, uncompiled)
 
 
 def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:

@@ -6,8 +6,11 @@ address of two int64 as their scratch `timespec`, so that they allocate nothing.
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
+from rtloop.hil.native import uncompiled
 from rtloop.hil.native.compiled import external, jit
 from rtloop.hil.native.pointers import address_pointer, carray
 
@@ -15,7 +18,14 @@ CLOCK_MONOTONIC = 1
 TIMER_ABSTIME = 1
 SECOND_NS = 1_000_000_000
 
-_clock_gettime = external("clock_gettime", "int32(int32, intp)")
+
+def _gettime_in_python(clock: int, timespec_address: int) -> int:
+    """As `clock_gettime`."""
+    uncompiled.carray(timespec_address, 2, np.int64)[:] = divmod(time.clock_gettime_ns(clock), SECOND_NS)
+    return 0
+
+
+_clock_gettime = external("clock_gettime", "int32(int32, intp)", _gettime_in_python)
 _clock_nanosleep = external("clock_nanosleep", "int32(int32, int32, intp, intp)")
 
 

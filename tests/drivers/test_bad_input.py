@@ -128,9 +128,6 @@ CASES = {
                          channels=("adc0", "ao0")),
     "comedi: range upside down": Case("comedi", "input_range_v: [10, -10]; allowed is the lower end before the higher",
                                       CONFIGURATION, options={"input_range_v": "[10, -10]"}),
-    "comedi: drive beyond the range": Case("comedi", "axis.x.limits.drive_v: 10.0 is outside the driver's",
-                                           CONFIGURATION,
-                                           options={"output_range_v": "[-5, 5]"}),
     "comedi: key": Case("comedi", "driver.devise: unknown key; did you mean device?", CONFIGURATION,
                         options={"devise": '"/dev/comedi1"'}),
     "shm: no board": shm("{device}: No such file or directory; start the board with `rtloop hil serve CONFIG`",
@@ -179,6 +176,16 @@ def test_one_clear_message(tmp_path, case, monkeypatch):
         assert text.startswith("rtloop: ")
         assert len(text.splitlines()) <= 2
         assert "Traceback" not in text
+
+
+def test_limits_of_the_law_are_judged_by_check_and_do_not_keep_the_outputs_from_being_parked(tmp_path, monkeypatch):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    config, _ = written(tmp_path, Case("comedi", "", options={"output_range_v": "[-5, 5]"}))
+    checked, parked = (CliRunner().invoke(main, [command, str(config)]) for command in ("check", "park"))
+    assert checked.exit_code == CONFIGURATION
+    assert "axis.x.limits.drive_v: 10.0 is outside the driver's" in checked.stderr
+    assert parked.exit_code == HARDWARE
+    assert "ao0 has no range [-5.0, 5.0] V" in parked.stderr
 
 
 @pytest.mark.parametrize("name", ["comedi: in use", "shm: in use"])

@@ -125,10 +125,10 @@ def test_what_a_refused_law_started_is_ended(own: Callable[[str], Path]):
 
 
 def test_what_build_prints_is_shown_and_no_part_of_an_answer(own: Callable[[str], Path]):
-    config = own("print('read')\n" + law_text().replace(BUILD, f"{BUILD}        print('built')\n"))
+    config = own("print('text was read')\n" + law_text().replace(BUILD, f"{BUILD}        print('built')\n"))
     ran = CliRunner().invoke(main, ["check", str(config), "--json"])
     assert (ran.exit_code, "built" in ran.stderr, ran.stdout[:1]) == (0, True, "{"), ran.output
-    assert "read" not in ran.stdout
+    assert "text was read" not in ran.stdout
 
 
 def test_a_shipped_law_needs_no_process(monkeypatch: pytest.MonkeyPatch):

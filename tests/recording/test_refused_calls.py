@@ -90,7 +90,7 @@ def test_a_recovered_file_whose_original_cannot_be_removed_is_told(part: Path, m
 
 
 def test_a_folder_that_cannot_be_looked_into_refuses_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(Path, "exists", refuse)
+    monkeypatch.setattr(os, "lstat", refuse)
     with pytest.raises(OutputError, match=os.strerror(errno.EIO)):
         Writer(tmp_path / "run.mcap", make_header(), START_UNIX_NS)
 

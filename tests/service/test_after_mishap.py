@@ -142,7 +142,8 @@ def dying_loops(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 10
     options = service.configuration.service.model_copy(update={"restarts": 2, "restart_window_s": 60.0})
     service.configuration = replace(service.configuration, service=options)
     monkeypatch.setattr(service_module, "time", clock)
-    monkeypatch.setattr(service, "_aside", lambda work: None)
+    done = SimpleNamespace(join=lambda timeout_s: None, is_alive=lambda: False)
+    monkeypatch.setattr(service, "_aside", lambda work: done)
 
     def episode(at_rest: bool) -> Any:
         resting.append(at_rest)

@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 from rtloop.cli.service import park
 from rtloop.hil.board import LSB_V
-from tests.faults.configuration import BOARD_RATE_HZ, TRIP_SLEW_V_PER_S, on_a_board
+from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
 from tests.service.fake_board import FakeBoard
 
 START_V = 6.66
@@ -59,14 +59,14 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
         "driver_options": json.dumps(options),
         "wiring": {"x": ["adc0", "dac0"]},
         "rate_hz": BOARD_RATE_HZ,
-        "trip_slew_v_per_s": TRIP_SLEW_V_PER_S,
+        "trip_slew_v_per_s": SLEW_V_PER_S,
         "heartbeat_timeout_s": 1.0,
     }
     boards = FakeBoard(tmp_path / "board", START_V), FakeBoard(tmp_path / "other", START_V, channels=2)
     return Lab(config, run / "lab.hardware", *boards, text)
 
 
-def assert_ramped(board: FakeBoard, slew_v_per_s: float = TRIP_SLEW_V_PER_S, rate_hz: float = BOARD_RATE_HZ) -> None:
+def assert_ramped(board: FakeBoard, slew_v_per_s: float = SLEW_V_PER_S, rate_hz: float = BOARD_RATE_HZ) -> None:
     """Down to 0 V by steps of the slew, and never away from it."""
     assert board.outputs_v == [0.0] * board.channels
     steps = -np.diff(board.path_v)

@@ -24,14 +24,14 @@ from rtloop.hil.board import LSB_V, BoardMemory
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware, keep, noted
 from rtloop.supervision.paths import block_path, hardware_path
-from tests.faults.configuration import BOARD_RATE_HZ, TRIP_SLEW_V_PER_S, on_a_board
+from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
 from tests.syscalls import card
 from tests.syscalls.component import Case
 from tests.syscalls.traced import Outcome
 
 NAME, DRIVE_CODE = "lab", 8192
 DRIVE_V = DRIVE_CODE * LSB_V
-STEP_V = TRIP_SLEW_V_PER_S / BOARD_RATE_HZ
+STEP_V = SLEW_V_PER_S / BOARD_RATE_HZ
 ANOTHER = (
     ('kind = "shm"', f'kind = "{card.KIND}"'), ("board_rate_hz = 8000\n", ""), ('"adc0"', '"in"'), ('"dac0"', '"out"'),
     ("[driver.plant.sensor]\num_per_v = 10.0\nnoise_um = 0.010\nresolution_um = 0.010\n", ""),
@@ -141,7 +141,7 @@ class Noting(Case):
         self.path = folder / f"{NAME}.hardware"
         wiring = {"x": Wiring("adc0", "dac0")}
         self.old, self.new = (
-            Hardware("shm", f'{{"file":"{folder}/{name}"}}', wiring, BOARD_RATE_HZ, TRIP_SLEW_V_PER_S, 1.0)
+            Hardware("shm", f'{{"file":"{folder}/{name}"}}', wiring, BOARD_RATE_HZ, SLEW_V_PER_S, 1.0)
             for name in ("old-board", "new-board")
         )
         keep(self.path, self.old)

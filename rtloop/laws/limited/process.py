@@ -24,7 +24,7 @@ from typing import Any
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
 from rtloop.laws.limited.frames import LENGTH, write_frame
-from rtloop.laws.limited.worker import Preparation
+from rtloop.laws.limited.worker import PREPARE, RUN, Preparation
 
 LIMIT_S = 10.0
 """A law that is not read, or not built and verified, within this is refused. The host's load does not count."""
@@ -82,7 +82,7 @@ class LimitedProcess:
                 while self._unanswered:
                     self._message(_Clock(START_S, self.pid))
                     self._unanswered -= 1
-                self._send(pickle.dumps(arguments))
+                self._send(pickle.dumps((RUN, pickle.dumps(arguments))))
                 kind, value = self._outcome()
             except BaseException:
                 if self._law is None:
@@ -131,7 +131,7 @@ class LimitedProcess:
 
     def _prepare(self, function: Callable[..., Any], compiles: bool) -> None:
         preparation = Preparation(os.getcwd(), sys.path, pickle.dumps(function), compiles, self.limit_s)
-        self._send(pickle.dumps(tuple(preparation)))
+        self._send(pickle.dumps((PREPARE, tuple(preparation))))
         self._unanswered += 1
 
     def _send(self, data: bytes) -> None:

@@ -1,7 +1,8 @@
 """The limited process: runs one function after the other, says which law's code runs, and what came of it.
 
 A job is two messages: what to run, with all that must be imported or loaded for it, which is acknowledged; then the
-arguments, with which the code of a law may begin to run. Whatever that raises, SystemExit and KeyboardInterrupt among
+arguments, with which the code of a law may begin to run. The first may come without the second, for a job that is
+expected. Whatever that raises, SystemExit and KeyboardInterrupt among
 it, becomes an answer. Its output goes to stderr, which the other process reads.
 """
 
@@ -22,6 +23,8 @@ from rtloop.laws.limited.frames import read_frame, write_frame
 
 SPARE_S = 5.0
 """Of processor time beyond its limit, after which the process ends: the other one may have been killed meanwhile."""
+PREPARE, RUN = "prepare", "run"
+"""Kinds of messages: with a `Preparation`, and with the pickled arguments."""
 STREAMS = {0: "stdin", 1: "stdout", 2: "stderr"}
 
 
@@ -45,23 +48,30 @@ class Worker:
         listen(self._announce)
 
     def work(self) -> None:
-        """Until the other process ends, or closes its pipe."""
+        """Until the other process ends, or closes its pipe. Arguments are for the preparation that came last."""
+        function: Callable[..., Any] = _identity
+        limit_s = 0.0
         while (data := read_frame(self._jobs)) is not None:
-            preparation = Preparation(*pickle.loads(data))
-            os.chdir(preparation.folder)
-            sys.path[:] = preparation.module_folders
-            function = pickle.loads(preparation.function)
-            if preparation.compiles:
-                _load_compiler()
-            self._answer("ready", None)
-            arguments = read_frame(self._jobs)
-            if arguments is None:
-                return
+            kind, content = pickle.loads(data)
+            if kind == PREPARE:
+                preparation = Preparation(*content)
+                function, limit_s = self._prepared(preparation), preparation.limit_s
+                continue
             self._law = None
-            signal.setitimer(signal.ITIMER_PROF, preparation.limit_s + SPARE_S)
-            outcome = self._outcome(function, arguments)
+            signal.setitimer(signal.ITIMER_PROF, limit_s + SPARE_S)
+            outcome = self._outcome(function, content)
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             self._answer(*outcome)
+
+    def _prepared(self, preparation: Preparation) -> Callable[..., Any]:
+        """The function of a job, with all that it needs loaded, which is acknowledged."""
+        os.chdir(preparation.folder)
+        sys.path[:] = preparation.module_folders
+        function = pickle.loads(preparation.function)
+        if preparation.compiles:
+            _load_compiler()
+        self._answer("ready", None)
+        return function
 
     def _outcome(self, function: Callable[..., Any], arguments: bytes) -> tuple[str, Any]:
         """Kind and value of an answer; a value that was computed is pickled."""

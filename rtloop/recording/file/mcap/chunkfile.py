@@ -212,7 +212,7 @@ class ChunkFile:
 
     def _refuse_to_replace(self) -> None:
         try:
-            is_finished, is_begun = os.path.lexists(self.path), os.path.lexists(self.part)
+            is_finished, is_begun = _is_taken(self.path), _is_taken(self.part)
         except OSError as error:
             raise self._refused(error) from None
         if is_finished:
@@ -255,3 +255,12 @@ class ChunkFile:
     def _refused(self, error: OSError) -> OutputError:
         where = error.filename if isinstance(error, Untrusted) else self.part
         return OutputError(f"{where}: {error.strerror}", error.errno or 0)
+
+
+def _is_taken(path: Path) -> bool:
+    """Whether anything, be it a link that leads nowhere, has this name. Raises OSError where that cannot be told."""
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        return False
+    return True
