@@ -18,6 +18,7 @@ from rtloop.configuration.axis import AxisOptions, ReferenceOptions
 from rtloop.configuration.extras import NAME, ExtraInputOptions, ExtraOutputOptions, extra_faults
 from rtloop.configuration.laws import DEFAULT_LAWS, Library, names_own_laws
 from rtloop.configuration.service import ServiceOptions
+from rtloop.configuration.setpoints import setpoint_faults
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.errors import DriverError
@@ -364,6 +365,7 @@ def _cross_faults(sections: _Sections, channels: Mapping[str, ChannelOptions]) -
         if name not in channels
     ]
     faults += [f"driver.channels.{name}: there is no axis of this name" for name in channels if name not in names]
+    faults += setpoint_faults(sections.axis, sections.loop.mode, sections.schedule)
     faults += shared_faults(sections.axis)
     faults += extra_faults(sections.inputs, sections.outputs, sections.loop.hold_input, sections.axis)
     for entry in sections.schedule:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,7 +14,7 @@ from rtloop.configuration.checks import AxisCheck, Findings, check_axes
 from rtloop.configuration.coefficients import axis_coefficients
 from rtloop.configuration.extras import extras_of
 from rtloop.configuration.file import Configuration, ScheduleOptions
-from rtloop.configuration.references import TableOfSamples, generator_values, planned_references, setpoint_fault
+from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.drivers.base import Channel, Driver, Facts, index_of
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
@@ -100,10 +99,7 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         else (configuration.loop.hold_input, configuration.loop.hold_min_v),
         enable_input=configuration.loop.enable_input,
     )
-    faults = [
-        *around_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz),
-        *_setpoint_faults(configuration, plan),
-    ]
+    faults = around_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)
     if faults:
         raise ConfigError(configuration.source, faults)
     return Prepared(configuration, plan, facts, tuple(checks), tuple(findings.warnings))
@@ -186,15 +182,6 @@ def _generators(
             generators["volts"][i] = configuration.loop.mode == "raw"
             generators["parameters"][i, : len(values) - 1] = values[1:]
     return generators
-
-
-def _setpoint_faults(configuration: Configuration, plan: Plan) -> Iterator[str]:
-    """A line for each setpoint in µm that would trip the position interlock."""
-    for number, axis in enumerate(configuration.axes):
-        for where, mode, values in planned_references(plan, number):
-            fault = setpoint_fault(values, axis.interlocks.position_um)
-            if fault is not None and mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
-                yield f"axis.{axis.name}.{where}: {fault}"
 
 
 def _schedule(

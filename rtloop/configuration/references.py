@@ -156,13 +156,6 @@ def planned_references(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[
             yield f"reference from tick {command['tick']} on", mode, command["values"].tolist()
 
 
-def setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
-    """Why the generator `values` cannot be a setpoint in µm; None where it can, and for generators that move."""
-    if values[0] != Generator.HOLD or abs(values[1]) <= position_limit_um:
-        return None
-    return f"{values[1]:g} µm; within ±{position_limit_um:g} µm (interlocks.position_um) is allowed, beyond it trips"
-
-
 def volts(lowest: float, highest: float) -> str:
     """An extent in words."""
     return f"{lowest:g} V" if lowest == highest else f"{lowest:g} V … {highest:g} V"

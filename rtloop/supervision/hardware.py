@@ -6,7 +6,6 @@ turn may be one of another version, or name what is no longer installed: it is b
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 from collections.abc import Mapping
@@ -110,8 +109,6 @@ def noted(path: Path) -> Hardware | None:
     except Untrusted as error:
         raise refusal(error) from None
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise _unusable(path, "it is a link") from None
         raise UnreadableNote(f"{path}: the note of the hardware cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
         raise _unusable(path, describe(error, "note", None)[0]) from None

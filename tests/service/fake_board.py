@@ -22,7 +22,7 @@ class FakeBoard:
         os.close(fd)
         facts = self._memory.facts
         facts["version"], facts["channels"], facts["rate_hz"] = board.VERSION, channels, 8000.0
-        self._memory.dac_codes[:channels] = round(volts / LSB_V)
+        write_first(self._memory, [round(volts / LSB_V)] * channels)
         facts["magic"] = board.MAGIC
 
     @property
@@ -35,4 +35,10 @@ class FakeBoard:
         """Volts of the first output, from the start through every write to the end."""
         count = int(self._memory.words[board.WRITTEN])
         assert count < FIFO, "more writes than the board keeps"
-        return np.array([self.start_v, *self._memory.fifo[:count, 0] * LSB_V, self.outputs_v[0]])
+        return np.array([self.start_v, *self._memory.fifo.codes[1:count, 0] * LSB_V])
+
+
+def write_first(memory: BoardMemory, codes: list[int]) -> None:
+    """Have the outputs of a board whose memory is fresh stand at `codes`, by one write."""
+    memory.fifo.codes[0, : len(codes)] = codes
+    memory.words[board.WRITTEN] = 1

@@ -222,13 +222,13 @@ def test_a_note_that_others_may_have_made_is_refused_and_the_configuration_parke
 
 
 @pytest.mark.parametrize("target", ["note", "nothing", "itself"])
-def test_a_note_that_is_a_link_is_none(lab: Lab, tmp_path: Path, target: str):
+def test_a_note_that_is_a_link_is_refused_and_the_configuration_parked(lab: Lab, tmp_path: Path, target: str):
     place = {"note": tmp_path / "elsewhere", "nothing": tmp_path / "missing", "itself": lab.note}[target]
     (tmp_path / "elsewhere").write_text(json.dumps(lab.text))
     lab.note.symlink_to(place)
     code, message = lab.park()
-    assert code == GOOD
-    assert NOT_UNDERSTOOD in message
+    assert code == REFUSED
+    assert f"{lab.note}: a link" in message
     assert_ramped(lab.board)
 
 

@@ -34,3 +34,9 @@ def test_a_setpoint_within_it_and_volts_are_sent(in_raw_mode: bool, value: float
     sent: list[list[float]] = []
     references(in_raw_mode, sent).play(0, [Generator.HOLD, value], built().plan.table[:0])
     assert sent == [[Generator.HOLD, value]]
+
+
+def test_a_setpoint_that_was_held_before_comes_back_whatever_the_interlock_is_now() -> None:
+    sent: list[list[float]] = []
+    references(False, sent).play(0, [Generator.HOLD, 15.5], built().plan.table[:0], restores=True)
+    assert sent == [[Generator.HOLD, 15.5]]

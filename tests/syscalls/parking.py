@@ -25,6 +25,7 @@ from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware, keep, noted
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
+from tests.service.fake_board import write_first
 from tests.syscalls import card
 from tests.syscalls.component import Case
 from tests.syscalls.traced import Outcome
@@ -77,12 +78,13 @@ class ParkingABoard(Case):
         self.memory.reset()
         facts = self.memory.facts
         facts["version"], facts["channels"], facts["rate_hz"] = board.VERSION, 1, BOARD_RATE_HZ
-        facts["magic"], self.memory.dac_codes[0] = board.MAGIC, DRIVE_CODE
+        write_first(self.memory, [DRIVE_CODE])
+        facts["magic"] = board.MAGIC
 
     def written_v(self) -> list[float]:
-        """All that was written to the output, and what stands there now."""
+        """All that was written to the output, the newest last."""
         count = int(self.memory.words[board.WRITTEN])
-        return [code * LSB_V for code in (*self.memory.fifo[:count, 0].tolist(), int(self.memory.dac_codes[0]))]
+        return (self.memory.fifo.codes[:count, 0] * LSB_V).tolist()
 
     def work(self) -> None:
         parking.park_configuration(self.config)
@@ -115,7 +117,7 @@ class ParkingTheNoted(ParkingABoard):
         other = folder / "other"
         shutil.copy(self.card, other)
         fd = os.open(other, os.O_RDWR | os.O_CLOEXEC)
-        BoardMemory(fd).dac_codes[0] = 0
+        write_first(BoardMemory(fd), [0])
         os.close(fd)
         other.chmod(0o600)
         self.config.write_text(self.config.read_text().replace(f'"{self.card}"', f'"{other}"'))

@@ -15,10 +15,10 @@ from rtloop.configuration.references import (
     TableOfSamples,
     extent,
     generator_values,
-    setpoint_fault,
     table_values,
     volts,
 )
+from rtloop.configuration.setpoints import setpoint_fault
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.law.reference import Generator
@@ -44,15 +44,19 @@ class LiveReferences:
         self.times_set = [0] * len(plan.axes)
         """How often each axis was given another one."""
 
-    def set(self, axis: str, reference: Mapping[str, Any]) -> int:
-        """Change the generator of an axis; returns the tick. Raises ConfigError, Refused."""
+    def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
+        """Change the generator of an axis; returns the tick. Raises ConfigError, Refused.
+
+        `restores`: the reference is one that was in force before; a position interlock that was narrowed meanwhile
+        does not keep it from coming back.
+        """
         try:
             options = TypeAdapter(ReferenceOptions).validate_python(dict(reference))
         except ValidationError as error:
             raise ConfigError("reference", describe(error, "reference", reference)) from None
         values, samples = self.generator(options)
         with self._staging.lock:
-            return self.play(axis_number(self._prepared(), axis), values, samples)
+            return self.play(axis_number(self._prepared(), axis), values, samples, restores=restores)
 
     def set_waveform(self, axis: str, samples: Samples, hold_ticks: int, repeat: bool) -> int:
         """Play samples (n, 1 or 2), `hold_ticks` ticks each; returns the tick. Raises ConfigError, Refused.
@@ -96,10 +100,10 @@ class LiveReferences:
             raise ConfigError("reference", [f"reference.{error}"]) from None
         return list(values), table.samples
 
-    def play(self, number: int, values: list[Any], samples: Samples) -> int:
+    def play(self, number: int, values: list[Any], samples: Samples, *, restores: bool = False) -> int:
         """Have a generator take over, the lock being held; its table's samples go where the loop finds them.
 
-        Raises ConfigError, Refused.
+        `restores` as in `set`. Raises ConfigError, Refused.
         """
         options = self._prepared().configuration.axes[number]
         limits = options.limits
@@ -111,8 +115,9 @@ class LiveReferences:
         elif not (most := max(-lowest, highest)) <= limits.command_um:
             limit = limits.command_um
             raise unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
-        elif fault := setpoint_fault(values, options.interlocks.position_um):
-            raise unsuitable(f"reference: {fault}")
+        elif values[0] == Generator.HOLD and not restores:
+            if (fault := setpoint_fault(values[1], options.interlocks.position_um)) is not None:
+                raise unsuitable(f"reference: {fault}")
         if samples.size:
             return self._submit_table(number, values, samples)
         return self._submit(number, [float(value) for value in values])

@@ -54,7 +54,7 @@ class Player:
 
     def hold(self, value_um: float) -> None:
         """A constant, and a while to come to rest. Raises Refused."""
-        self._live.references.set(self.axis, {"kind": "hold", "value": value_um})
+        self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
         self._set += 1
         time.sleep(REST_S)
 

@@ -1,4 +1,7 @@
-"""A sample of what `make soak-syscalls` tries: killed and failing at a system call, judged by the next hand."""
+"""A sample of what `make soak-syscalls` tries: killed and failing at a system call, judged by the next hand.
+
+python -m pytest tests/syscalls/sampled.py
+"""
 
 from __future__ import annotations
 
