@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -115,9 +115,8 @@ class LiveReferences:
         elif not (most := max(-lowest, highest)) <= limits.command_um:
             limit = limits.command_um
             raise unsuitable(f"reference: reaches {most:g}, beyond the axis's ±{limit:g} (limits.command_um)")
-        elif values[0] == Generator.HOLD and not restores:
-            if (fault := setpoint_fault(values[1], options.interlocks.position_um)) is not None:
-                raise unsuitable(f"reference: {fault}")
+        elif not restores and (fault := _setpoint_fault(values, options.interlocks.position_um)) is not None:
+            raise unsuitable(f"reference: {fault}")
         if samples.size:
             return self._submit_table(number, values, samples)
         return self._submit(number, [float(value) for value in values])
@@ -145,6 +144,11 @@ class LiveReferences:
         tick = self._submit(number, [float(value) for value in values], table=True)
         self._places[number] = place
         return tick
+
+
+def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
+    """Why the generator `values` is refused as a setpoint; None for one within the interlock, and for what moves."""
+    return setpoint_fault(values[1], position_limit_um) if values[0] == Generator.HOLD else None
 
 
 def axis_number(prepared: Prepared, name: str) -> int:
