@@ -3,6 +3,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # As the command line does by itself: matrices here have tens of rows, and threads wait longer for each other than they compute.
 export OPENBLAS_NUM_THREADS ?= 1
+# As Python does by itself: a machine that forbids it has each process compile the whole package anew.
+export PYTHONDONTWRITEBYTECODE :=
 READY := $(VENV)/.ready
 
 .PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants planted strace soak-syscalls
@@ -21,7 +23,7 @@ test: $(READY)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
 	$(BIN)/python -m rtloop.commands.warm
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 3 --dist loadfile
 
 # Foxglove's own client and decoders, with which `make test` reads what viewers get: needs node and npm.
 viewers:
@@ -38,7 +40,8 @@ browser: $(READY)
 strace:
 	command -v strace >/dev/null || { apt-get update && apt-get install --yes strace; }
 
-# Each system call of recorder, recover, cut, quota, note of the hardware and parking fails, or is the last before SIGKILL.
+# Each system call of recorder, recover, cut, quota, note of the hardware, parking and a service's start and stop fails,
+# or is the last before SIGKILL: an hour and a half; `make test` tries 200 of them.
 soak-syscalls: $(READY) strace
 	$(BIN)/python -m tests.syscalls --mutants
 	$(BIN)/python -m tests.syscalls

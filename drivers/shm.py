@@ -23,7 +23,7 @@ from rtloop.hil.native.compiled import cfunc
 from rtloop.hil.native.monotonic import monotonic_ns
 from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import BoardOptions
-from rtloop.hil.trusted import open_file
+from rtloop.hil.trusted import open_file, release
 
 CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "fifo", "adc_codes")]
@@ -123,7 +123,7 @@ class ShmDriver(Driver):
             self._take(self._fd)
             memory = self._memory = BoardMemory(self._fd)
         except (DriverError, OSError) as error:
-            os.close(self._fd)
+            release(self._fd)
             self._fd = None
             if isinstance(error, DriverError):
                 raise
@@ -154,7 +154,7 @@ class ShmDriver(Driver):
             context["channels"] = MAX_CHANNELS
             _WRITE(shm_write.address)(context.ctypes.data, safe.ctypes.data)
             self._memory, self._arrays = None, ()
-            os.close(self._fd)
+            release(self._fd)
             self._fd = None
 
     def _take(self, fd: int) -> None:

@@ -25,7 +25,7 @@ from rtloop.hil.native.monotonic import monotonic_ns, sleep_until
 from rtloop.hil.options import BoardOptions
 from rtloop.hil.rig import advance, build_rig, sample
 from rtloop.hil.stages.noise import seed_word
-from rtloop.hil.trusted import open_file
+from rtloop.hil.trusted import open_file, release
 from rtloop.hil.witness import LEVELS, PAST, SEEN, move, see_write
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
@@ -143,7 +143,7 @@ def serve(
         memory.facts["magic"] = 0
         return int(memory.words[SEQUENCE])
     finally:
-        os.close(fd)
+        release(fd)
 
 
 def take_role(fd: int, byte: int) -> bool:

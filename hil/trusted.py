@@ -16,7 +16,7 @@ import fcntl
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -34,6 +34,12 @@ class Untrusted(PermissionError):
         super().__init__(errno.EPERM, reason, str(path))
 
 
+def release(fd: int) -> None:
+    """Close a descriptor through which nothing was written. An error is ignored: Linux frees the descriptor anyway."""
+    with suppress(OSError):
+        os.close(fd)
+
+
 def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) -> int:
     """An O_PATH descriptor of a folder that we or root alone may write to. Raises OSError, Untrusted.
 
@@ -41,7 +47,7 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
     """
     fd, _, is_shared = _walk(path, mode)
     if is_shared and not shared:
-        os.close(fd)
+        release(fd)
         raise Untrusted(path, "everybody may write there; a folder of its own is needed")
     return fd
 
@@ -49,7 +55,7 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 def owners(folder: Path) -> set[int]:
     """Users whose files in `folder` count: we, root, and whom root gave it. Raises OSError, Untrusted."""
     fd, found, _ = _walk(folder, None, given=True)
-    os.close(fd)
+    release(fd)
     return found
 
 
@@ -64,7 +70,7 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     except OSError as error:
         raise _without_link(error, path) from None
     finally:
-        os.close(folder)
+        release(folder)
     status = os.fstat(fd)
     ours = group and status.st_gid in (os.getegid(), *os.getgroups())
     if not stat.S_ISREG(status.st_mode):
@@ -75,7 +81,7 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
         reason = "others may write to it"
     else:
         return fd
-    os.close(fd)
+    release(fd)
     raise Untrusted(path, reason)
 
 
@@ -97,16 +103,16 @@ def open_own(path: Path | str) -> int:
     """As `open_found`, a file of ours or root's. Raises OSError, Untrusted."""
     fd = open_found(path)
     if not _is_own(status := os.fstat(fd)):
-        os.close(fd)
+        release(fd)
         raise Untrusted(path, _belongs(status))
     return fd
 
 
 def is_own(path: Path) -> bool:
-    """Whether `path` is a regular file of ours or root's, and no link."""
+    """Whether `path` is a regular file of ours or root's, and no link. Raises OSError where that cannot be told."""
     try:
         status = os.lstat(path)
-    except OSError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
     return stat.S_ISREG(status.st_mode) and _is_own(status)
 
@@ -136,7 +142,7 @@ def remake_file(path: Path, mode: int = 0o666) -> int:
             fcntl.flock(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.unlink(path.name, dir_fd=folder)
         finally:
-            os.close(abandoned)
+            release(abandoned)
         return os.open(path.name, _NEW, mode, dir_fd=folder)
 
 
@@ -174,7 +180,7 @@ def _emptied(fd: int, path: Path, folder: os.stat_result) -> int:
             os.ftruncate(fd, 0)
         os.set_blocking(fd, True)
         return fd
-    os.close(fd)
+    release(fd)
     raise Untrusted(path, reason)
 
 
@@ -188,7 +194,7 @@ def _regular(fd: int, path: Path | str) -> int:
     mode = os.fstat(fd).st_mode
     if stat.S_ISREG(mode):
         return fd
-    os.close(fd)
+    release(fd)
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     raise OSError(errno.EINVAL, "not a regular file", str(path))
@@ -201,7 +207,7 @@ def _folder_of(path: Path) -> Iterator[int]:
     try:
         yield fd
     finally:
-        os.close(fd)
+        release(fd)
 
 
 def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool = True) -> tuple[int, set[int], bool]:
@@ -241,7 +247,7 @@ def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool =
                 raise Untrusted(where, "others may write there; it must be its owner's alone (chmod go-w)")
             by_root = by_root and status.st_uid == 0 and not shared
     except BaseException:
-        os.close(fd)
+        release(fd)
         raise
     return fd, believed, shared
 
@@ -260,7 +266,7 @@ def _entry(name: str, folder: int, mode: int | None) -> os.stat_result:
 def _onward(fd: int, name: str) -> int:
     """The folder `name` in `fd`, which is closed."""
     following = os.open(name, _FOLDER, dir_fd=fd)
-    os.close(fd)
+    release(fd)
     return following
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import llvmlite.binding
 
-from rtloop.hil.trusted import open_folder
+from rtloop.hil.trusted import open_folder, release
 
 PACKAGE = Path(__file__).parents[2]
 KERNELS = ("hil", "drivers", "law", "laws", "engine", "signals.py")
@@ -48,7 +48,7 @@ def cpu_identity() -> str:
 def _owned_folder(path: Path) -> bool:
     """Make `path` if needed; True when it is ours alone to write, so that nobody else's code is loaded from it."""
     try:
-        os.close(open_folder(path, 0o700))
+        release(open_folder(path, 0o700))
     except OSError:
         return False
     return os.access(path, os.W_OK | os.X_OK)

@@ -107,7 +107,7 @@ def hysteresis(
 @click.option("--delay", "delay_ticks", type=click.IntRange(0, 16), help="Samples of delay [0 to 5, found].")
 @click.option(
     "--criterion", type=click.Choice(["aic", "held-out", "validation"]),
-    help="What chooses the order [aic; held-out in a closed loop, where nothing else does].",
+    help="What chooses the order [held-out; a closed loop allows no other].",
 )  # fmt: skip
 @click.option(
     "--loop",

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import RtloopError
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_named, release
 
 
 class InputFileError(RtloopError):
@@ -49,10 +49,10 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
     try:
         for part in relative.parts[:-1]:
             above, fd = fd, os.open(part, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=fd)
-            os.close(above)
+            release(above)
         return _contents(os.open(relative.name, _READ | os.O_NOFOLLOW, dir_fd=fd), limit_bytes)
     finally:
-        os.close(fd)
+        release(fd)
 
 
 def _contents(fd: int, limit_bytes: int) -> bytes:

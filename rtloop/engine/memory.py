@@ -23,6 +23,7 @@ import numpy as np
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 from rtloop.hil.native.words import load_acquire, store_release
+from rtloop.hil.trusted import release
 
 DIRECTORY_BYTES = 8192
 _LOCK = "hhqqi4x"
@@ -194,7 +195,7 @@ class SharedBlock:
         except ProcessLookupError:
             pass
         finally:
-            os.close(process)
+            release(process)
 
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""

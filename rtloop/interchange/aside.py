@@ -21,7 +21,7 @@ import numpy as np
 
 from rtloop.errors import MissingExtra, RtloopError
 from rtloop.interchange.formats.groups import BYTES_AT_MOST, rows_of
-from rtloop.interchange.formats.table import Table, UnreadableData
+from rtloop.interchange.formats.table import Table, UnopenedData, UnreadableData
 from rtloop.interchange.reading import read_here
 
 MEMORY_BYTES = 6 * BYTES_AT_MOST
@@ -53,7 +53,8 @@ def _received(path: Path, stream: IO[bytes]) -> Table | None:
         return None
     said = json.loads(line)
     if "error" in said:
-        raise (MissingExtra if said["kind"] == MissingExtra.__name__ else UnreadableData)(said["error"])
+        kinds = {kind.__name__: kind for kind in (MissingExtra, UnopenedData)}
+        raise kinds.get(said["kind"], UnreadableData)(said["error"])
     columns = {name: np.empty(said["rows"]) for name in said["columns"]}
     for values in columns.values():
         rest = values.data.cast("B")

@@ -23,7 +23,14 @@ from rtloop.interchange.aside import read_table
 from rtloop.interchange.formats.groups import rows_of
 from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.mapping import Column, axes_of, bare, column_of, find_column, own_name, signal_name, unit_in
-from rtloop.interchange.sampling import OWN, Sampling, came_from_a_recording, sampling, time_column
+from rtloop.interchange.sampling import (
+    OWN,
+    Sampling,
+    came_from_a_recording,
+    grows_evenly,
+    sampling,
+    time_column,
+)
 from rtloop.interchange.wanted import NAME, Wanted
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
@@ -86,7 +93,8 @@ def import_data(
 def listing(path: Path, table: Table, wanted: Wanted) -> dict[str, Any]:
     """What is in a file: {file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files}."""
     columns = [
-        {"name": name, "unit": unit_in(table, name), **extremes(values)} for name, values in table.columns.items()
+        {"name": name, "unit": unit_in(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
+        for name, values in table.columns.items()
     ]
     said: dict[str, Any] = {"time": None, "rate_hz": None, "time_column": time_column(table)}
     try:

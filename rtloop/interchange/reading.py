@@ -11,7 +11,7 @@ from rtloop.interchange.formats.from_hdf5 import read_hdf5
 from rtloop.interchange.formats.from_mat import HDF5_AT, HDF5_MAGIC, read_mat
 from rtloop.interchange.formats.from_npz import read_npz
 from rtloop.interchange.formats.from_parquet import read_parquet
-from rtloop.interchange.formats.table import Table, UnreadableData
+from rtloop.interchange.formats.table import Table, UnopenedData
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
@@ -21,13 +21,13 @@ def read_here(path: Path, group: str | None = None) -> Table:
 
     A library may let anything through of a damaged file, or crash: `aside.read_table` does not.
 
-    Raises UnreadableData, MissingExtra.
+    Raises UnopenedData, UnreadableData, MissingExtra.
     """
     try:
         with os.fdopen(open_named(path), "rb") as file:
             head = file.read(HDF5_AT + len(HDF5_MAGIC))
     except OSError as error:
-        raise UnreadableData(f"{path}: {error.strerror}") from None
+        raise UnopenedData(f"{path}: {error.strerror}") from None
     if head.startswith(MCAP_MAGIC):
         from rtloop.interchange.formats.from_mcap import read_mcap
 

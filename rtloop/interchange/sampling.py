@@ -83,9 +83,13 @@ def time_column(table: Table) -> str | None:
 def _unnamed_time(table: Table) -> str | None:
     """The first of columns without names, or row of Simulink's To File, where it grows evenly."""
     name, times = next(iter(table.columns.items()))
-    steps = np.diff(times)
-    even = steps.size > 1 and steps.min() > 0 and steps.max() < MISSING * steps.min()
-    return name if name.endswith("_1") and len(table.columns) > 1 and even else None
+    return name if name.endswith("_1") and len(table.columns) > 1 and grows_evenly(times) else None
+
+
+def grows_evenly(values: Real) -> bool:
+    """Whether each value is larger than the one before, by about the same step: as a clock or a counter does."""
+    steps = np.diff(values)
+    return steps.size > 1 and bool(steps.min() > 0 and steps.max() < MISSING * steps.min())
 
 
 def unit_of_time(table: Table, name: str, asked: str, said: str) -> str | None:

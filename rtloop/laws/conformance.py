@@ -164,6 +164,7 @@ class Bench:
         self.coefficients[:] = record_of(law)
         self.state: Any = records(keeps.state, 1)
         self._told: Any = records(told_by(law.count), 1) if law.count else None
+        self._rows = (self.coefficients[0], self.state[0])
         self._kernels: dict[str, Any] = {}
         self._signatures = signatures_of(type(law), keeps)
         for name, signature in self._signatures.items():
@@ -172,7 +173,7 @@ class Bench:
 
     def _call(self, name: str, told: Any) -> Any:
         with np.errstate(all="ignore"):
-            return self._kernels[name](self.coefficients[0], self.state[0], told)
+            return self._kernels[name](*self._rows, told)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
         """What each tick gives, a number or one for each axis, and the state and the outputs after it."""
@@ -186,15 +187,15 @@ class Bench:
             told = self._told[0]
             reach = 1e6 if wild and number % 97 == 0 else REACH_UM
             axes = None if self._law.count == 1 else self._law.count
-            told.position_um = random.uniform(-reach, reach, axes)
-            told.reference_um = random.uniform(-reach, reach, axes)
-            told.error_um = told.reference_um - told.position_um
-            told.command_um = told.applied_um = random.uniform(-REACH_UM, REACH_UM, axes)
-            told.inputs, told.outputs = random.uniform(-10, 10, MAX_EXTRAS), np.zeros(MAX_EXTRAS)
+            position_um, reference_um = random.uniform(-reach, reach, axes), random.uniform(-reach, reach, axes)
+            told["position_um"], told["reference_um"] = position_um, reference_um
+            told["error_um"] = reference_um - position_um
+            told["command_um"] = told["applied_um"] = random.uniform(-REACH_UM, REACH_UM, axes)
+            told["inputs"], told["outputs"] = random.uniform(-10, 10, MAX_EXTRAS), 0.0
             value = self._commands(told)
-            told.command_um, told.applied_um = value, np.clip(value, -REACH_UM, REACH_UM)
+            told["command_um"], told["applied_um"] = value, np.clip(value, -REACH_UM, REACH_UM)
             self._call("update", told)
-            yield value, self.state.tobytes() + told.outputs.tobytes()
+            yield value, self.state.tobytes() + told["outputs"].tobytes()
 
     def _commands(self, told: Any) -> Any:
         """What the controller commands: a number, or a tuple with one for each of its axes."""

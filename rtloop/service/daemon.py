@@ -16,7 +16,7 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import UnavailableError
-from rtloop.hil.trusted import Untrusted, open_folder
+from rtloop.hil.trusted import Untrusted, open_folder, release
 from rtloop.service.api.application import application
 from rtloop.service.api.connections import BACKLOG, settings
 from rtloop.service.can_bus import supervised_by_can
@@ -28,6 +28,8 @@ from rtloop.service.service import Service
 from rtloop.supervision.paths import FOLDER_MODE, refusal, socket_path
 
 END_TIMEOUT_S = 5.0
+NO_THREAD = "can't start new thread"
+"""What Python says of it; it has no class of its own."""
 
 
 def serve(config: Path, duration_s: float | None = None) -> int:
@@ -35,7 +37,13 @@ def serve(config: Path, duration_s: float | None = None) -> int:
 
     Raises RtloopError.
     """
-    _log_to_stderr()
+    with _refused_in_words():
+        _log_to_stderr()
+        return _serve(config, duration_s)
+
+
+def _serve(config: Path, duration_s: float | None) -> int:
+    """As `serve`, with the journal there; raises OSError and RuntimeError too, where the system refuses something."""
     service = Service(config, duration_s)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.end())
@@ -47,6 +55,19 @@ def serve(config: Path, duration_s: float | None = None) -> int:
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()
+
+
+@contextlib.contextmanager
+def _refused_in_words() -> Iterator[None]:
+    """Raise UnavailableError for what the system refuses: in place of OSError, and where no thread can be started."""
+    try:
+        yield
+    except OSError as error:
+        raise UnavailableError(f"the host refuses what the service needs: {error.strerror or error}") from error
+    except RuntimeError as error:
+        if NO_THREAD not in str(error):
+            raise
+        raise UnavailableError(f"the host refuses what the service needs: {error}") from error
 
 
 @contextlib.contextmanager
@@ -62,8 +83,10 @@ def _listening(service: Service) -> Iterator[None]:
     finally:
         server.should_exit = server.force_exit = True
         thread.join(END_TIMEOUT_S)
-        listener.close()
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a socket that stays is cleared by the next service
+            path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            listener.close()
 
 
 def _bind(path: Path, mode: int) -> socket.socket:
@@ -78,7 +101,7 @@ def _bind(path: Path, mode: int) -> socket.socket:
         try:
             group = os.fstat(folder).st_gid
         finally:
-            os.close(folder)
+            release(folder)
         _clear(path)
         previous = os.umask(0o777)
         try:

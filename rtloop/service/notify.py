@@ -24,7 +24,7 @@ class Notifier:
             return
         message = "\n".join(f"{name}={value}" for name, value in fields.items())
         # a manager that went away, or does not read, is no reason to stop the loop
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel, contextlib.suppress(OSError):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
             channel.setblocking(False)
             channel.sendto(message.encode(), self._address)
 

@@ -76,13 +76,14 @@ class Child:
             return False
         self.close_stdin()
         if self.process.stdout is not None:
-            self.process.stdout.close()
+            with contextlib.suppress(OSError):
+                self.process.stdout.close()
         return True
 
     def close_stdin(self) -> None:
         """Say that nothing more will come; a child that waits for its orders ends."""
         if self.process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
+            with contextlib.suppress(OSError):
                 self.process.stdin.close()
 
     def _read(self) -> None:

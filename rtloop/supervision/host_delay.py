@@ -19,7 +19,7 @@ from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.errors import ConfigError, OutputError
 from rtloop.hil.options import Options
-from rtloop.hil.trusted import Untrusted, open_file, open_folder
+from rtloop.hil.trusted import Untrusted, open_file, open_folder, release
 from rtloop.supervision.paths import FOLDER_MODE, client_folders, refusal, runtime_folder
 
 MOST_BYTES = 1 << 16
@@ -67,7 +67,7 @@ def note_host_delay(configuration: Configuration, **measured: Any) -> None:
     kept = (before or HostDelay(rate_hz=rate_hz)).model_copy(update=measured)
     path = runtime_folder() / _name(configuration)
     try:
-        os.close(open_folder(path.parent, FOLDER_MODE))
+        release(open_folder(path.parent, FOLDER_MODE))
         fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o640)
         with os.fdopen(fd, "w") as file:
             file.write(kept.model_dump_json())

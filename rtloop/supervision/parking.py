@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from rtloop.engine.memory import UNREADABLE, SharedBlock, Word, claimant
 from rtloop.engine.ramp import LONGEST_RAMP_S, found_v, output_indices, ramp_to_safe, safe_outputs_v, unusable_drives
 from rtloop.errors import RtloopError, UnavailableError, one_line
 from rtloop.hil.native.uncompiled import as_written
+from rtloop.hil.trusted import release
 from rtloop.supervision.account import Account
 from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, noted
 from rtloop.supervision.paths import block_path, hardware_path, open_block
@@ -103,7 +103,7 @@ def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
             account.remarks.append(f"{path}: the shared block is not understood, and counts as none: {one_line(error)}")
         yield block
     finally:
-        os.close(fd)
+        release(fd)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtloop.errors import HostRefused, OutputError, UnavailableError
-from rtloop.hil.trusted import Untrusted, open_file, open_folder
+from rtloop.hil.trusted import Untrusted, open_file, open_folder, release
 
 if TYPE_CHECKING:  # clients of the control API need none of it: half a second of import
     from rtloop.configuration.file import Configuration
@@ -65,7 +65,7 @@ def new_file(path: Path, what: str = "the shared block") -> int:
                 os.unlink(path.name, dir_fd=folder)
             return os.open(path.name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600, dir_fd=folder)
         finally:
-            os.close(folder)
+            release(folder)
     except Untrusted as error:
         raise refusal(error) from None
     except OSError as error:

@@ -139,7 +139,10 @@ class RecorderKeeper:
             raise OutputError(f"{self._path}: cannot record: {self._totals().get('error') or 'the recorder ended'}")
 
     def _replace_if_gone(self) -> None:
-        """Replace a recorder that died or stands still; give a new one its orders."""
+        """Replace a recorder that died or stands still; give a new one its orders.
+
+        A recorder whose process ends by itself after the loop has come to its end is done.
+        """
         if not self._ordered:
             if self.state == ProcessState.READY:
                 self._order()
@@ -147,7 +150,9 @@ class RecorderKeeper:
         taken = self._block.load(Word.RECORDER_CURSOR)
         behind = int(self._block["ticks_head"][0]) != taken
         stuck = self._watch.stalled(taken, time.monotonic()) and behind
-        if (self.exit_code is not None or stuck) and self.replacements < MAX_REPLACEMENTS:
+        loop_ended = self._block.load(Word.LOOP_STATE) in (ProcessState.FINISHED, ProcessState.FAILED)
+        died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
+        if (died or stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
             if not self._child.end():
                 return  # it hangs in the kernel, where its file is: it may yet go on
@@ -164,8 +169,8 @@ class RecorderKeeper:
             self._replace_if_gone()
             time.sleep(POLL_S)
         if self._child.wait(END_TIMEOUT_S) is None:
-            self._child.end()
             self.notes.append("the recorder did not end and was killed")
+        self._child.end()
         totals = {"path": str(self._path), "complete": False, "error": "the recorder died"} | self._totals()
         for part in self._files(".mcap.part"):
             self._repair(part)

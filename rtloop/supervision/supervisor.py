@@ -6,6 +6,7 @@ older than its limit.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import threading
@@ -184,7 +185,8 @@ class Supervisor:
                 raise self.recorder.failure
             time.sleep(START_POLL_S)
         self.block.store(Word.GO, 1)
-        self.startup_s = seconds_since_start()
+        with contextlib.suppress(OSError):  # a figure: no reason to stop a loop that runs
+            self.startup_s = seconds_since_start()
 
     def poll(self) -> RunResult | None:
         """Watch the loop, park what it leaves; the result once the recording has come to its end as well."""

@@ -91,8 +91,8 @@ def print_dynamics(report: dict[str, Any]) -> None:
     shown = table("mode", "Hz", "± (1σ)", "damping", "± (1σ)", "static share")
     for i, mode in enumerate(report["modes"]):
         shown.add_row(
-            str(i), f"{mode['frequency_hz']:.3f}", f"{mode['frequency_std_hz']:.2g}", f"{mode['damping']:.5f}",
-            f"{mode['damping_std']:.2g}", f"{mode['static_share']:.4f}",
+            str(i), f"{mode['frequency_hz']:.3f}", _number(mode["frequency_std_hz"], "{:.2g}"),
+            f"{mode['damping']:.5f}", _number(mode["damping_std"], "{:.2g}"), f"{mode['static_share']:.4f}",
         )  # fmt: skip
     out.print(shown)
     tests = report["tests"]

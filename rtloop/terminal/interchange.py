@@ -62,8 +62,8 @@ def print_listing(report: Mapping[str, Any]) -> None:
 
 
 def _likely(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:
-    """A drive and a position by their units, else the first columns that are left."""
-    left, found = [one for one in columns if one["name"] != time and not _converts(one["unit"], "s")], []
+    """A drive and a position by their units, else the first columns that are left and are no clock."""
+    left, found = [one for one in columns if one["name"] != time and not _is_clock(one)], []
     for name, unit in LIKELY:
         one = next((one for one in left if _converts(one["unit"], unit)), next(iter(left), None))
         if one is not None:
@@ -71,6 +71,11 @@ def _likely(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, 
             fits = _converts(one["unit"], unit)
             found.append((name, f"{bare(one['name'])} [{one['unit'] if fits else unit}]"))
     return found
+
+
+def _is_clock(column: dict[str, Any]) -> bool:
+    """Whether a column has a unit of time, or no unit and grows evenly."""
+    return _converts(column["unit"], "s") or (not column["unit"] and column["grows_evenly"])
 
 
 def _converts(unit: str | None, target: str) -> bool:

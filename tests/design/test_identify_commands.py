@@ -238,6 +238,7 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
         assert "Traceback" not in result.output
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_one_command_makes_a_configuration_that_runs_as_promised(folder: Path, sine: Path, step: Path) -> None:
     """Identify, synthesise, write, verify; then run it on the rig that was identified, without its noise.
 

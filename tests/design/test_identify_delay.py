@@ -1,12 +1,17 @@
 """Whole samples of delay, told from recordings: a mode and nothing else, seen late."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from rtloop.design.identification.dynamics.dynamics_fit import modes_of
 from rtloop.design.identification.dynamics.identify_delay import Candidate, simplest
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.design.identification.measured import UnsuitableData
 from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import build_rig
 from tests.design.rigs import _record
@@ -92,3 +97,40 @@ def test_fewer_poles_win_among_equally_good_predictions_and_lose_against_a_clear
 
 def delays_of(candidates: list[Candidate]) -> list[int]:
     return [candidate.ticks for candidate in candidates]
+
+
+@pytest.mark.parametrize("criterion", ["aic", "held-out"])
+def test_creep_is_not_taken_for_a_mode(criterion) -> None:
+    """Creep of 0.08 µm per factor e of time, which a mode slower than the run would follow, and take D(0) with it."""
+    drive_v = up_and_down()
+    run = excitation(800.0, 0.02, 1, drive_v)
+    creep_um = 0.08 * np.log1p(np.maximum(PERIOD_S * np.arange(drive_v.size) - 0.05, 0.0) / 0.01)
+    fit = identify_dynamics(replace(run, position_um=run.position_um + creep_um), criterion=criterion)
+    assert all(mode.frequency_hz > 1 / (2 * np.pi * PERIOD_S * drive_v.size) for mode in fit.modes)
+    (light,) = [mode for mode in fit.modes if mode.damping < 0.1]
+    assert light.frequency_hz == pytest.approx(800.0, rel=1e-3)
+    assert light.static_share == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_stage_that_has_not_settled_by_the_end_is_refused() -> None:
+    """A lag of 2 s in a recording of 0.6 s: where it would come to rest cannot be told."""
+    run = Excitation("rig", up_and_down(), np.zeros(6000), PERIOD_S)
+    lag = 1 - np.exp(-PERIOD_S / 2.0)
+    position_um = lfilter([0.0, lag], [1.0, lag - 1.0], run.input) + np.random.default_rng(1).normal(
+        scale=1e-3, size=6000
+    )
+    with pytest.raises(
+        UnsuitableData, match=r"drifts or creeps.* longer than the recording, such as 2\.?\d* s in 0.6 s"
+    ):
+        identify_dynamics(replace(run, position_um=position_um), order=1, delay_ticks=0)
+
+
+def test_a_mode_that_is_over_within_a_sample_has_no_spread() -> None:
+    """Poles at z = 1e-9, and at 0.01, of a model that was written down."""
+    rates = np.log([1e-9, 0.01]) / PERIOD_S
+    model = Innovations(PERIOD_S, rates + 0j, np.array([0.5, 0.5]) + 0j, np.zeros(2, complex), 1.0)
+    slow, fast = modes_of(model, np.eye(4), noise=False)
+    assert slow.frequency_hz == pytest.approx(-np.log(0.01) / PERIOD_S / (2 * np.pi))
+    assert np.isfinite(slow.frequency_std_hz)
+    assert fast.frequency_hz == pytest.approx(14 / PERIOD_S / (2 * np.pi))
+    assert (fast.frequency_std_hz, fast.damping_std) == (np.inf, np.inf)

@@ -42,6 +42,7 @@ def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
     assert all(abs(distances[name]) <= limit for name, limit in LIMITS.items()), distances
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_the_stage_of_ones_own_keeps_its_specification(tmp_path, monkeypatch) -> None:
     """deploy/own-stage*.toml, as docs/identification.md walks through them: every command ends with 0."""
     recordings = [

@@ -71,6 +71,7 @@ def automatically(recordings, folder, text: str):
     return CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_two_recordings_become_a_loop_with_taps_that_keeps_its_promise(recordings, tmp_path) -> None:
     """The step on the rig is the one that is promised; the interlocks are armed; progress is on stderr alone."""
     result = automatically(recordings, tmp_path, SPEC.format(percent=3.0))

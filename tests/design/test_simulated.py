@@ -218,6 +218,24 @@ def test_a_model_stands_for_hardware() -> None:
         Bench(card, {"x": stand._replace(residual_percent=90.0)})
 
 
+@pytest.mark.parametrize(
+    ("specification", "simulation", "heights_um", "judged"),
+    [
+        ({}, {}, (1.0, 5.0, 20.0, 40.0), False),
+        ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {}, (1.0, 5.0, 20.0, 40.0, 18.0), False),
+        ({"command": {"reference_um": 40.1, "command_um": 50.0}}, {}, (1.0, 5.0, 20.0, 40.0), False),
+        ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {"steps_um": [3.0]}, (3.0,), False),
+        ({}, {"residual_percent": 0.0}, (1.0, 5.0, 20.0, 40.0), True),
+        ({}, {"residual_percent": 3.0, "judged": False}, (1.0, 5.0, 20.0, 40.0), False),
+        ({}, {"judged": True}, (1.0, 5.0, 20.0, 40.0), True),
+    ],
+)
+def test_the_step_that_is_asked_for_is_simulated_and_judged(specification, simulation, heights_um, judged) -> None:
+    """The size that the specification names is one of the heights; a hysteresis that is stated makes steps count."""
+    design = DesignOptions.model_validate({"specification": specification, "simulation": simulation})
+    assert (design.step_heights_um, design.judges_simulated_steps) == (heights_um, judged)
+
+
 def test_what_cannot_run_is_not_simulated() -> None:
     without = replace(PAPER, axes=(PAPER.axes[0].model_copy(update={"controller": None}),))
     with pytest.raises(ConfigError, match="mode closed_loop needs it"):

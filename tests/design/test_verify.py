@@ -112,6 +112,7 @@ def test_the_report_is_complete_and_stands_alone(report) -> None:
     assert json.loads((out / "verify.json").read_text(encoding="utf-8"))["axes"][0]["name"] == "x"
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_the_terminal_shows_required_achieved_verdict_and_claim() -> None:
     result = run(str(DEPLOY / "paper.toml"))
     assert result.exit_code == 1
@@ -123,6 +124,7 @@ def test_the_terminal_shows_required_achieved_verdict_and_claim() -> None:
     assert "the loop misses static error" in result.stdout
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_a_specification_that_is_met(tmp_path) -> None:
     spec = tmp_path / "modest.toml"
     spec.write_text(f"{MODEST}resonance_shift_percent = 1.0\n")
@@ -185,6 +187,7 @@ def nothing_moved() -> Robustness:
     return Robustness({}, {}, 0.0, 0)
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path) -> None:
     shown = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
     assert shown.meets
@@ -197,6 +200,19 @@ def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path)
     assert "simulated, settling (5 %) of 2 µm steps" in answer(found)
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
+def test_a_stated_hysteresis_makes_the_steps_count(tmp_path) -> None:
+    """Without `judged`: 18 µm are asked for, simulated beside the others, and miss the settling time."""
+    command = "[specification.command]\nreference_um = 18.0\ncommand_um = 30.0\n"
+    spec = MODEST.replace("settling_ms = 5.0", "settling_ms = 4.0") + command
+    found = judged(tmp_path, spec + "[simulation]\nresidual_percent = 3.0\n", simulated=True)
+    assert found.simulated is not None
+    assert 18.0 in [step.height_um for step in found.simulated.steps]
+    assert not found.meets
+    assert "of 18 µm steps" in answer(found)
+
+
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_what_trips_is_said(tmp_path) -> None:
     """An interlock at 6 µm ends a step of 10 µm."""
     config = (DEPLOY / "paper.toml").read_text().replace("position_um = 60.0", "position_um = 6.0")
@@ -251,6 +267,7 @@ def test_a_delay_that_the_model_states_is_not_raised_to_that_of_the_rig() -> Non
     assert late.endswith("the loop is judged with 1")
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_faults_of_the_user(tmp_path, monkeypatch) -> None:
     assert run(str(tmp_path / "none.toml")).exit_code == 66
     assert run(str(DEPLOY / "paper.toml"), "--spec", str(tmp_path / "none.toml")).exit_code == 66

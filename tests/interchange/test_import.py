@@ -116,6 +116,20 @@ def test_times_that_jitter_and_samples_that_are_missing_are_told_and_kept(folder
     assert "jitter" in run("info", "scan.mcap").stdout
 
 
+def test_a_file_that_is_not_there_ends_as_with_every_command(folder: Path):
+    result = run("import", "absent.csv")
+    assert (result.exit_code, result.stderr) == (66, "rtloop: absent.csv: No such file or directory\n")
+
+
+def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
+    """Neither a clock in seconds since 1970 nor a counter, where no unit says what they are."""
+    rows = "".join(f"{1_700_000_000 + k},{k},{k % 3},{k % 5}\n" for k in range(100))
+    (folder / "scan.csv").write_text("stamp,count,out,gap\n" + rows)
+    offered = run("import", "scan.csv").stdout.partition("Such as")[2]
+    assert "--map 'x_drive_v=out [V]'" in offered
+    assert "--map 'x_position_um=gap [µm]'" in offered
+
+
 def test_a_rate_counts_where_the_time_is_not_believed(folder: Path):
     savemat(folder / "scan.mat", {"time": np.round(TIME, 3), "u": VOLTS})
     result = run("import", "scan.mat", "--all")

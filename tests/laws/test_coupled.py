@@ -207,6 +207,7 @@ def test_the_loop_is_as_it_was_predicted(tmp_path):
     assert predicted.disk_margin == pytest.approx(disk, rel=0.01)
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_it_is_verified_as_it_runs():
     """What `design verify` promises of a step is what the rig does; there is no C(s), and nothing is said of one."""
     answer = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["coupled"]), "--json"])
@@ -223,6 +224,7 @@ def test_it_is_verified_as_it_runs():
     assert rows["settling_ms"]["running"] == pytest.approx((outside[-1] + 1) * 0.1, abs=0.15)
 
 
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_a_law_of_one_axis_is_verified_too():
     answer = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["pid"])])
     assert answer.exit_code == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import queue
@@ -136,6 +137,21 @@ def test_what_was_not_looked_at_yet_is_not_removed(tmp_path: Path):
     assert len(left(tmp_path)) == len(files)
 
 
+def test_a_file_that_cannot_be_looked_at_holds_back_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It may hold the trip that the file before it leads to."""
+    files, lstat = run_of(tmp_path, "20260101T000001", 4, trip=PART + 1), os.lstat
+
+    def refuse(path: Any, *arguments: Any, **options: Any) -> os.stat_result:
+        if Path(path) == files[1]:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return lstat(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "lstat", refuse)
+    quota = Quota(tmp_path, "test", 1, 0)
+    assert quota.keep(budget_s=60.0) == []
+    assert quota.failure == f"{tmp_path}: {os.strerror(errno.EIO)}"
+
+
 def test_a_folder_that_is_gone_is_said(tmp_path: Path):
     quota = Quota(tmp_path / "gone", "test", 1, 0)
     assert quota.keep() == []
@@ -151,6 +167,9 @@ class Listener:
 
     def wait(self, timeout_s: float) -> int:
         return 0
+
+    def end(self) -> bool:
+        return True
 
 
 def test_the_recorder_is_told_what_went_and_a_failure_is_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

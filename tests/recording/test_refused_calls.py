@@ -12,6 +12,7 @@ from typing import Any, cast
 
 import pytest
 
+from rtloop.engine.memory import Word
 from rtloop.errors import OutputError
 from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
@@ -131,3 +132,25 @@ def test_a_run_whose_last_file_cannot_be_begun_is_not_complete(tmp_path: Path, m
     summary = summarise(totals["paths"])
     assert (totals["complete"], totals["ticks_lost"]) == (False, SECOND // 2)
     assert (summary.complete, summary.ticks_lost) == (False, SECOND // 2)
+
+
+def test_a_run_whose_last_file_gets_no_tick_is_not_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    disk = Disk(monkeypatch)
+    recorded = Recorded(tmp_path / "run.mcap", rotate_s=1.0)
+    recorded.run_to(2 * SECOND + 100)
+    disk.longest_write_bytes = 40_000  # enough for a file's beginning, not for ticks
+    recorded.run_to(2 * SECOND + SECOND // 2)
+    totals = recorded.end()
+    assert (len(totals["paths"]), totals["complete"], totals["ticks_lost"]) == (2, False, SECOND // 2)
+    summary = summarise(totals["paths"])
+    assert (summary.complete, summary.problems) == (False, ["part 3 of the run is missing"])
+
+
+def test_ticks_that_make_room_for_the_index_are_not_said_to_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    recorded = Recorded(tmp_path / "run.mcap")
+    recorded.run_to(SECOND)
+    refuse_the_end_once(monkeypatch)
+    totals = recorded.end()
+    assert totals["ticks_logged"] == len(load(totals["paths"])) < SECOND
+    load_word = recorded.loop.block.load
+    assert load_word(Word.FLUSHED_TICKS) - load_word(Word.LOST_TICKS) == totals["ticks_logged"]

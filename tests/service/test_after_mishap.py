@@ -126,6 +126,33 @@ def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_
     assert keeper.replacements == replaced
 
 
+@pytest.mark.parametrize(
+    ("loop", "code", "replaced"),
+    [
+        (ProcessState.FINISHED, 0, 0), (ProcessState.FINISHED, 1, 0), (ProcessState.FAILED, 0, 0),
+        (ProcessState.RUNNING, 0, 1), (ProcessState.FINISHED, -9, 1),
+    ],
+)  # fmt: skip
+def test_a_recorder_that_ended_with_its_loop_is_not_replaced(block, tmp_path, monkeypatch, loop, code, replaced):
+    """The supervisor may be late to see the end of the loop; a killed recorder is replaced all the same."""
+    monkeypatch.setattr(recorder_keeper, "Child", Recorder)
+    keeper = a_keeper(block, tmp_path)
+    block.store(Word.LOOP_STATE, loop)
+    keeper._child.exit_code = code  # type: ignore[misc]
+    keeper._replace_if_gone()
+    assert keeper.replacements == replaced
+
+
+def test_the_pipes_of_the_last_recorder_are_closed(block, tmp_path, monkeypatch):
+    """It may be another than that which the run began with."""
+    keeper, ended = a_keeper(block, tmp_path), list[bool]()
+    child: Any = keeper._child
+    child.exit_code, child.wait, child.reports = 0, lambda _: 0, list
+    monkeypatch.setattr(child, "end", lambda: ended.append(True), raising=False)
+    keeper._finish()
+    assert ended == [True]
+
+
 def test_another_recorder_begins_behind_the_last_file_whatever_was_removed(block, tmp_path):
     """The quota took the files 1 to 3: a fifth after the fourth, and never one that is there."""
     keeper = a_keeper(block, tmp_path)

@@ -20,6 +20,7 @@ from rtloop.hil import board
 from rtloop.supervision import parking
 from rtloop.supervision.account import Account
 from rtloop.supervision.hardware import Hardware, UnreadableNote, keep, noted
+from tests.syscalls.parking import ParkingABoard
 
 WIRING = {"x": Wiring("adc0", "dac0")}
 
@@ -78,3 +79,18 @@ def test_a_board_that_cannot_be_mapped_is_told(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(DriverError, match="Too many open files"):
         driver.open()
     assert len(os.listdir("/proc/self/fd")) == open_before
+
+
+def test_a_board_and_a_block_that_cannot_be_closed_are_parked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Every `close` fails: Linux frees the descriptor all the same, and parking comes to its end."""
+    case = ParkingABoard(tmp_path)
+    close = os.close
+
+    def close_and_refuse(fd: int) -> None:
+        close(fd)
+        refuse()
+
+    with monkeypatch.context() as refusing:
+        refusing.setattr(os, "close", close_and_refuse)
+        assert "parked from" in parking.park_configuration(case.config)
+    assert case.written_v()[-1] == 0.0

@@ -26,13 +26,14 @@ LONGEST = 1_500
 """Characters of a problem."""
 
 
-def table(tried: Counter[tuple[str, str]], failed: Counter[str], missed: Counter[str]) -> Table:
-    """Calls tried by component and kind; `missed` are those that the work did not come to a second time."""
-    columns = ("component", *KINDS, "not reached", "failed")
+def table(tried: Counter[tuple[str, str]], failed: Counter[str], missed: Counter[str], crashed: Counter[str]) -> Table:
+    """Calls tried by component and kind; `missed` are tries that did not come about: how often a process waits, and
+    in which order its threads run, depends on time."""
+    columns = ("component", *KINDS, "not reached", "traceback", "failed")
     shown = Table(*columns, title=f"{sum(tried.values())} calls, failed {sum(failed.values())}")
     for name in dict.fromkeys(component for component, _ in tried):
         counts = [str(tried[name, kind]) for kind in KINDS]
-        shown.add_row(name, *counts, str(missed[name]), str(failed[name]))
+        shown.add_row(name, *counts, str(missed[name]), str(crashed[name]), str(failed[name]))
     return shown
 
 
@@ -42,6 +43,7 @@ def main() -> int:
     parser.add_argument("components", nargs="*", choices=[[], *COMPONENTS], metavar="COMPONENT")
     parser.add_argument("--sample", type=int, metavar="N")
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--last-first", action="store_true", help="in the opposite order: two of these meet")
     parser.add_argument("--mutants", action="store_true", help="plant mistakes, and see each of them found")
     options = parser.parse_args()
     if reason := unavailable():
@@ -51,23 +53,28 @@ def main() -> int:
         from tests.syscalls.mutants import run
 
         return run()
-    tried, failed, missed, start_s = Counter[tuple[str, str]](), Counter[str](), Counter[str](), time.monotonic()
+    tried, start_s = Counter[tuple[str, str]](), time.monotonic()
+    failed, missed, crashed = Counter[str](), Counter[str](), Counter[str]()
     with TemporaryDirectory(prefix="rtloop-syscalls-") as name, surroundings():
         tries, problems = plan([COMPONENTS[each] for each in options.components or COMPONENTS], Path(name))
         print(*problems, sep="\n", file=sys.stderr)
         failed.update(["as it is"] * len(problems))
         chosen = tries if options.sample is None else sample(tries, options.sample, options.seed)
+        chosen = chosen[::-1] if options.last_first else chosen
         for number, (component, injection) in enumerate(chosen, start=1):
             result = component.measure(Path(name), injection)
-            tried[component.name, injection.kind] += 1
+            tried[component.name, injection.kind] += result.reached
             missed[component.name] += not result.reached
+            if result.crashed:
+                crashed[component.name] += 1
+                print(f"{component.name}: {injection}: ends in a traceback", file=sys.stderr)
             if result.problems:
                 failed[component.name] += 1
                 print(f"{component.name}: {injection}: {injection.call.line[:200]}", file=sys.stderr)
                 print("   " + "\n   ".join(problem[-LONGEST:] for problem in result.problems), file=sys.stderr)
             if number % 100 == 0:
                 print(f"{number}/{len(chosen)}, {time.monotonic() - start_s:.0f} s", file=sys.stderr, flush=True)
-    Console(width=140).print(table(tried, failed, missed))
+    Console(width=140).print(table(tried, failed, missed, crashed))
     return int(any(failed.values()))
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 from rtloop.drivers.base import Channel, Facts
@@ -23,6 +24,7 @@ class FileCardOptions(Options):
 class FileCard(PythonDriver):
     kind = KIND
     options_model = FileCardOptions
+    options: FileCardOptions
     fd: int | None = None
 
     @property
@@ -43,7 +45,7 @@ class FileCard(PythonDriver):
     def read(self) -> tuple[float]:
         return (0.0,)
 
-    def write(self, volts: list[float]) -> None:
+    def write(self, volts: Sequence[float]) -> None:
         assert self.fd is not None
         os.write(self.fd, struct.pack("<d", volts[0]))
 

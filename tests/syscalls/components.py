@@ -15,18 +15,24 @@ from tests.syscalls.files import Cutting, KeepingQuota, Recovering
 from tests.syscalls.parking import Noting, ParkingABoard, ParkingACard, ParkingTheNoted
 from tests.syscalls.recorder import Recording
 from tests.syscalls.recordings import small_chunks
+from tests.syscalls.service import ImportingAService, StartingAService, StoppingAService
 
+IMPORTS = 20
+"""Calls of a service's imports that are tried: each takes some seconds, and they are thousands of one kind."""
 COMPONENTS = {
     component.name: component
     for component in (
-        Component("recorder", Recording, share=8),
-        Component("recover", Recovering, share=4),
-        Component("cut", Cutting, share=4),
-        Component("quota", KeepingQuota, share=3),
-        Component("note", Noting, share=2),
-        Component("parking", ParkingABoard, share=4),
-        Component("parking-noted", ParkingTheNoted, share=2),
-        Component("parking-card", ParkingACard, share=4),
+        Component("recorder", Recording, share=24),
+        Component("recover", Recovering, share=12),
+        Component("cut", Cutting, share=12),
+        Component("quota", KeepingQuota, share=12),
+        Component("note", Noting, share=6),
+        Component("parking", ParkingABoard, share=12),
+        Component("parking-noted", ParkingTheNoted, share=6),
+        Component("parking-card", ParkingACard, share=12),
+        Component("service-imports", ImportingAService, share=0, most=IMPORTS),
+        Component("service-start", StartingAService, share=1, is_thinned=True),
+        Component("service-stop", StoppingAService, share=1, is_thinned=True),
     )
 }
 

@@ -17,6 +17,7 @@ from rtloop.recording.file.mcap.chunkfile import ChunkFile
 from rtloop.recording.file.writer import Writer
 from rtloop.supervision import parking as parking_module
 from rtloop.supervision.hardware import _AS_JSON, Hardware
+from rtloop.supervision.supervisor import Supervisor
 from tests.syscalls import parking
 from tests.syscalls.component import Component
 from tests.syscalls.components import COMPONENTS, surroundings
@@ -67,6 +68,18 @@ def ignore_refused_writes() -> None:
     parking_module.ramp_to_safe = careless
 
 
+def tidy_up_at_the_stop() -> None:
+    """A service that is told to end removes unfinished recordings, as its recorder will finish its own."""
+    stop = Supervisor.stop
+
+    def tidy(supervisor: Supervisor) -> None:
+        for part in Path(supervisor.prepared.configuration.recording.folder).glob("*.part"):
+            part.unlink()
+        stop(supervisor)
+
+    Supervisor.stop = tidy  # type: ignore[method-assign]
+
+
 class Mutant(NamedTuple):
     """A mistake in a component, the kinds and calls that may find it; any of them has to."""
 
@@ -94,6 +107,7 @@ MUTANTS = (
     Mutant(remove_before_it_is_whole, "recover", (KILLED_AFTER,), ("unlink",)),
     Mutant(write_the_note_in_place, "note", (KILLED_AFTER, KILLED_BEFORE), ("openat", "write")),
     Mutant(ignore_refused_writes, "parking-card", ("EIO",), ("write",)),
+    Mutant(tidy_up_at_the_stop, "service-stop", (KILLED_AFTER,), ("sendto",)),
 )
 
 
@@ -104,6 +118,11 @@ def _with(sound: Component, plant: Callable[[], None]) -> Any:
         def prepare_child(self) -> None:
             super().prepare_child()
             plant()
+
+        def traced_work(self, logs: Path) -> None:
+            if not self.is_all_traced:  # then nobody prepares the child
+                plant()
+            super().traced_work(logs)
 
     return Planted
 

@@ -22,7 +22,7 @@ from rtloop.errors import RtloopError
 from rtloop.hil import board
 from rtloop.hil.board import LSB_V, BoardMemory
 from rtloop.supervision import parking
-from rtloop.supervision.hardware import Hardware, keep, noted
+from rtloop.supervision.hardware import Hardware, UnusableNote, keep, noted
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
 from tests.service.fake_board import write_first
@@ -152,7 +152,10 @@ class Noting(Case):
         keep(self.path, self.new)
 
     def judge(self, outcome: Outcome) -> list[str]:
-        problems, there = [], noted(self.path)
+        try:
+            problems, there = [], noted(self.path)
+        except UnusableNote as error:
+            problems, there = [str(error)], None
         if there not in (self.old, self.new):
             problems.append("the note is neither the old one nor the new one")
         if outcome.finished and there != self.new:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import random
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from tests.syscalls.component import Component
-from tests.syscalls.kinds import injections
+from tests.syscalls.kinds import injections, thinned
 from tests.syscalls.traced import Injection
 
 SEED = 38
@@ -22,8 +23,10 @@ def plan(components: Sequence[Component], folder: Path) -> tuple[list[Try], list
         component.warm_up(folder)
         result = component.measure(folder)
         problems += [f"{component.name}, nothing injected: {problem}" for problem in result.problems]
-        every = component.stride
-        tries += [(component, injection) for injection in list(injections(result.calls))[::every]]
+        calls = thinned(result.calls) if component.is_thinned else result.calls
+        calls = calls[:: max(len(calls) // component.most, 1)] if component.most else calls
+        print(f"{component.name}: {len(calls)} of {len(result.calls)} calls are tried", file=sys.stderr)
+        tries += [(component, injection) for injection in injections(calls)]
     return tries, problems
 
 
@@ -31,7 +34,7 @@ def sample(tries: Sequence[Try], count: int, seed: int = SEED) -> list[Try]:
     """About `count` of the tries, spread over components by `share`, and over kinds and names of calls."""
     chance, chosen = random.Random(seed), []
     components = list(dict.fromkeys(component for component, _ in tries))
-    total = sum(component.share for component in components)
+    total = max(sum(component.share for component in components), 1)
     for component in components:
         groups: dict[tuple[str, str], list[Try]] = {}
         for one in tries:

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import threading
 import time
-import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -21,18 +20,17 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from rtloop.drivers.errors import DriverError
-from rtloop.errors import RtloopError
+from tests.syscalls.marked import BEGIN, CLEAR, END, GO, PREPARED, REFUSED, work_and_exit
 
-BEGIN, END = "/rtloop-begin", "/rtloop-end"
-"""Looked for by the child, in vain: they mark the work in the trace."""
-GO = signal.SIGUSR1
 KILLED_BEFORE, KILLED_AFTER = "killed before", "killed after"
 _LINE = re.compile(r"(\w+)\(")
 _FOREVER_US, _POLL_S, _TIMEOUT_S = 600_000_000, 0.001, 60.0
 _LAST_BYTES = 400
 """Of a trace: at least its last line."""
-_CLEAR, _REFUSED, _CRASHED = 0, 1, 2
+
+
+class EndedTooEarly(Exception):
+    """The work ended before its trace began: a host that stands still for seconds trips a loop."""
 
 
 class Call(NamedTuple):
@@ -70,6 +68,7 @@ class Outcome(NamedTuple):
     killed: bool
     refusal: str
     crash: str
+    hung: bool
 
     @property
     def finished(self) -> bool:
@@ -87,9 +86,10 @@ def unavailable() -> str:
 
 
 class Traced:
-    """Forks and attaches strace at once; `begin` lets the work go. `folder` receives the trace and the error.
+    """Forks, and attaches strace to the thread that says it is ready; `begin` lets the work go.
 
-    `prepare` is done in the child before strace is attached.
+    `folder` receives the trace and the error. `prepare` is done in the child before strace is attached; None: the work
+    says by itself, by `begin_here`, which of its threads is traced from where on.
     """
 
     def __init__(
@@ -97,10 +97,10 @@ class Traced:
         work: Callable[[], object],
         folder: Path,
         injection: Injection | None = None,
-        prepare: Callable[[], object] = lambda: None,
+        prepare: Callable[[], object] | None = lambda: None,
     ) -> None:
         self._log, self._error, self._injection = folder / "trace", folder / "error", injection
-        prepared = folder / "prepared"
+        prepared = folder / PREPARED
         for path in (self._log, self._error, prepared):
             path.unlink(missing_ok=True)
         self._lock, self._status = threading.Lock(), None
@@ -109,11 +109,27 @@ class Traced:
             warnings.simplefilter("ignore", DeprecationWarning)
             self.pid = os.fork()
         if self.pid == 0:
-            _child(prepare, work, self._error)
+            work_and_exit(prepare, work, self._error)
         while not prepared.exists():
+            if self.exit_code() is not None:
+                error = self._error.read_text() if self._error.exists() else f"exit code {self._status}"
+                raise EndedTooEarly(f"the work ended before it was traced: {error}")
             time.sleep(_POLL_S)
+        self._thread = int(prepared.read_text())
         options = injection.options if injection else []
-        command = ["strace", "-q", "-s", "64", "-e", "signal=none", "-o", str(self._log), "-p", str(self.pid), *options]
+        command = [
+            "strace",
+            "-q",
+            "-s",
+            "64",
+            "-e",
+            "signal=none",
+            "-o",
+            str(self._log),
+            "-p",
+            str(self._thread),
+            *options,
+        ]
         self._strace = subprocess.Popen(command, stderr=subprocess.PIPE)
         self._await_attachment()
 
@@ -143,11 +159,13 @@ class Traced:
         self._strace.communicate()
         code, error = self.exit_code(), self._error.read_text() if self._error.exists() else ""
         killed = code == -signal.SIGKILL and not late
-        crash = late or (error if code not in (_CLEAR, _REFUSED) and not killed else "")
-        if not crash and not killed and code not in (_CLEAR, _REFUSED):
+        crash = late or (error if code not in (CLEAR, REFUSED) and not killed else "")
+        if not crash and not killed and code not in (CLEAR, REFUSED):
             crash = f"exit code {code}"
         text = self._text()
-        return Outcome(_calls(text), self._is_reached(text, killed), killed, error if code == _REFUSED else "", crash)
+        return Outcome(
+            _calls(text), self._is_reached(text, killed), killed, error if code == REFUSED else "", crash, bool(late)
+        )
 
     def kill(self) -> None:
         """End the process if it still runs."""
@@ -163,7 +181,7 @@ class Traced:
 
     def _await_attachment(self) -> None:
         deadline_s, mark = time.monotonic() + _TIMEOUT_S, f"TracerPid:\t{self._strace.pid}\n"
-        while mark not in Path(f"/proc/{self.pid}/status").read_text():
+        while mark not in Path(f"/proc/{self.pid}/task/{self._thread}/status").read_text():
             if self._strace.poll() is not None or time.monotonic() > deadline_s:
                 os.kill(self.pid, signal.SIGKILL)
                 raise RuntimeError(f"strace cannot attach: {self._strace.communicate()[1].decode()}")
@@ -195,26 +213,3 @@ def _calls(text: str) -> list[Call]:
             calls.append(Call(match[1], seen[match[1]], line))
         inside = inside or BEGIN in line
     return calls
-
-
-def _child(prepare: Callable[[], object], work: Callable[[], object], error: Path) -> None:
-    """Wait for GO, do the work between the marks, say how it ended; never returns."""
-    code = _CLEAR
-    try:
-        prepare()
-        (error.parent / "prepared").touch()
-        signal.sigwait([GO])
-        os.access(BEGIN, 0)
-        try:
-            work()
-        except (RtloopError, DriverError) as refusal:
-            os.access(END, 0)
-            code = _REFUSED
-            error.write_text(str(refusal) or type(refusal).__name__)
-        os.access(END, 0)
-    except BaseException:
-        os.access(END, 0)
-        code = _CRASHED
-        error.write_text(traceback.format_exc())
-    finally:
-        os._exit(code)

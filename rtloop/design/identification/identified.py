@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -58,7 +59,12 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[
 
 def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
     """Where the dynamics come from, a line each."""
-    modes = (f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})" for mode in fit.modes)
+    modes = (
+        f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
+        if math.isfinite(mode.frequency_std_hz)
+        else "one that is over within a sample"
+        for mode in fit.modes
+    )
     return [
         f"Dynamics, identified by rtloop {__version__} from {sources([run])}, input: {how}",
         f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "

@@ -165,19 +165,25 @@ class SensorOptions(Options):
         return plant * Transfer.from_zpk([], [-rate], rate)
 
 
+STEP_HEIGHTS_UM = (1.0, 5.0, 20.0, 40.0)
+SAME_HEIGHT = 0.02
+"""Heights that differ by no larger part than this are simulated once."""
+
+
 class SimulationOptions(Options):
     """Steps that are simulated, with everything that is not linear."""
 
-    steps_um: Annotated[Numbers, Field(min_length=1, max_length=16)] = (1.0, 5.0, 20.0, 40.0)
-    """Their heights."""
-    judged: bool = False
-    """Whether they must keep static_error_percent, settling_ms and overshoot_percent."""
+    steps_um: Annotated[Numbers, Field(min_length=1, max_length=16)] | None = None
+    """Their heights; by default those of STEP_HEIGHTS_UM and specification.command.reference_um."""
+    judged: bool | None = None
+    """Whether they must keep static_error_percent, settling_ms and overshoot_percent; by default where residual_percent
+    is given, because the simulation then has the hysteresis that the stage has."""
     residual_percent: float = Field(default=0.0, ge=0, lt=100)
     """h/H that the inverse leaves, as a compensation experiment finds it. Of a driver that is no simulated rig."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if not all(height > 0 for height in self.steps_um):
+        if self.steps_um is not None and not all(height > 0 for height in self.steps_um):
             raise ValueError(f"steps_um {list(self.steps_um)}: heights above 0 are allowed")
         return self
 
@@ -233,6 +239,25 @@ class DesignOptions(Options):
     scenarios: ScenarioOptions = ScenarioOptions()
     robust: RobustOptions = RobustOptions()
     shape: ShapeOptions = ShapeOptions()
+
+    @property
+    def step_heights_um(self) -> tuple[float, ...]:
+        """Heights of the steps that are simulated, as `simulation.steps_um` says."""
+        if self.simulation.steps_um is not None:
+            return self.simulation.steps_um
+        command = self.specification.command
+        if command is None or any(
+            math.isclose(command.reference_um, height, rel_tol=SAME_HEIGHT) for height in STEP_HEIGHTS_UM
+        ):
+            return STEP_HEIGHTS_UM
+        return (*STEP_HEIGHTS_UM, command.reference_um)
+
+    @property
+    def judges_simulated_steps(self) -> bool:
+        """Whether simulated steps must keep the specification, as `simulation.judged` says."""
+        if self.simulation.judged is not None:
+            return self.simulation.judged
+        return "residual_percent" in self.simulation.model_fields_set
 
 
 def weights_of(design: DesignOptions) -> Weights:

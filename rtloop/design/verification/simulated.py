@@ -112,7 +112,7 @@ class Simulated:
 
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> Simulated:
     """Steps of an axis whose linear loop has `slowest_s` as its slowest time constant."""
-    heights_um, judged = design.simulation.steps_um, design.simulation.judged
+    heights_um, judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
     reach_um, downwards = _reach(axis)
     possible = sorted(height for height in set(heights_um) if height <= reach_um)
@@ -206,6 +206,9 @@ def between_ticks(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: 
         moved += share * run[f"{other}_hysteresis_um"]
     inputs = np.append(moved[1:], moved[-1])  # a record has what the period before it did
     positions = held.between.rows @ held.system.driven(inputs).T + np.outer(held.between.direct, inputs)
-    true_um, ticks = run[f"{axis}_true_position_um"], np.arange(inputs.size)
-    times = (ticks[:, None] + np.arange(POINTS) / POINTS).ravel()
-    return positions.T.ravel() + np.interp(times, ticks, true_um - positions[0])
+    besides = run[f"{axis}_true_position_um"] - positions[0]
+    slopes = np.append(np.diff(besides), 0.0)  # after the last tick it stands still
+    straight = slopes[:, None] * (np.arange(POINTS) / POINTS)
+    straight += besides[:, None]
+    straight += positions.T
+    return straight.ravel()

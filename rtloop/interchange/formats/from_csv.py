@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import io
 import os
 import re
@@ -15,6 +17,7 @@ from rtloop.hil.trusted import open_named
 from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
 from rtloop.interchange.formats.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
 from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
+from rtloop.values import counted
 
 ROWS_AT_ONCE = 1 << 16
 SIGNS = {None: "blanks", "\t": "tabs"}
@@ -85,6 +88,7 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
     except ImportError:
         raise MissingExtra("CSV needs pandas: pip install 'rtloop[data]'") from None
     blocks: list[list[np.ndarray[Any, Any]]] = []
+    without_last = set[int]()
     rows, most = 0, min(ROWS_AT_MOST, BYTES_AT_MOST // (8 * len(dialect.numbers)))
     lines = _Lines(path, dialect)
     try:
@@ -101,6 +105,7 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         ) as reader:
             for block in reader:
                 dates = [_dates_ns(path, dialect, block[column]) for column in dialect.dates]
+                without_last.update(block.index[block.iloc[:, -1].isna()])
                 blocks.append([*dates, *(_column(path, dialect, block[column]) for column in dialect.numbers)])
                 rows += len(block)
                 if rows > most:
@@ -109,7 +114,32 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         raise UnreadableData(f"{path}: {_where(str(fault), dialect)}") from None
     finally:
         lines.close()
+    _require_whole_rows(path, dialect, without_last)
     return blocks
+
+
+def _require_whole_rows(path: Path, dialect: Dialect, without_last: set[int]) -> None:
+    """Raise UnreadableData at one of these rows with fewer columns than the others, unless it is the last of the file.
+
+    `without_last` are rows without a number in their last column; the last row of a file may be cut off.
+    """
+    if not without_last:
+        return
+    short: tuple[int, int] | None = None
+    with contextlib.closing(_Lines(path, dialect)) as lines:
+        for row, line in enumerate(lines):
+            if short is not None:
+                raise UnreadableData(f"{path}: {_uneven(*short, dialect)}")
+            if row in without_last:
+                sign = dialect.delimiter
+                fields = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
+                short = (dialect.first + row + 1, len(fields)) if 0 < len(fields) < len(dialect.names) else None
+
+
+def _uneven(line: int, columns: int, dialect: Dialect) -> str:
+    return (
+        f"line {line} has {counted(columns, 'column')}; each line must have {len(dialect.names)}, as the first one has"
+    )
 
 
 def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
@@ -148,4 +178,6 @@ def _dates_ns(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]
 def _where(fault: str, dialect: Dialect) -> str:
     """pandas counts lines from the first numbers on."""
     words = fault.removeprefix("Error tokenizing data. C error: ").strip()
+    if found := re.fullmatch(r"Expected (\d+) fields in line (\d+), saw (\d+)", words):
+        return _uneven(int(found[2]) + dialect.first, int(found[3]), dialect)
     return "damaged: " + re.sub(r"line (\d+)", lambda found: f"line {int(found[1]) + dialect.first}", words)

@@ -18,6 +18,12 @@ class UnreadableData(RtloopError):
     exit_code = 1
 
 
+class UnopenedData(UnreadableData):
+    """A file that is not there, or that the system does not let be read."""
+
+    exit_code = 66
+
+
 @dataclass(frozen=True)
 class Table:
     """Named columns of a file, each float64 of shape (rows,), that were sampled together.

@@ -109,7 +109,7 @@ class LimitedProcess:
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe is not None:
-                with contextlib.suppress(BrokenPipeError):
+                with contextlib.suppress(OSError):  # nobody reads what was not sent
                     pipe.close()
         self._process = None
 

@@ -5,6 +5,9 @@
 A plug-in internal model (S. Hara, Y. Yamamoto, T. Omata and M. Nakano, IEEE Trans. Automatic Control 33(7), 1988) with
 a smoothing filter Q of no phase (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111, 1989). With T
 the closed loop of the integrator alone, it is stable where that is and |g Q (1 − z^L T)| < 1 at every frequency.
+
+ê_k counts as 0 in the memory where the command of tick k was limited: an error that no command could have made smaller
+teaches nothing, and would be added to the command a period later.
 """
 
 from __future__ import annotations
@@ -109,7 +112,7 @@ class Repetitive(Controller):
         for j in range(c.count):
             recalled_um += c.weights[j] * s.past_um[(place - j) % c.places]
         total_um = told.error_um + recalled_um
-        s.past_um[s.at] = total_um
+        s.past_um[s.at] = total_um if told.applied_um == told.command_um else 0.0
         s.at = (s.at + 1) % c.places
         s.integral_um += c.ki * total_um + told.applied_um - told.command_um
 

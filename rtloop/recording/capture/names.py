@@ -13,6 +13,7 @@ import numpy as np
 
 from rtloop.engine.memory import EVENT_SLOTS
 from rtloop.hil.native.words import load_acquire, store_release
+from rtloop.hil.trusted import release
 from rtloop.recording.file.topics.events import MAX_NAME
 
 SLOT = np.dtype([("identity", np.uint64), ("name", f"S{4 * MAX_NAME}")])
@@ -35,7 +36,7 @@ class Names:
 
     def close(self) -> None:
         """No further process gets the file; what is mapped stays."""
-        os.close(self.fd)
+        release(self.fd)
 
     def note(self, identity: int, name: str) -> None:
         """The command `identity`, from 1 on, is asked for by `name`."""

@@ -121,6 +121,8 @@ class Session:
         self._write_the_rest(result)
         self._pending.drop(self._pending.take())
         self._finish_file(FINISHED, result, self.cursor, self.cursor)
+        if self._files.next.tick >= self._reached.ticks:  # the end of the file may have cost it ticks
+            self._account(self._files.next.tick)
         paths = [str(path) for path in self._files.paths]
         lost = self.cursor - self._files.logged - self._files.skipped
         return {

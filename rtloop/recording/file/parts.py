@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.topics.events import ROTATED
 from rtloop.recording.file.topics.header import OF_A_RUN, absent
 
 Files = Path | str | Sequence[Path | str]
@@ -62,8 +63,10 @@ class Parts(ExitStack):
 
 
 def absent_parts(readers: Sequence[Reader]) -> list[str]:
-    """What is missing between, or in front of, the files of a rotated run. One file alone is a whole recording."""
-    return absent(map(_sequence, readers))
+    """What is missing before, between or behind the files of a rotated run. One file alone is a whole recording."""
+    numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
+    goes_on = len(readers) > 1 and last is not None and last["result"] == ROTATED
+    return [*absent(numbers), *([f"part {numbers[-1] + 1} of the run is missing"] if goes_on else [])]
 
 
 def _sequence(reader: Reader) -> int:

@@ -9,12 +9,11 @@ import fcntl
 import json
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from rtloop.errors import writing
-from rtloop.hil.trusted import is_own, open_named
+from rtloop.hil.trusted import is_own, open_named, release
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunks import Opener
 from rtloop.recording.file.reader import Reader, Rows
@@ -37,15 +36,15 @@ def output_of(path: Path) -> Path:
 
 def leftovers(folder: Path) -> list[Path]:
     """Our own unfinished recordings in `folder` that nobody writes any more and nobody recovered yet."""
-    parts = [part for part in sorted(folder.glob("*.mcap.part")) if is_own(part)]
-    return [part for part in parts if not os.path.lexists(output_of(part)) and _is_left(part)]
+    parts = [part for part in sorted(folder.glob("*.mcap.part")) if not os.path.lexists(output_of(part))]
+    return [part for part in parts if _is_left(part)]
 
 
 def _is_left(part: Path) -> bool:
-    """Whether nobody writes the file; False where its lock cannot be asked for."""
+    """Whether a file is ours and nobody writes it; False where either cannot be told."""
     try:
-        return not grows(part)
-    except RecordingError:
+        return is_own(part) and not grows(part)
+    except (OSError, RecordingError):
         return False
 
 
@@ -169,6 +168,5 @@ def grows(path: Path) -> bool:
         reason = f"cannot be locked ({error.strerror}), so a recorder may be writing it"
         raise RecordingError(f"{path}: {reason}") from None
     finally:
-        with suppress(OSError):  # it is closed all the same
-            os.close(fd)
+        release(fd)
     return False

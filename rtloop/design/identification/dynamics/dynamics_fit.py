@@ -73,7 +73,10 @@ def transfer_of(model: Innovations) -> Transfer:
 
 
 def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
-    """Poles with their standard deviations, for |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`."""
+    """Poles with their standard deviations, for |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
+
+    A mode that is over within a tick stands at FASTEST, as in `transfer_of`, and its standard deviation is infinite.
+    """
     found, i = [], 0
     for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
         size, width = abs(rate), 2 if rate.imag != 0 else 1
@@ -82,9 +85,12 @@ def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode
         by_damping = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
         share = width * abs(residue / (1 - image) / model.static_gain)
         deviations = [float(np.sqrt(max(d @ part @ d, 0.0))) for d in (by_size, by_damping)]
-        found.append(
-            Mode(size / (2 * np.pi), deviations[0] / (2 * np.pi), -rate.real / size, deviations[1], float(share))
-        )
+        if rate.real * model.period_s < -FASTEST:
+            found.append(Mode(FASTEST / model.period_s / (2 * np.pi), np.inf, 1.0, np.inf, float(share)))
+        else:
+            found.append(
+                Mode(size / (2 * np.pi), deviations[0] / (2 * np.pi), -rate.real / size, deviations[1], float(share))
+            )
         i += (3 if noise else 2) * width
     return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
 

@@ -42,16 +42,17 @@ def identify_dynamics(
     run: Excitation,
     order: int | None = None,
     largest_order: int = LARGEST_ORDER,
-    criterion: Criterion = "aic",
+    criterion: Criterion = "held-out",
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
     """The model of `order` poles, or of the order that `criterion` chooses up to `largest_order`, behind `delay_ticks`
     samples, or behind the delay that is found.
 
-    "aic" judges by the run itself, "held-out" by the prediction of its second part where the input changes there too,
-    "validation" by the free-running output error on `validation`. Raises UnsuitableData, and ValueError for options
-    that contradict each other.
+    "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
+    there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
+    free-running output error on `validation`. Raises UnsuitableData, and ValueError for options that contradict each
+    other.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': another recording is needed to validate on")
@@ -73,12 +74,35 @@ def identify_dynamics(
         raise UnsuitableData(
             f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed"
         )
+    fitted = _settled_within(fitted, centred)
     candidates = [_candidate(model, centred, start, validation) for model in fitted]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
     model = fitted[_chosen(candidates, score, by_aic=criterion != "validation" and start is None)]
-    if start is not None:
-        model = refined(model, centred) or model
+    if start is not None and (better := refined(model, centred)) and _has_settled(better, centred):
+        model = better
     return _described(model, centred, tuple(candidates), delay_ticks)
+
+
+def _settled_within(fitted: Sequence[Innovations], run: Excitation) -> list[Innovations]:
+    """The models whose time constants are all shorter than the run. Raises UnsuitableData where there is none.
+
+    A longer one stands for drift, creep or what the model of the hysteresis misses, and most of D(0) may lie in it.
+    """
+    settled = [model for model in fitted if _has_settled(model, run)]
+    if not settled:
+        slowest_s = max(1 / max(np.abs(model.rates).min(), 1e-300) for model in fitted)
+        duration_s = run.input.size * run.period_s
+        raise UnsuitableData(
+            f"{run.name}: the position drifts or creeps: every model has a time constant that is longer than the "
+            f"recording, such as {slowest_s:.3g} s in {duration_s:.3g} s; a stage that has settled before, or a longer "
+            "recording, is needed"
+        )
+    return settled
+
+
+def _has_settled(model: Innovations, run: Excitation) -> bool:
+    """Whether each time constant of the model is shorter than the run."""
+    return float(np.abs(model.rates).min()) * run.input.size * run.period_s >= 1
 
 
 def _candidate(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:

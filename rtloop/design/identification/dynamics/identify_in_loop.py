@@ -53,7 +53,7 @@ def identified_dynamics(
     Raises UnsuitableData, and ValueError for options that contradict each other.
     """
     if not isinstance(run, LoopExcitation):
-        return identify_dynamics(run, order, largest_order, criterion or "aic", validation, delay_ticks)
+        return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
     if criterion not in (None, "held-out"):
         raise ValueError(f"criterion {criterion!r}: the order of a closed loop's model is chosen by 'held-out'")
     return identify_in_loop(run, order, largest_order, validation, delay_ticks)

@@ -20,7 +20,7 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
-from rtloop.hil.trusted import Untrusted, remake_file
+from rtloop.hil.trusted import Untrusted, release, remake_file
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     MAGIC,
@@ -167,8 +167,7 @@ class ChunkFile:
     def close(self) -> None:
         """Give up the file as it is; idempotent."""
         if self._fd >= 0:
-            with contextlib.suppress(OSError):  # it is closed all the same; what counts is that it was synced
-                os.close(self._fd)
+            release(self._fd)  # what counts is that it was synced
             self._fd = -1
 
     def discard(self) -> None:
@@ -190,7 +189,7 @@ class ChunkFile:
             if not self.is_there():
                 raise BlockingIOError(errno.EWOULDBLOCK, "another process began it as well")
         except OSError as error:
-            os.close(fd)
+            release(fd)
             raise self._refused(error) from None
         return fd
 
@@ -208,7 +207,7 @@ class ChunkFile:
         try:
             os.fsync(folder)
         finally:
-            os.close(folder)
+            release(folder)
 
     def _refuse_to_replace(self) -> None:
         try:

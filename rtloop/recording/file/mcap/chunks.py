@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_named, release
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
@@ -64,7 +63,7 @@ class Source:
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         if magic != MAGIC:
-            os.close(self._fd)
+            release(self._fd)
             what = "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
             raise RecordingError(f"{path}: not a recording: {what or 'not an MCAP file'}")
 
@@ -77,8 +76,7 @@ class Source:
 
     def close(self) -> None:
         """Close the file."""
-        with contextlib.suppress(OSError):  # it is closed all the same, and nothing was written
-            os.close(self._fd)
+        release(self._fd)
 
 
 def _hint(path: Path) -> str:

@@ -1,0 +1,46 @@
+"""A service where the host refuses a system call that its loop does not need: it goes on, and its end comes."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from rtloop.errors import UnavailableError
+from rtloop.service import daemon
+from rtloop.service.notify import Notifier
+from rtloop.supervision.child import Child
+
+
+def refuse(*_: object, **__: object) -> Any:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+def test_a_manager_that_cannot_be_told_stops_no_loop(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
+    notifier = Notifier()
+    monkeypatch.setattr(socket, "socket", refuse)
+    notifier.send(READY=1)
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), RuntimeError("can't start new thread")])
+def test_what_the_host_refuses_is_said_in_a_sentence(error: Exception):
+    with pytest.raises(UnavailableError, match="the host refuses what the service needs"), daemon._refused_in_words():
+        raise error
+
+
+def test_a_mistake_of_the_service_stays_one():
+    with pytest.raises(RuntimeError, match="dictionary changed"), daemon._refused_in_words():
+        raise RuntimeError("dictionary changed size during iteration")
+
+
+def test_a_child_whose_pipes_cannot_be_closed_has_ended():
+    pipe = SimpleNamespace(close=refuse)
+    process = SimpleNamespace(poll=lambda: 0, wait=lambda timeout_s: 0, stdin=pipe, stdout=pipe)
+    child = cast(Child, SimpleNamespace(process=process, kill=lambda: None, wait=lambda timeout_s: 0))
+    child.close_stdin = lambda: Child.close_stdin(child)  # type: ignore[method-assign]
+    assert Child.end(child)
