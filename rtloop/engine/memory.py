@@ -85,6 +85,11 @@ class ProcessState(IntEnum):
     FINISHED = 3
     FAILED = 4
 
+    @classmethod
+    def ended(cls, state: int) -> bool:
+        """Whether a process in this state has ended by itself."""
+        return state in (cls.FINISHED, cls.FAILED)
+
 
 class Sizes(NamedTuple):
     """What the block's arrays are sized by; `snapshot_bytes` is the length of the law's binary snapshot."""

@@ -88,7 +88,8 @@ def _unnamed_time(table: Table) -> str | None:
 
 def grows_evenly(values: Real) -> bool:
     """Whether each value is larger than the one before, by about the same step: as a clock or a counter does."""
-    steps = np.diff(values)
+    with np.errstate(invalid="ignore"):  # inf − inf, which does not grow
+        steps = np.diff(values)
     return steps.size > 1 and bool(steps.min() > 0 and steps.max() < MISSING * steps.min())
 
 

@@ -150,7 +150,7 @@ class RecorderKeeper:
         taken = self._block.load(Word.RECORDER_CURSOR)
         behind = int(self._block["ticks_head"][0]) != taken
         stuck = self._watch.stalled(taken, time.monotonic()) and behind
-        loop_ended = self._block.load(Word.LOOP_STATE) in (ProcessState.FINISHED, ProcessState.FAILED)
+        loop_ended = ProcessState.ended(self._block.load(Word.LOOP_STATE))
         died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
         if (died or stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if stuck else f"died (exit code {self.exit_code})"

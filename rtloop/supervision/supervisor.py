@@ -264,7 +264,7 @@ class Supervisor:
 
     def _end(self) -> None:
         """Park first, if the loop died; then let the recorder finish."""
-        if self.block.load(Word.LOOP_STATE) not in (ProcessState.FINISHED, ProcessState.FAILED):
+        if not ProcessState.ended(self.block.load(Word.LOOP_STATE)):
             died = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
             self.error = f"the loop's process {died}; {self._park()}"
             self.block.store(Word.LOOP_STATE, ProcessState.FAILED)

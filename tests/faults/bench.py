@@ -15,7 +15,7 @@ from rtloop.errors import RtloopError
 from rtloop.hil import board
 from rtloop.service.client import Client
 from tests.faults import plain_card
-from tests.faults.configuration import ROOT, Bounds, on_a_board, on_a_card
+from tests.faults.configuration import ROOT, Bounds, on_a_board, on_a_card, patient
 from tests.faults.evidence import TIMEOUT_S, Evidence, wait_for
 from tests.faults.host import HostWitness
 
@@ -24,7 +24,11 @@ START_POLL_S = 0.05
 
 
 class Bench(Evidence):
-    """`with Bench(folder) as bench`: a service that runs in closed loop on a board, or on a plain card."""
+    """`with Bench(folder) as bench`: a service that runs in closed loop on a board, or on a plain card.
+
+    Where `strict`, a process that stands still for 50 ms is killed, as in a laboratory. For tests of other things it is
+    patient: a host that holds up the loop does not end it.
+    """
 
     def __init__(
         self,
@@ -35,11 +39,13 @@ class Bench(Evidence):
         text: str | None = None,
         name: str = "lab",
         environment: dict[str, str] | None = None,
+        strict: bool = False,
     ) -> None:
         super().__init__(folder, card)
         self.config = folder / f"{name}.toml"
         self._with_board = board and not card
-        self.config.write_text(text or (on_a_card if card else on_a_board)(folder, *changes))
+        text = text or (on_a_card if card else on_a_board)(folder, *changes)
+        self.config.write_text(text if strict else patient(text))
         self.environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), str(folder), os.environ.get("PYTHONPATH")])),
             "RUNTIME_DIRECTORY": str(folder / "run"),
@@ -113,6 +119,10 @@ class Bench(Evidence):
         self.blocks.append(SharedBlock(fd))
         return self.blocks[-1]
 
+    def _follows_the_present_loop(self) -> bool:
+        path = self.folder / "run" / f"{self.config.stem}.block"
+        return path.exists() and os.path.samestat(os.fstat(self.blocks[-1].fd), path.stat())
+
     def pid(self, role: str) -> int:
         """Process of the service, of its present loop ("rt") or of its present recorder."""
         assert self.service is not None
@@ -174,7 +184,12 @@ class Bench(Evidence):
         self.await_state("running")
         wait_for(lambda: abs(self.seen().last_v) > 1.0, "a drive")
         ticks = self.ticks
-        wait_for(lambda: self.ticks > ticks + 1000, "a thousand ticks")
+
+        def executed() -> bool:
+            assert self._follows_the_present_loop(), f"the loop was replaced; {self.log()[-600:]}"
+            return self.ticks > ticks + 1000
+
+        wait_for(executed, "a thousand ticks")
 
     def recover(self) -> None:
         """Reset what is tripped, start, and see that it drives again."""

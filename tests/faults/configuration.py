@@ -85,6 +85,10 @@ min_free_mib = 0.0
 """
 
 
+PATIENCE_S = 20.0
+"""How long a host may hold up a process of a patient bench before the others take it for dead."""
+
+
 class Bounds(NamedTuple):
     """What a configuration allows its output: a step from one write to the next, and a change within WINDOW_S."""
 
@@ -112,6 +116,19 @@ def on_a_board(folder: Path, *changes: tuple[str, str]) -> str:
 def on_a_card(folder: Path, *changes: tuple[str, str]) -> str:
     """A first-order plant behind a third party's driver in plain Python."""
     return _changed(CARD + '[[axis]]\nname = "x"\n' + CARD_LAW + LIMITS, folder, changes)
+
+
+def patient(text: str) -> str:
+    """A configuration whose service and loop wait PATIENCE_S for each other, where it states no other limit."""
+    for table, key, value in (
+        ("loop", "heartbeat_timeout_s", PATIENCE_S),
+        ("service", "stall_ms", 1000.0 * PATIENCE_S),
+    ):
+        if key in tomllib.loads(text).get(table, {}):
+            continue
+        header, line = f"[{table}]\n", f"{key} = {value}\n"
+        text = text.replace(header, header + line, 1) if header in text else f"{text}\n{header}{line}"
+    return text
 
 
 def _changed(text: str, folder: Path, changes: tuple[tuple[str, str], ...]) -> str:

@@ -68,8 +68,8 @@ def measure(fault: Fault) -> Row:
     row = Row(fault)
     with tempfile.TemporaryDirectory(prefix="rtloop-fault-") as name, _surroundings(fault, Path(name)):
         try:
-            environment = fault.environment(Path(name))
-            with Bench(Path(name), *fault.changes, card=fault.card, environment=environment) as bench:
+            given = {"card": fault.card, "environment": fault.environment(Path(name)), "strict": True}
+            with Bench(Path(name), *fault.changes, **given) as bench:
                 row.bounds = bench.bounds
                 if fault.drives:
                     bench.await_drive()

@@ -120,7 +120,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     chance, failed = random.Random(given.seed), 0
-    with tempfile.TemporaryDirectory(prefix="rtloop-pairs-") as name, Bench(Path(name)) as bench:
+    with tempfile.TemporaryDirectory(prefix="rtloop-pairs-") as name, Bench(Path(name), strict=True) as bench:
         largest_v = 0.0
         for number in range(given.sequences):
             if number:

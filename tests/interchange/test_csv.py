@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.interchange.formats.from_csv import read_csv
+from rtloop.interchange.formats.from_csv import ROWS_AT_ONCE, read_csv
 from rtloop.interchange.formats.table import UnreadableData
 
 TIME = np.arange(300) * 1e-4
@@ -66,6 +66,16 @@ def test_what_is_missing_is_no_number(tmp_path: Path):
     (tmp_path / "scan.csv").write_text("t,u\n0,nan\n1,\n2,inf\n3,-inf\n4,1e-300\n5,NULL\n")
     found = read_csv(tmp_path / "scan.csv").columns["u"]
     assert np.array_equal(found, [np.nan, np.nan, np.inf, -np.inf, 1e-300, np.nan], equal_nan=True)
+
+
+def test_an_empty_last_column_is_read_to_the_end_of_a_long_file(tmp_path: Path):
+    """Of several blocks of rows; a row that is short where the next block begins is found there."""
+    whole = "0,1,\n" * (2 * ROWS_AT_ONCE)
+    (tmp_path / "scan.csv").write_text("t,u,w\n" + whole)
+    assert read_csv(tmp_path / "scan.csv").columns["u"].size == 2 * ROWS_AT_ONCE
+    (tmp_path / "scan.csv").write_text("t,u,w\n" + whole + "0,1\n" * 200)
+    with pytest.raises(UnreadableData, match=f"line {2 * ROWS_AT_ONCE + 2} has 2 columns"):
+        read_csv(tmp_path / "scan.csv")
 
 
 def test_dates_are_times(tmp_path: Path):

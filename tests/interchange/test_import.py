@@ -11,6 +11,7 @@ from scipy.io import loadmat, savemat
 
 from rtloop.interchange import aside
 from rtloop.interchange.reading import read_here
+from rtloop.interchange.sampling import grows_evenly
 from rtloop.recording.load import load
 from tests.asked import answer, run
 from tests.interchange.controldesk import read_v5, write_controldesk
@@ -128,6 +129,13 @@ def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
     offered = run("import", "scan.csv").stdout.partition("Such as")[2]
     assert "--map 'x_drive_v=out [V]'" in offered
     assert "--map 'x_position_um=gap [µm]'" in offered
+
+
+def test_a_column_with_what_is_infinite_is_no_clock():
+    """And no warning (each is an error here)."""
+    assert grows_evenly(np.arange(9.0))
+    for endless in ([0, np.inf, np.inf], [-np.inf, 1, np.inf], [0, 1, np.inf], [0, np.nan, 2]):
+        assert not grows_evenly(np.array(endless))
 
 
 def test_a_rate_counts_where_the_time_is_not_believed(folder: Path):

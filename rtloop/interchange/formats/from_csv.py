@@ -88,7 +88,7 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
     except ImportError:
         raise MissingExtra("CSV needs pandas: pip install 'rtloop[data]'") from None
     blocks: list[list[np.ndarray[Any, Any]]] = []
-    without_last = set[int]()
+    without_last: list[np.ndarray[Any, Any]] = []
     rows, most = 0, min(ROWS_AT_MOST, BYTES_AT_MOST // (8 * len(dialect.numbers)))
     lines = _Lines(path, dialect)
     try:
@@ -105,7 +105,9 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         ) as reader:
             for block in reader:
                 dates = [_dates_ns(path, dialect, block[column]) for column in dialect.dates]
-                without_last.update(block.index[block.iloc[:, -1].isna()])
+                lacking = block.iloc[:, -1].isna().to_numpy()
+                # where all rows lack it, the column is empty, or all are as short as the first one
+                without_last.append(rows + np.flatnonzero(lacking)[: 1 if lacking.all() else None])
                 blocks.append([*dates, *(_column(path, dialect, block[column]) for column in dialect.numbers)])
                 rows += len(block)
                 if rows > most:
@@ -114,23 +116,24 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         raise UnreadableData(f"{path}: {_where(str(fault), dialect)}") from None
     finally:
         lines.close()
-    _require_whole_rows(path, dialect, without_last)
+    _require_whole_rows(path, dialect, np.concatenate(without_last))
     return blocks
 
 
-def _require_whole_rows(path: Path, dialect: Dialect, without_last: set[int]) -> None:
+def _require_whole_rows(path: Path, dialect: Dialect, without_last: np.ndarray[Any, Any]) -> None:
     """Raise UnreadableData at one of these rows with fewer columns than the others, unless it is the last of the file.
 
-    `without_last` are rows without a number in their last column; the last row of a file may be cut off.
+    `without_last` (rows,) are rows without a number in their last column; the last row of a file may be cut off.
     """
-    if not without_last:
-        return
-    short: tuple[int, int] | None = None
+    looked_at, short = 0, None
     with contextlib.closing(_Lines(path, dialect)) as lines:
         for row, line in enumerate(lines):
             if short is not None:
                 raise UnreadableData(f"{path}: {_uneven(*short, dialect)}")
-            if row in without_last:
+            if looked_at == without_last.size:
+                return
+            if row == without_last[looked_at]:
+                looked_at += 1
                 sign = dialect.delimiter
                 fields = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
                 short = (dialect.first + row + 1, len(fields)) if 0 < len(fields) < len(dialect.names) else None

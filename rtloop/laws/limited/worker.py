@@ -2,8 +2,8 @@
 
 A job is two messages: what to run, with all that must be imported or loaded for it, which is acknowledged; then the
 arguments, with which the code of a law may begin to run. The first may come without the second, for a job that is
-expected. Whatever that raises, SystemExit and KeyboardInterrupt among
-it, becomes an answer. Its output goes to stderr, which the other process reads.
+expected. Whatever that raises, SystemExit and KeyboardInterrupt among it, becomes an answer. Its output goes to stderr,
+which the other process reads.
 """
 
 from __future__ import annotations

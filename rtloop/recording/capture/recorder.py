@@ -83,7 +83,7 @@ class Recorder:
             self.block.store(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
             if drained:
                 last_tick_s = time.monotonic()
-            elif state in (ProcessState.FINISHED, ProcessState.FAILED):
+            elif ProcessState.ended(state):
                 return ProcessState(state).name.lower()
             elif alone or (orders.closed and time.monotonic() - last_tick_s > ABANDONED_S):
                 return "abandoned"

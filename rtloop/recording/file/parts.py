@@ -11,7 +11,7 @@ from pathlib import Path
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.events import ROTATED
-from rtloop.recording.file.topics.header import OF_A_RUN, absent
+from rtloop.recording.file.topics.header import OF_A_RUN, absent, absent_part
 
 Files = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""
@@ -66,7 +66,7 @@ def absent_parts(readers: Sequence[Reader]) -> list[str]:
     """What is missing before, between or behind the files of a rotated run. One file alone is a whole recording."""
     numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
     goes_on = len(readers) > 1 and last is not None and last["result"] == ROTATED
-    return [*absent(numbers), *([f"part {numbers[-1] + 1} of the run is missing"] if goes_on else [])]
+    return [*absent(numbers), *([absent_part(numbers[-1] + 1)] if goes_on else [])]
 
 
 def _sequence(reader: Reader) -> int:

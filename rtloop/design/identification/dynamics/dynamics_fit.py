@@ -84,13 +84,11 @@ def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode
         by_size = np.array([rate.real, rate.imag][:width]) / size
         by_damping = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
         share = width * abs(residue / (1 - image) / model.static_gain)
-        deviations = [float(np.sqrt(max(d @ part @ d, 0.0))) for d in (by_size, by_damping)]
+        size_std, damping_std = (float(np.sqrt(max(d @ part @ d, 0.0))) for d in (by_size, by_damping))
+        damping = -rate.real / size
         if rate.real * model.period_s < -FASTEST:
-            found.append(Mode(FASTEST / model.period_s / (2 * np.pi), np.inf, 1.0, np.inf, float(share)))
-        else:
-            found.append(
-                Mode(size / (2 * np.pi), deviations[0] / (2 * np.pi), -rate.real / size, deviations[1], float(share))
-            )
+            size, size_std, damping, damping_std = FASTEST / model.period_s, np.inf, 1.0, np.inf
+        found.append(Mode(size / (2 * np.pi), size_std / (2 * np.pi), damping, damping_std, float(share)))
         i += (3 if noise else 2) * width
     return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
 

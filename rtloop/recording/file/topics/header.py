@@ -89,7 +89,12 @@ def absent(numbers: Iterable[int]) -> list[str]:
     there = set(numbers)
     if len(there) == 1:
         return []
-    return [f"part {number} of the run is missing" for number in range(1, max(there)) if number not in there]
+    return [absent_part(number) for number in range(1, max(there)) if number not in there]
+
+
+def absent_part(number: int) -> str:
+    """The sentence for one part."""
+    return f"part {number} of the run is missing"
 
 
 def _moment(unix_ns: int) -> str:
