@@ -85,6 +85,21 @@ def test_standard_deviations_are_those_of_repeated_measurements() -> None:
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.45)
 
 
+def test_a_margin_says_how_far_off_it_is_where_the_light_mode_decides_it() -> None:
+    """Between the lines about the mode, a margin is no more certain than the mode's frequency and damping."""
+    loop = TrueLoop(150.0, 0.02, 0, 20.0)
+    lines = grid(RATE_HZ, 1.0, 2.0, 4400.0, loop.hz)
+    period = excitation.first(lines, AMPLITUDE_UM)
+    for aim in excitation.AIMS:
+        before = loop.run(played(period, 2, 0.0, FADE), seed=99)
+        period = excitation.shaped(lines, period, whole(lines, before, 2), AMPLITUDE_UM, aim)
+    reference, true = played(period, 4, 0.0, FADE), loop.margins(lines.hz[0], lines.hz[-1])
+    found = [measurement(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
+    for name in ("gain_margin", "modulus_margin"):
+        off = [(getattr(one, name).value - true[name]) / getattr(one, name).std for one in found]
+        assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.7  # without the mode's own uncertainty: 2.3
+
+
 def _answers(loop: TrueLoop, lines: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Position and command per reference."""
     opened = loop.open(lines.hz)

@@ -193,9 +193,13 @@ class Bench(Evidence):
 
     def recover(self) -> None:
         """Reset what is tripped, start, and see that it drives again."""
-        if self.status().get("state") == "tripped":
+        before = wait_for(self.status, "an answer")
+        if before["state"] == "tripped":
             self.client.post("/reset")
-        self.client.post("/start")
+        try:
+            self.client.post("/start")
+        except RtloopError as error:
+            raise AssertionError(f"{error}; before {before}; now {self.status()}; {self.log()[-600:]}") from None
         self.await_drive()
 
     @property

@@ -14,6 +14,9 @@ from tests.faults.evidence import wait_for
 from tests.faults.fault import Fault, Measured
 from tests.faults.preload import preloaded
 
+RATE_HZ, HOST_MAY_TAKE = 4000.0, 0.2
+"""A stall of the host loses periods; a rate by the stepping clock would be wrong by thousands."""
+
 
 def stepping_clock(folder: Path) -> dict[str, str]:
     """The environment that makes the wall clock step. Raises NotPossible without a compiler."""
@@ -27,7 +30,7 @@ def steps(bench: Bench) -> Measured:
     wait_for(lambda: bench.ticks > ticks + 12_000, "three seconds")
     report = bench.status()
     assert report["state"] == "running", report
-    assert abs(report["rate_hz"] - 4000.0) < 40.0, report
+    assert abs(report["rate_hz"] - RATE_HZ) < HOST_MAY_TAKE * RATE_HZ, report
     return Measured(note=f"started at {first / 1e9:.0f} s of a stepping clock")
 
 

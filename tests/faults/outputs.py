@@ -174,12 +174,12 @@ def parking_that_dies(bench: Bench) -> Measured:
 
 
 def drive_and_die(driver: Driver, drive_v: float, slew_v_per_s: float) -> None:
-    """Ramp the output up, and leave it there."""
+    """Ramp the output up as steeply as is allowed, and leave it there."""
     pointers = driver.open()
     write = FUNCTION(pointers.write)
     for row in ramp(np.zeros(1), np.array([drive_v]), slew_v_per_s / driver.rate_hz):
         write(pointers.context, row.ctypes.data)
-        time.sleep(1e-4)
+        time.sleep(1.0 / driver.rate_hz)
     os._exit(0)
 
 

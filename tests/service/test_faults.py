@@ -7,7 +7,7 @@ import pytest
 from tests.faults import hardware, processes
 from tests.faults.fault import Fault, measure
 
-CHOSEN = ("loop SIGSTOP", "service SIGKILL", "driver raises in write")
+CHOSEN = ("loop SIGSTOP", "driver raises in write")
 FAULTS = {fault.name: fault for fault in (*processes.FAULTS, *hardware.FAULTS)}
 
 

@@ -117,9 +117,10 @@ def shown(bench: Bench) -> Shown:
 def test_margins_and_motion_are_those_of_the_rig(bench: Bench, shown: Shown) -> None:
     found = shown.found
     true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
-    assert found["margins"]["gain_margin"]["value"] == pytest.approx(true["gain_margin"], rel=0.02)
-    assert found["margins"]["phase_margin_deg"]["value"] == pytest.approx(true["phase_margin_deg"], abs=2.0)
-    assert found["margins"]["modulus_margin"]["value"] == pytest.approx(true["modulus_margin"], rel=0.02)
+    for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
+        margin = found["margins"][name]
+        assert 0.0 < margin["std"] < 0.02 * true[name], margin
+        assert abs(margin["value"] - true[name]) < 5.0 * margin["std"], margin
     assert found["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.002)
     assert found["model"] is None
     assert reference_um(bench) == HELD_UM

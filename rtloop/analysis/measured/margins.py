@@ -1,12 +1,14 @@
 """Margins of a measured loop with their standard deviations.
 
 The definitions are those of a computed loop (`rtloop.analysis.margins`), as far as the measured band goes. Uncertainty
-is carried over by what a change of L by one standard deviation does, in magnitude and in phase.
+is carried over by what a change by one standard deviation does: of L in magnitude, of L in phase, and of the light
+mode in frequency and in damping.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,10 +36,10 @@ class MeasuredMargins:
     max_sensitivity_hz: Uncertain
 
 
-def measured_margins(loop: MeasuredLoop) -> MeasuredMargins:
-    """Of a measured loop."""
+def measured_margins(loop: MeasuredLoop, with_moved_mode: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
+    """Of a measured loop, and of what it would be with each figure of its light mode off by a standard deviation."""
     half = math.sqrt(0.5)  # of each part of a complex number
-    here, *moved = (margins(loop.moved(part)) for part in (0, half, 1j * half))
+    here, *moved = map(margins, (loop, loop.moved(half), loop.moved(1j * half), *with_moved_mode))
 
     def uncertain(name: str) -> Uncertain:
         value = getattr(here, name)

@@ -97,7 +97,8 @@ def measurement(
     found = response(grid, Signals(error, command, position, part.folded(past)[0]))
     mode = _mode(found, rate_hz, near_hz)
     loop = measured_loop(found, rate_hz, mode)
-    return Measurement(found, loop, measured_margins(loop), mode, model)
+    with_moved_mode = [measured_loop(found, rate_hz, moved) for moved in mode.moved()] if mode else []
+    return Measurement(found, loop, measured_margins(loop, with_moved_mode), mode, model)
 
 
 def _mode(found: Response, rate_hz: float, near_hz: float | None) -> LightMode | None:

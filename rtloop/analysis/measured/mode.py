@@ -9,7 +9,7 @@ measurement's own uncertainty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +44,10 @@ class LightMode:
     def image(self, rate_hz: float) -> complex:
         """λ, of positive imaginary part."""
         return _image(self.hz, self.damping, rate_hz)
+
+    def moved(self) -> tuple[LightMode, LightMode]:
+        """With a frequency that is larger by its standard deviation, and with a damping that is."""
+        return replace(self, hz=self.hz + self.hz_std), replace(self, damping=self.damping + self.damping_std)
 
 
 def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
