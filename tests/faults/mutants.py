@@ -52,7 +52,8 @@ MUTANTS = (
            "now_v = np.where(np.abs(safe_v - now_v) <= 0.2, safe_v, np.clip(safe_v, now_v - step_v, now_v + step_v))",
            STEEP, (PARKED, DEATHS)),
     Mutant("a driver's close that writes 0 V at once in place of the ramp", RAMP,
-           "    write = _WRITE(pointers.write)", "    return\n    write = _WRITE(pointers.write)", STEEP, (PARKED, CARD)),
+           "    write = _WRITE(pointers.write)", "    return\n    write = _WRITE(pointers.write)", STEEP,
+           (PARKED, CARD)),
 )  # fmt: skip
 
 
