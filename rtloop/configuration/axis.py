@@ -67,6 +67,8 @@ class LimitsOptions(Options):
     """Ramp of a trip, a stop and mode off."""
     bump_s: float = Field(default=0.02, gt=0)
     """Time constant with which the offset of a bumpless change of mode dies out."""
+    settled_within_um: float | None = Field(default=None, gt=0)
+    """An error that stays larger is said: the axis is not settled. It limits nothing; None: not judged."""
 
     @property
     def lowest_v(self) -> float:

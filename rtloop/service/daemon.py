@@ -50,7 +50,7 @@ def _serve(config: Path, duration_s: float | None) -> int:
     signal.signal(signal.SIGHUP, lambda *_: service.reload())
     try:
         adapts = adapting(service, socket_path(service.configuration))
-        sums = summed(service.quality, lambda: service.supervisor)
+        sums = summed(service.quality, lambda: (service.supervisor, service.limits))
         with builder_ended(), _listening(service), supervised_by_can(service), adapts, sums:
             return service.run()
     finally:

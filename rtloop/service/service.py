@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from rtloop import signals
+from rtloop.configuration.axis import LimitsOptions
 from rtloop.configuration.file import Configuration, load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.drivers.errors import DriverError
@@ -124,6 +125,12 @@ class Service:
     def _died(self) -> bool:
         """Whether the present loop's process has died; its outputs are parked, its recording may not be whole yet."""
         return self.supervisor is not None and self.supervisor.error is not None
+
+    @property
+    def limits(self) -> list[LimitsOptions]:
+        """Of each axis, as they are now; empty while no loop runs."""
+        live = self.live
+        return [] if live is None else [axis.limits for axis in live.prepared.configuration.axes]
 
     @property
     def desk(self) -> Desk:

@@ -71,7 +71,7 @@ def timing(service: Service) -> dict[str, Any]:
 
 
 def newest_signals(service: Service) -> dict[str, Any]:
-    """Tick, mode, trip causes and the signals of each axis; empty before the first tick."""
+    """Tick, mode, trip causes, signals of each axis, condition of those in closed loop; empty before the first tick."""
     supervisor = service.supervisor
     row = None if supervisor is None else supervisor.latest()
     if supervisor is None or row is None:
@@ -89,6 +89,7 @@ def newest_signals(service: Service) -> dict[str, Any]:
         "trip": (causes := signals.trip_causes(row[signals.FLAGS])),
         "trip_reason": supervisor.trip_reason if causes else None,
         "axes": axes,
+        "condition": {axis: sums.condition for axis, sums in service.quality.axes.items() if sums.condition},
     }
 
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 BAR_WIDTH = 40
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
 """Of a specification, in the order of the table."""
+UNCONTROLLED_PERCENT = 50.0
+"""A loop that was saturated, or not settled, for a larger share of its time is said not to have controlled."""
 MOST = 8
 """Names in a row."""
 LONGEST_STEP_ANALYSIS_TICKS = 6_000_000
@@ -106,6 +108,14 @@ def print_summary(summary: Summary) -> None:
     if any(summary.ticks_limited.values()):
         counts = ", ".join(f"{name} {count:,}" for name, count in summary.ticks_limited.items() if count)
         shown.add_row("limited", "", f"ticks by what: {counts}")
+    if (summary.saturated_percent or 0.0) > UNCONTROLLED_PERCENT:
+        share = f"{summary.saturated_percent:.0f} % of the ticks in closed loop"
+        shown.add_row("[red]saturated[/]", "", f"[red]in {share} the law asked for more than command or drive may[/]")
+    for axis in summary.axes:
+        if axis.settled_percent is not None and axis.settled_percent < UNCONTROLLED_PERCENT:
+            share = f"{100 - axis.settled_percent:.0f} % of the ticks in closed loop"
+            error = f"the error of {escape(axis.name)} was larger than {axis.settled_within_um:g} µm"
+            shown.add_row("[red]not settled[/]", "", f"[red]in {share} {error}[/]")
     if cut := summary.cut:
         shown.add_row("cut", f"{cut['first']} …", f"to tick {cut['end'] - 1}, of {escape(', '.join(cut['files']))}")
     if len(summary.parts) > 1:

@@ -10,6 +10,7 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
+from rtloop.configuration.axis import LimitsOptions
 from rtloop.service.api.metrics import _Summed
 from rtloop.service.measuring.quality import Quality
 from tests.recording.hand_made_loop import AXES, COLUMNS, HandMadeLoop, make_rows
@@ -31,11 +32,11 @@ class Looked:
         """Another loop."""
         self.loop = HandMadeLoop(rate_hz=100.0)  # whose ring is as small as can be
         plan = SimpleNamespace(columns=COLUMNS, axes=tuple(AXES))
-        self._supervisor: Any = SimpleNamespace(block=self.loop.block, ticks=1, prepared=SimpleNamespace(plan=plan))
+        self.supervisor: Any = SimpleNamespace(block=self.loop.block, ticks=1, prepared=SimpleNamespace(plan=plan))
 
     def run(self, rows: np.ndarray) -> None:
         self.loop.run(rows)
-        self.quality.look(self._supervisor)
+        self.quality.look(self.supervisor)
 
     @property
     def samples(self) -> dict[tuple[str, ...], float]:
@@ -135,3 +136,35 @@ def test_without_a_loop_there_is_nothing(looked: Looked):
     looked.quality.look(None)
     assert looked.samples["ticks_summed_total",] == 0
     assert ("error_peak_um", "x") not in looked.samples
+
+
+@pytest.mark.parametrize(
+    ("share", "column", "value", "found"),
+    [
+        (0.6, "x_demand_v", 10.1, "saturated"),
+        (0.4, "x_demand_v", 10.1, "controlled"),
+        (0.6, "x_demand_v", -0.1, "saturated"),
+        (0.6, "x_demand_v", 0.0, "controlled"),
+        (0.6, "x_command_um", -42.1, "saturated"),
+        (0.6, "x_command_um", -42.0, "controlled"),
+        (0.6, "x_error_um", -0.3, "not settled"),
+        (0.4, "x_error_um", -0.3, "controlled"),
+        (0.6, "x_error_um", 0.2, "controlled"),
+    ],
+)
+def test_an_axis_at_its_limits_or_beside_its_reference_is_not_controlled(
+    looked: Looked, share: float, column: str, value: float, found: str
+):
+    """An amplifier without a negative side, 10 V, 42 µm, and a band of 0.2 µm."""
+    limits = LimitsOptions(drive_v=10.0, drive_min_v=0.0, command_um=42.0, settled_within_um=0.2)
+    rows = make_rows(1000)
+    for name in ("x_demand_v", "x_command_um", "x_error_um"):
+        rows[:, COLUMNS.index(name)] = 0.1
+    rows[: round(1000 * share), COLUMNS.index(column)] = value
+    looked.loop.run(rows)
+    looked.quality.look(looked.supervisor, [limits] * len(AXES))
+    assert looked.quality.axes["x"].condition == found
+    rows[:, MODE] = 1
+    looked.loop.run(rows)
+    looked.quality.look(looked.supervisor, [limits] * len(AXES))
+    assert looked.quality.axes["x"].condition is None

@@ -12,8 +12,17 @@ function causes(trip, reason) {
   return [reason, ...others].filter(Boolean).map(words).join(", ");
 }
 
+/** Axes that run in closed loop and are not controlled, and why; "" where all are. */
+function uncontrolled(condition = {}) {
+  return Object.entries(condition)
+    .filter(([, found]) => found !== "controlled")
+    .map(([axis, found]) => `${axis} ${found}`)
+    .join(", ");
+}
+
 export class Strip {
   #state = null;
+  #word = "";
   #tripped = "";
 
   constructor(live) {
@@ -39,19 +48,21 @@ export class Strip {
   }
 
   #take(state) {
-    const before = this.#state?.state;
+    const before = this.#word;
     this.#state = state;
-    $("state").dataset.state = state.state;
-    say($("state-word"), words(state.state));
+    const ill = state.state === "running" ? uncontrolled(state.condition) : "";
+    this.#word = ill || words(state.state);
+    $("state").dataset.state = ill ? "uncontrolled" : state.state;
+    say($("state-word"), this.#word);
     say($("mode"), state.mode ? words(state.mode) : "");
     say($("tick"), counted(state.tick));
-    if (before !== state.state) say($("spoken"), `${words(state.state)}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
+    if (before !== this.#word) say($("spoken"), `${this.#word}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
     const tripped = state.trip?.length ? `Tripped: ${causes(state.trip, state.trip_reason)}. Reset to go on.` : "";
     if (tripped !== this.#tripped) {
       this.#tripped = tripped;
       say($("alarm"), tripped);
     }
-    document.title = `${state.state === "running" ? "▶" : state.state === "tripped" ? "✕" : "■"} ${$("name").textContent} · rtloop`;
+    document.title = `${ill ? "!" : state.state === "running" ? "▶" : state.state === "tripped" ? "✕" : "■"} ${$("name").textContent} · rtloop`;
   }
 
   #status({ rate_hz, lateness_us, recording, periods_missed }) {

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -33,6 +35,10 @@ class AxisSummary:
     name: str
     rms_error_um: float | None
     max_abs_drive_v: float | None
+    settled_within_um: float | None = None
+    """As the configuration states it; None where it does not."""
+    settled_percent: float | None = None
+    """Closed-loop ticks with |error| ≤ `settled_within_um`."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,8 @@ class Summary:
     paced: bool
     overruns: int
     ticks_limited: dict[str, int]
+    saturated_percent: float | None
+    """Closed-loop ticks that limited the command or drive of an axis; None where the loop was never closed."""
     lateness_us: dict[str, float] | None
     lateness_histogram: list[dict[str, Any]]
     exec_us: dict[str, float] | None
@@ -110,9 +118,9 @@ class Summary:
 class AxisSums:
     """Tracking error over closed-loop ticks and the largest drive of one axis."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self._square_sum, self._count, self._drive = 0.0, 0, 0.0
+    def __init__(self, name: str, settled_within_um: float | None) -> None:
+        self.name, self._band_um = name, settled_within_um
+        self._square_sum, self._count, self._settled, self._drive = 0.0, 0, 0, 0.0
 
     def add(self, column: dict[str, np.ndarray[Any, Any]], closed: Any) -> None:
         """Count a block; `closed` says which ticks ran in closed loop. Imported signals may lack either column."""
@@ -121,13 +129,17 @@ class AxisSums:
             errors = error_um[closed]
             self._square_sum += float(errors @ errors)
             self._count += len(errors)
+            if self._band_um is not None:
+                self._settled += int(np.count_nonzero(np.abs(errors) <= self._band_um))
         if drive_v is not None:
             self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
     def summary(self, columns: Sequence[str]) -> AxisSummary:
         """What came of it, in a recording with these columns."""
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
-        return AxisSummary(self.name, rms_um, self._drive if f"{self.name}_drive_v" in columns else None)
+        drive_v = self._drive if f"{self.name}_drive_v" in columns else None
+        settled = 100 * self._settled / self._count if self._count and self._band_um is not None else None
+        return AxisSummary(self.name, rms_um, drive_v, self._band_um, settled)
 
 
 class Extremes:
@@ -154,13 +166,15 @@ class Extremes:
 class Totals:
     """What is summed up over the ticks of a recording."""
 
-    def __init__(self, axes: list[str], imported_units: dict[str, str]) -> None:
+    def __init__(self, bands_um: dict[str, float | None], imported_units: dict[str, str]) -> None:
+        """`bands_um`: by axis, what `settled_within_um` its configuration states."""
         self.ticks, self.overruns, self.periods_missed = 0, 0, 0
+        self.closed_ticks, self.saturated_ticks = 0, 0
         self.limited = dict.fromkeys(LIMITED, 0)
         self.first: tuple[float, float] | None = None
         self.last = (0.0, 0.0)
         self.histograms = {name: Histogram() for name in MEASURED}
-        self.axes = [AxisSums(name) for name in axes]
+        self.axes = [AxisSums(name, band_um) for name, band_um in bands_um.items()]
         self.extremes = Extremes(imported_units)
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
@@ -177,6 +191,9 @@ class Totals:
         for name in self.histograms.keys() & column.keys():
             self.histograms[name].add(column[name])
         closed = column["mode"] == Mode.CLOSED_LOOP if "mode" in column else None
+        if closed is not None and flags.size:
+            self.closed_ticks += int(np.count_nonzero(closed))
+            self.saturated_ticks += int(np.count_nonzero(flags[closed] & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED)))
         with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a recording
             for axis in self.axes:
                 axis.add(column, closed)
@@ -252,6 +269,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         paced=header["paced"],
         overruns=totals.overruns,
         ticks_limited=totals.limited,
+        saturated_percent=100 * totals.saturated_ticks / totals.closed_ticks if totals.closed_ticks else None,
         lateness_us=reports["lateness_us"],
         lateness_histogram=totals.histograms["lateness_us"].classes(),
         exec_us=reports["exec_us"],
@@ -277,9 +295,20 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
     )
 
 
+def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
+    """By axis, `settled_within_um` of the configuration that a recording holds; None where it states none."""
+    bands_um: dict[str, float | None] = dict.fromkeys(header["axes"])
+    with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
+        for axis in tomllib.loads(header.get("configuration") or "").get("axis", ()):
+            band_um = axis.get("limits", {}).get("settled_within_um")
+            if axis.get("name") in bands_um and isinstance(band_um, int | float):
+                bands_um[axis["name"]] = float(band_um)
+    return bands_um
+
+
 def _sum_up(readers: Sequence[Reader], progress: Progress | None) -> Totals:
     header, axes = readers[0].header, readers[0].header["axes"]
-    totals = Totals(axes, header["imported"]["units"] if "imported" in header else {})
+    totals = Totals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]
     if "imported" in header:
         names = [*readers[0].columns]

@@ -10,6 +10,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 
+from rtloop.service.measuring.condition import Condition
 from rtloop.service.measuring.quality import LATENESS_US, Quality
 from rtloop.service.service import Service, State
 from rtloop.service.status import newest_signals, timing
@@ -61,6 +62,11 @@ def metrics_text(service: Service) -> str:
     trip = Gauge("rtloop_trip", "1 for each cause of the trip in force", ["cause"], registry=registry)
     for cause in newest.get("trip", ()):
         trip.labels(cause).set(1)
+    condition = Gauge("rtloop_condition", "1 for the condition of an axis in closed loop", ["axis", "condition"],
+                      registry=registry)  # fmt: skip
+    for axis, found in newest.get("condition", {}).items():
+        for one in Condition:
+            condition.labels(axis, one.value).set(float(found is one))
     axes = newest.get("axes", {})
     signal = Gauge("rtloop_signal", "Newest value of a signal", ["axis", "signal"], registry=registry)
     for axis, values in axes.items():

@@ -10,16 +10,20 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rtloop import signals
 from rtloop.recording.capture.rings import RingReader
+from rtloop.service.measuring.condition import Condition, condition
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from rtloop.configuration.axis import LimitsOptions
 
 LOOK_S = 0.5
 MOST_TICKS = 1 << 14
@@ -40,6 +44,8 @@ class AxisSums:
     drive_v2: float = 0.0
     peaks: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=PEAK_LOOKS))
     """Of each of the last looks: largest |error| in µm, least and largest drive in V."""
+    condition: Condition | None = None
+    """At the newest look."""
 
     def add(self, error_um: Rows, drive_v: Rows, closed: Rows) -> None:
         """Some ticks, at least one."""
@@ -69,9 +75,11 @@ class Quality:
         self._rows: Rows = np.empty((0, 0))
         self._flags = 0
 
-    def look(self, supervisor: Supervisor | None) -> None:
-        """Count what ticked since the last time."""
+    def look(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
+        """Count what ticked since the last time, and judge each axis by its `limits`."""
         if supervisor is None or not supervisor.ticks:
+            for sums in self.axes.values():
+                sums.condition = None
             return
         if supervisor is not self._supervisor:
             self._supervisor, self._flags = supervisor, 0
@@ -84,6 +92,8 @@ class Quality:
                 self.unseen += lost
                 if copied:
                     self._add(self._rows[:copied], supervisor.prepared.plan.axes)
+                    for number, (axis, one) in enumerate(zip(supervisor.prepared.plan.axes, limits, strict=False)):
+                        self.axes[axis].condition = condition(self._rows[:copied], number, one)
 
     def _add(self, rows: Rows, axes: tuple[str, ...]) -> None:
         flags = rows[:, signals.FLAGS].astype(np.int64)
@@ -112,13 +122,15 @@ class Quality:
 
 
 @contextlib.contextmanager
-def summed(quality: Quality, present: Callable[[], Supervisor | None]) -> Iterator[None]:
-    """Sum up what the `present` loop does, one after the other, in a thread of its own."""
+def summed(
+    quality: Quality, present: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
+) -> Iterator[None]:
+    """Sum up what the `present` loop does within its limits, one after the other, in a thread of its own."""
     ended = threading.Event()
 
     def watch() -> None:
         while not ended.wait(LOOK_S):
-            quality.look(present())
+            quality.look(*present())
 
     threading.Thread(target=watch, daemon=True).start()
     try:
