@@ -13,6 +13,7 @@ export class Live extends EventTarget {
   #failures = 0;
   #heard_ms = -Infinity;
   #age_s = null;
+  #answered = false;
 
   constructor() {
     super();
@@ -56,17 +57,19 @@ export class Live extends EventTarget {
     if (message.kind === "state") {
       this.#heard_ms = performance.now();
       this.#age_s = message.age_s;
+      this.#answered = message.state !== "unreachable";
       this.#watch();
     }
     this.dispatchEvent(new CustomEvent(message.kind, { detail: message }));
   }
 
-  /** Tells how old what is shown is, and whether it is the present. */
+  /** Tells how old what is shown is, whether it is the present, and whether the service answers. */
   #watch() {
     const silence_ms = performance.now() - this.#heard_ms;
     const connected = this.#socket?.readyState === WebSocket.OPEN && silence_ms < SILENCE_MS;
     const age_s = this.#age_s == null ? null : this.#age_s + (connected ? 0 : silence_ms / 1000);
-    const fresh = connected && age_s != null && age_s * 1000 < SILENCE_MS;
-    this.dispatchEvent(new CustomEvent("freshness", { detail: { connected, fresh, age_s, silence_s: silence_ms / 1000 } }));
+    const fresh = connected && this.#answered && age_s != null && age_s * 1000 < SILENCE_MS;
+    const detail = { connected, answered: connected && this.#answered, fresh, age_s, silence_s: silence_ms / 1000 };
+    this.dispatchEvent(new CustomEvent("freshness", { detail }));
   }
 }

@@ -5,6 +5,11 @@ import { counted, fixed } from "./numbers.js";
 
 const words = (name) => String(name).replaceAll("_", " ");
 const STATUS_MS = 1000;
+const STOPPED = ["stopped", "armed"];
+/** In these a STOP is done, whoever asked for it. */
+
+const NO_CONNECTION = "No connection: what is shown is old, and STOP may not get through. Use the emergency stop.";
+const NO_SERVICE = "What is shown is old, and STOP does not get through. A loop that still runs parks its outputs by itself; if they must be safe now, use the emergency stop.";
 
 /** The one found first with its numbers, then the others. */
 function causes(trip, reason) {
@@ -23,7 +28,6 @@ function uncontrolled(condition = {}) {
 export class Strip {
   #state = null;
   #word = "";
-  #tripped = "";
 
   constructor(live) {
     live.addEventListener("state", ({ detail }) => this.#take(detail));
@@ -36,7 +40,7 @@ export class Strip {
       try {
         this.#status(await get("/api/status"));
       } catch {
-        // the age of the data says it
+        this.#status({});
       }
       setTimeout(ask, STATUS_MS);
     };
@@ -57,11 +61,9 @@ export class Strip {
     say($("mode"), state.mode ? words(state.mode) : "");
     say($("tick"), counted(state.tick));
     if (before !== this.#word) say($("spoken"), `${this.#word}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
-    const tripped = state.trip?.length ? `Tripped: ${causes(state.trip, state.trip_reason)}. Reset to go on.` : "";
-    if (tripped !== this.#tripped) {
-      this.#tripped = tripped;
-      say($("alarm"), tripped);
-    }
+    const why = state.trip?.length ? causes(state.trip, state.trip_reason) : (state.faults ?? []).join("; ");
+    say($("alarm"), state.state === "tripped" && why ? `Tripped: ${why}. Reset to go on.` : "");
+    if (STOPPED.includes(state.state)) say($("stop-alarm"), "");
     document.title = `${ill ? "!" : state.state === "running" ? "▶" : state.state === "tripped" ? "✕" : "■"} ${$("name").textContent} · rtloop`;
   }
 
@@ -72,15 +74,17 @@ export class Strip {
     $("recording").replaceChildren(ill ? make("span", { class: "error" }, `✕ ${recording.reason ?? recording.state}`) : recording?.state ? "● on" : "—");
   }
 
-  #fresh({ connected, fresh, age_s, silence_s }) {
+  #fresh({ connected, answered, fresh, age_s, silence_s }) {
     document.body.classList.toggle("stale", !fresh);
+    if (answered && $("desk").inert) for (const place of document.querySelectorAll("#desk .error")) place.replaceChildren(); // of before
+    $("desk").inert = !answered;
     const old_s = age_s ?? (!connected && Number.isFinite(silence_s) ? silence_s : null);
     const age = old_s == null ? "none yet" : `${fixed(old_s, old_s < 10 ? 1 : 0)} s old`;
     say($("age"), fresh ? "live" : age);
     const why = connected ? (this.#state?.error ?? "no new ticks") : "no connection to the panel's server";
     const says = `${why[0].toUpperCase()}${why.slice(1)}${old_s == null ? "" : `; what is shown is ${age}`}`;
     for (const veil of document.querySelectorAll(".veil")) if (!fresh) veil.dataset.says = says;
-    const spoken = connected ? (fresh ? "" : "No new ticks: what is shown is old.") : "No connection: what is shown is old, and STOP may not get through. Use the emergency stop.";
+    const spoken = fresh ? "" : !connected ? NO_CONNECTION : answered ? "No new ticks: what is shown is old." : `${why[0].toUpperCase()}${why.slice(1)}. ${NO_SERVICE}`;
     say($("said"), this.note && fresh ? this.note : spoken);
   }
 

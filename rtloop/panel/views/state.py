@@ -8,11 +8,13 @@ from typing import Any
 
 from rtloop.errors import RtloopError
 from rtloop.service.client import Client
+from rtloop.service.client.client import Unanswered
 
 AGAIN_S = 0.5
 SILENT_S = 1.0
 """A service that says nothing for so long is not there."""
 UNREACHABLE = "unreachable"
+NO_ANSWER = "the service does not answer"
 
 
 class State:
@@ -41,6 +43,8 @@ class State:
             try:
                 for said in self._client.watch():
                     self._said, self._heard_s = said, time.monotonic()
+            except Unanswered as error:
+                self._fault = f"{NO_ANSWER}: {error.reason}"
             except RtloopError as error:
                 self._fault = str(error)
             time.sleep(AGAIN_S)

@@ -11,9 +11,11 @@ from starlette.routing import BaseRoute, Route
 
 from rtloop.errors import HostRefused, UnavailableError
 from rtloop.panel.views.link import Service
+from rtloop.panel.views.state import NO_ANSWER
 from rtloop.panel.web.rates import Rate
 from rtloop.service.api.bodies import MAX_BODY_BYTES
 from rtloop.service.api.lanes import Busy, Lane, Lanes
+from rtloop.service.client.client import Unanswered
 
 READ = ("status", "configuration", "metrics", "openapi.json")
 COMMANDS = {
@@ -67,6 +69,8 @@ class Proxy:
         exchange = self._service.client.exchange
         try:
             code, kind, data = await self._lanes.run(lane, exchange, request.method, resource, body, TIMEOUT_S[lane])
+        except Unanswered as error:
+            return JSONResponse({"error": f"{NO_ANSWER}: {error.reason}"}, status_code=503)
         except (UnavailableError, HostRefused, Busy) as error:
             return JSONResponse({"error": str(error)}, status_code=503)
         return Response(data, code, media_type=kind)

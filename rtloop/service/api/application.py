@@ -195,7 +195,7 @@ def application(service: Service) -> Starlette:
     async def watch(socket: WebSocket) -> None:
         async with stream(socket) as accepted:
             while accepted:
-                said = {"state": service.state, "lock": service.lock.held}
+                said = {"state": service.state, "faults": list(service.faults), "lock": service.lock.held}
                 await socket.send_text(json.dumps(said | newest_signals(service)))
                 await asyncio.sleep(1 / WATCH_HZ)
 

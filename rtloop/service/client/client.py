@@ -55,6 +55,20 @@ def _connected(path: Path) -> socket.socket:
         raise
 
 
+class Unanswered(UnavailableError):
+    """Nobody answers at a control socket; `reason` says why, in words and without its path."""
+
+    def __init__(self, path: Path, error: Exception) -> None:
+        match error:
+            case FileNotFoundError():
+                self.reason = "it was stopped, or never started"
+            case ConnectionRefusedError():
+                self.reason = "it has died: nobody listens at its socket any more"
+            case _:
+                self.reason = str(getattr(error, "strerror", None) or error)
+        super().__init__(f"{path}: no service answers there ({self.reason})")
+
+
 class Client:
     """Talks to the service at `path`, under a name where one is given."""
 
@@ -102,7 +116,7 @@ class Client:
                 for message in connection:
                     yield json.loads(message)
         except (OSError, WebSocketException) as error:
-            raise UnavailableError(f"{self.path}: {error}") from None
+            raise Unanswered(self.path, error) from None
 
     def exchange(
         self, method: str, resource: str, body: str | bytes | None, timeout_s: float = TIMEOUT_S
@@ -114,8 +128,7 @@ class Client:
             response = connection.getresponse()
             return response.status, response.getheader("Content-Type") or "", response.read()
         except (OSError, http.client.HTTPException) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise UnavailableError(f"{self.path}: no service answers there ({reason})") from None
+            raise Unanswered(self.path, error) from None
         finally:
             connection.close()
 

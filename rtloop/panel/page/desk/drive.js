@@ -64,12 +64,12 @@ export class Drive {
     this.go.end();
     this.#strip.tell("STOP is sent…", 2000);
     try {
-      const { tick } = await stop((error) => say($("alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`));
-      say($("alarm"), "");
+      const { tick } = await stop((error) => say($("stop-alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`));
+      say($("stop-alarm"), "");
       this.#strip.tell(`Stopped${tick == null ? "" : ` at tick ${tick}`}: the outputs ramp to safe.`);
     } catch (error) {
       if (error.status === 409) this.#strip.tell(error.message);
-      else say($("alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`);
+      else say($("stop-alarm"), `STOP did not get through: ${error.message}. Use the emergency stop!`);
     }
   }
 

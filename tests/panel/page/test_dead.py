@@ -1,0 +1,86 @@
+"""What the page shows when the loop, and then its service, have died, and when they are back; a service of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from rtloop.hil import board
+from rtloop.service.client import Client
+from tests.faults.bench import Bench
+from tests.panel.page.browser import chromium, opened, panel_of, running, said, stopped
+
+DESK = ("#go", "#set-mode button", "#setpoint", "#tune-value", "#undo")
+
+
+@pytest.fixture
+def doomed(tmp_path: Any) -> Iterator[Bench]:
+    """Whose loop ends by itself a second after its service died."""
+    chromium()
+    changes = (
+        ("[recording]", "[service]\narm = true\n[recording]"),
+        ("[loop]\n", "[loop]\nheartbeat_timeout_s = 1.0\n"),
+    )
+    with Bench(tmp_path, *changes) as bench:
+        yield bench
+
+
+def blank(page: Any, selector: str) -> None:
+    """Wait until an element says nothing."""
+    said(page, selector, "^$")
+
+
+def test_who_died_is_said_in_words_and_what_is_old_is_grey_and_locked(browser: Any, doomed: Bench) -> None:
+    page = opened(browser, panel_of(doomed)[0])
+    running(page, doomed)
+    doomed.ask_for(board.FROZEN_INPUT)
+    said(page, "#alarm", "Tripped: x: frozen 2000 ticks")
+    doomed.ask_for(board.NO_FAULT)
+    page.click("#reset")
+    blank(page, "#alarm")
+
+    os.kill(doomed.pid("rt"), signal.SIGKILL)
+    doomed.await_restart()
+    said(page, "#alarm", r"Tripped: the loop's process died \(signal 9\); its outputs were parked.* Reset to go on")
+    assert page.is_enabled("#reset")
+
+    assert doomed.service is not None
+    doomed.service.kill()
+    doomed.service.wait()
+    said(page, "#said", "The service does not answer: it has died: .* STOP does not get through")
+    assert str(doomed.folder) not in page.inner_text("body")
+    assert page.evaluate("(places) => places.every((one) => document.querySelector(one).closest('[inert]'))", [*DESK])
+    for figure in ("#digits", "#state", "#rate", "#traces"):
+        greys = "(one) => { for (let e = document.querySelector(one); e; e = e.parentElement) " \
+                "if (getComputedStyle(e).filter.includes('grayscale')) return true; return false }"  # fmt: skip
+        assert page.evaluate(greys, figure), figure
+    said(page, "#recording", "^—$")
+    page.keyboard.press("Escape")
+    page.keyboard.press("Space")
+    said(page, "#stop-alarm", "STOP did not get through: the service does not answer: it has died")
+
+    assert doomed.rtloop("park", doomed.config).wait() == 0
+    doomed.start_service()
+    said(page, "#state-word", "stopped")
+    for place in ("#stop-alarm", "#alarm", "#said", "#power-error", "#lock-error"):
+        blank(page, place)
+    assert not page.evaluate("document.querySelector('#desk').inert")
+    running(page, doomed)
+    stopped(page)
+    page.context.close()
+
+
+def test_a_loop_that_does_not_control_is_not_shown_as_running(page: Any, bench: Bench) -> None:
+    running(page, bench)
+    driver = Client(bench.client.path, "ada")
+    driver.post("/tune", {"axis": "x", "section": "limits", "values": {"settled_within_um": 1e-4}})
+    said(page, "#state-word", "x not settled")
+    assert page.get_attribute("#state", "data-state") == "uncontrolled"
+    assert page.title().startswith("!")
+    driver.post("/tune", {"axis": "x", "section": "limits", "values": {"settled_within_um": None}})
+    said(page, "#state-word", "^running$")
+    page.click("#release")
