@@ -167,7 +167,8 @@ class CreepOptions(Options):
 class SensorOptions(Options):
     """The displacement sensor."""
 
-    um_per_v: float = Field(default=10.0, gt=0)
+    um_per_v: float = 10.0
+    """Negative for one that is mounted, or wired, the wrong way round."""
     offset_um: float = 0.0
     noise_um: float = Field(default=0.010, ge=0)
     """White noise, rms. The paper gives none: one step of resolution, so that the last digit flickers."""
@@ -175,6 +176,13 @@ class SensorOptions(Options):
     """The paper's sensor: 10 nm; 0 is none."""
     bandwidth_hz: float | None = Field(default=None, gt=0)
     """First-order lag. None by default: D(s) was identified through the sensor and contains it already."""
+
+    @field_validator("um_per_v")
+    @classmethod
+    def _measures(cls, um_per_v: float) -> float:
+        if um_per_v == 0:
+            raise ValueError("0: a sensor that measures nothing; allowed are numbers other than 0")
+        return um_per_v
 
 
 class ConverterOptions(Options):

@@ -163,7 +163,7 @@ def _sensor(configuration: Configuration, axis: AxisOptions, channel: ChannelOpt
         return
     there = options.plants.get(axis.name, options.plant).sensor.um_per_v
     where = f"driver.channels.{axis.name}.um_per_v: {channel.um_per_v:g} µm/V"
-    if channel.um_per_v < 0 < there:
+    if channel.um_per_v * there < 0:
         yield f"{where}, of the other sign than the simulated sensor's {there:g}: the feedback is positive"
     elif abs(channel.um_per_v / there - 1) > SAME_SCALE:
         yield f"{where}, but the simulated sensor has {there:g}"

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
+from rtloop.design.identification.hysteresis.creep import creep_explains
+from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
+from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
 from rtloop.design.identification.hysteresis.thresholds import placed_thresholds
 from rtloop.design.identification.identified import feedforward_of, feedforward_section
 from rtloop.design.identification.measured import Measured, UnsuitableData, require_usable
@@ -15,6 +17,7 @@ from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
 from rtloop.laws.shipped.play_model import PlayModel
+from tests.design.other_truths import creeping_plays, preisach
 from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
 
 DRIVES = st.lists(st.floats(-10, 10), min_size=1, max_size=60)
@@ -179,3 +182,33 @@ def test_a_dead_band_is_found_where_there_is_one(dead_band_v: float) -> None:
     fit = identify_hysteresis([run_of(drive, position)])
     assert (fit.model.thresholds[0] > 0) == (dead_band_v > 0)
     assert fit.placement == ("chebyshev" if dead_band_v else "chebyshev-from-0")
+
+
+def test_a_position_that_falls_where_the_drive_rises_is_called_a_wrong_sign() -> None:
+    drive = slow_sine()
+    run = made_of(EQ_4, drive)
+    for wrong in (run_of(drive, -run.position_um), run_of(-drive, run.position_um)):
+        for identify in (identify_hysteresis, identify_from_parts):
+            with pytest.raises(
+                UnsuitableData, match=r"the sign is wrong: .* falls where the drive rises, by [34]\.\d+ µm/V"
+            ):
+                identify([wrong])
+
+
+def test_a_fit_that_explains_hardly_anything_is_no_fit() -> None:
+    """A position of another axis, which moves at twice the frequency."""
+    drive = slow_sine()
+    other = run_of(drive, 30.0 * np.sin(4 * np.pi * 0.1 * SLOW_S * np.arange(drive.size)))
+    for identify in (identify_hysteresis, identify_from_parts):
+        with pytest.raises(UnsuitableData, match=r"no sum of plays explains .* errs by \d+ % of the range .* 15 % are"):
+            identify([other])
+
+
+@pytest.mark.parametrize(("truth", "creeps"), [(creeping_plays, True), (preisach, False)])
+def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(truth, creeps: bool) -> None:
+    """Half a micrometre per volt, with a lag of a second and a half in 25 s; noise of a nanometre."""
+    drive = slow_sine(9.0)[::15]
+    position = truth(drive) + 1e-3 * np.random.default_rng(3).normal(size=drive.size)
+    run = Measured("made", 15 * SLOW_S, drive, np.append(0.0, position[:-1]), position, True, "", "")
+    assert unexplained_um([run], identify_hysteresis([run])) > 0
+    assert creep_explains(run) == creeps

@@ -107,7 +107,7 @@ def test_defaults_are_the_papers():
         ),
         ("plant.creep.gains = [0.1]", "plant.creep", "gains has 1 and time_constants_s 0 numbers"),
         ("plant.creep = {gains=[0.1], time_constants_s=[0]}", "plant.creep", "allowed are numbers > 0"),
-        ("plant.sensor.um_per_v = 0", "plant.sensor.um_per_v", "greater than 0"),
+        ("plant.sensor.um_per_v = 0", "plant.sensor.um_per_v", "other than 0"),
         ('plant.sensor.um_per_v = "10"', "plant.sensor.um_per_v", "valid number"),
         ("plant.sensor.noise_um = nan", "plant.sensor.noise_um", "finite number|greater than or equal"),
         ("plant.sensor.offset_um = inf", "plant.sensor.offset_um", "finite number"),

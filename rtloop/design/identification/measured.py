@@ -19,6 +19,8 @@ from rtloop.signals import trip_causes
 LEAST_SPAN_TO_NOISE = 50.0
 """Position must move by this many standard deviations of its noise."""
 LEAST_TICKS = 100
+LARGEST_AGAINST = -0.5
+"""Correlation of position and drive below which a position goes against a slow drive."""
 PLATEAU_DRIVE = 0.02
 """A reading that stands still at its extreme while the drive moves by more than this part of its span is clipped."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
@@ -109,6 +111,18 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
         raise UnsuitableData(
             f"{name}: saturated: the reading stands still at {adc_v[where]:.6g} V from tick {where} on while it should "
             "move; a smaller drive, or a sensor or converter of larger range, is needed"
+        )
+
+
+def require_rising(run: Measured) -> None:
+    """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere."""
+    drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
+    if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_AGAINST:
+        slope = float(np.polyfit(drive_v, position_um, 1)[0])
+        raise UnsuitableData(
+            f"{run.name}: the sign is wrong: the position falls where the drive rises, by {-slope:.3g} µm/V. Turn the "
+            "sign of the channel's um_per_v ([driver.channels], or the mapping of an import), or wire the sensor or "
+            "the drive the other way round, and record again: a loop closed like this runs away"
         )
 
 

@@ -20,6 +20,7 @@ from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
 from rtloop.design.chain import Stage, text_with
+from rtloop.design.identification.hysteresis.creep import creep_explains
 from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
 from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
@@ -99,6 +100,13 @@ def require_enough(design: DesignOptions, source: str) -> None:
         raise ConfigError(source, faults)
 
 
+CREEP = (
+    "; a lag over time explains most of it: creep, by the look of it. How much it is, recordings at several speeds "
+    "tell (`rtloop identify hysteresis` takes them together)"
+)
+OTHER_SIZES = ", and what steps of other sizes do is not in the recording"
+
+
 def _require_plays(stage: Stage, design: DesignOptions) -> None:
     """Raise NoDesign where steps cannot be promised: the inverse leaves what no recording tells.
 
@@ -106,9 +114,10 @@ def _require_plays(stage: Stage, design: DesignOptions) -> None:
     """
     left_um = unexplained_um([stage.slow], stage.hysteresis)
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
+        why = CREEP if creep_explains(stage.slow) else OTHER_SIZES
         raise NoDesign(
             f"{stage.slow.name}: the actuator is no sum of plays: {left_um:.3g} µm rms are left however many there "
-            "are, and what steps of other sizes do is not in the recording. With simulation.residual_percent, how much "
+            f"are{why}. With simulation.residual_percent, how much "
             "hysteresis the inverse may leave, the design goes on, and is verified with it"
         )
 

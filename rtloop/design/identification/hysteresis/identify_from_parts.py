@@ -17,6 +17,7 @@ from rtloop.design.identification.hysteresis.held_out import OTHERS, held_out
 from rtloop.design.identification.hysteresis.identify_hysteresis import (
     HysteresisFit,
     Weights,
+    explaining,
 )
 from rtloop.design.identification.hysteresis.judgement import (
     Judgement,
@@ -32,7 +33,7 @@ from rtloop.design.identification.hysteresis.thresholds import (
     require_ascending,
     tried,
 )
-from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
+from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of, require_rising
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output, turning_points
@@ -83,6 +84,8 @@ def identify_from_parts(
     `before_v` is the drive of each run since rest, where that is known. Raises UnsuitableData, ValueError for the
     options.
     """
+    for run in runs:
+        require_rising(run)
     work = prepared_work(runs, weights, before_v)
     stroke_v, missing = _require_stroke(runs, work)
     trials = [Trial(placed_thresholds(count, 0.5 * stroke_v, one), one, ()) for one in tried(placement)]
@@ -93,7 +96,7 @@ def identify_from_parts(
     left = np.concatenate([one.left_um for one in judgements])
     model = PlayModel(best.thresholds_v, np.diff(common.slopes, prepend=0.0))
     creep_um = max(float(np.ptp(work.equations(run, best).creep @ common.creep)) for run in work.runs)
-    shape = _shape(runs, work, model, judgements, left, best.placed, weights)
+    shape = explaining(_shape(runs, work, model, judgements, left, best.placed, weights), runs)
     return PartsFit(shape, judgements, on_others, best.terms, errors_um, stroke_v, creep_um, missing)
 
 

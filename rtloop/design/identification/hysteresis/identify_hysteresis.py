@@ -28,7 +28,7 @@ from rtloop.design.identification.hysteresis.thresholds import (
     require_ascending,
     tried,
 )
-from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
+from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of, require_rising
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output, play_outputs
@@ -43,6 +43,8 @@ LEAST_SLOPE = 0.05
 FINEST, STRUCTURE = 60, 2.5e-4
 """An actuator is no sum of plays where not even so many explain it: what they leave beside noise is more than this part
 of the range."""
+LARGEST_ERROR = 0.15
+"""rms, as a part of the range, of a fit that is given out at all; a straight line through a wide loop errs by less."""
 LEAST_DIRECTION = 1e-9
 """Smallest singular value of the scaled columns, relative to the largest, for weights that can be told apart."""
 
@@ -92,11 +94,24 @@ def identify_hysteresis(
     placements = tried(placement)
     for run in runs:
         require_loop(run)
+        require_rising(run)
     largest_v = max(float(np.abs(run.drive_v).max()) for run in runs)
     if thresholds_v is not None:
-        return _fitted(runs, np.array(thresholds_v, float), "given", weights, largest_v)
+        return explaining(_fitted(runs, np.array(thresholds_v, float), "given", weights, largest_v), runs)
     fits = [_fitted(runs, placed_thresholds(count, largest_v, one), one, weights, largest_v) for one in placements]
-    return min(fits, key=lambda fit: fit.rms_error_um)
+    return explaining(min(fits, key=lambda fit: fit.rms_error_um), runs)
+
+
+def explaining(fit: HysteresisFit, runs: Sequence[Measured]) -> HysteresisFit:
+    """The fit of `runs`. Raises UnsuitableData for one that explains hardly anything of them."""
+    part = fit.rms_error_um / fit.range_um
+    if part > LARGEST_ERROR:
+        raise UnsuitableData(
+            f"{', '.join(run.name for run in runs)}: no sum of plays explains how the position follows the drive: the "
+            f"best errs by {100 * part:.0f} % of the range (rms), and {100 * LARGEST_ERROR:.0f} % are allowed. Look at "
+            "position over drive: are these the axis's own signals, of one slow drive, and is the sensor's sign right?"
+        )
+    return fit
 
 
 def unexplained_um(runs: Sequence[Measured], fit: HysteresisFit) -> float:

@@ -82,7 +82,7 @@ def equations(
     since = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
     drift = [since] if "drift" in terms else []
     passed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
-    creep = [_lag(run.drive_v, passed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
+    creep = [lagged(run.drive_v, passed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
     return Equations(
         plays,
         np.array(creep).reshape(-1, since.size).T,
@@ -121,7 +121,7 @@ def averaged(rows: Real, size: int) -> Real:
     return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
-def _lag(drive_v: Real, passed: Real, constant: float) -> Real:
+def lagged(drive_v: Real, passed: Real, constant: float) -> Real:
     """Drive behind a first-order lag, which stood still at first: (blocks,). `passed` is what the constant is in."""
     shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
     found, last = np.empty(drive_v.size), float(drive_v[0])

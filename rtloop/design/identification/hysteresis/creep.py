@@ -1,0 +1,40 @@
+"""Whether what no sum of plays explains in a recording is a lag over time, such as creep."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtloop.design.identification.hysteresis.identify_hysteresis import FINEST
+from rtloop.design.identification.hysteresis.stretches import CREEP_PARTS, averaged, kept, lagged
+from rtloop.design.identification.hysteresis.thresholds import placed_thresholds
+from rtloop.design.identification.measured import Measured, noise_of
+from rtloop.hil.modal import Real
+from rtloop.hysteresis.plays import play_outputs
+
+EXPLAINED = 0.5
+"""A lag explains what is left where it halves it."""
+
+
+def creep_explains(run: Measured) -> bool:
+    """Whether plays with lags of the drive leave at most half of what plays alone do, noise aside.
+
+    Of a recording from rest, whose drive has one speed, this is what it looks like and no proof: a memory that fades
+    with the drive's path looks alike.
+    """
+    blocks = kept(run, 1, [0.0])
+    thresholds = placed_thresholds(FINEST, float(np.abs(run.drive_v).max()), "chebyshev-from-0")
+    plays = play_outputs(run.drive_v[:-1], thresholds)
+    columns = np.column_stack([averaged(plays, blocks.size), np.ones(blocks.time_s.size)])
+    passed = blocks.time_s / blocks.time_s[-1]
+    lags = np.column_stack([lagged(blocks.drive_v, passed, 1 / part) for part in CREEP_PARTS])
+    noise = noise_of(run.position_um) ** 2 / blocks.size
+    alone, with_lags = (
+        max(_left(one, blocks.position_um) - noise, 0.0) for one in (columns, np.hstack([columns, lags]))
+    )
+    return with_lags < EXPLAINED**2 * alone
+
+
+def _left(columns: Real, position_um: Real) -> float:
+    """Mean square that the columns leave."""
+    solution = np.linalg.lstsq(columns, position_um)[0]
+    return float(np.mean((position_um - columns @ solution) ** 2))
