@@ -6,8 +6,10 @@ indices and divisions, so that a mistake is a status and no broken process.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,7 +75,9 @@ def _address(law: type[Law], keeps: LawRecords, name: str) -> int:
     try:
         address = native_address(kernel, signature)
     except Exception as error:  # whatever the compiler comes upon
-        raise ValueError(f"law {law.kind!r}: {name} cannot be compiled: {_short(error)}") from error
+        file = function.__code__.co_filename
+        where = f"law {law.kind!r}{_line(error, file)}: {name}"
+        raise ValueError(f"{where} cannot be compiled: {_short(error)}") from error
     for called, reason in foreign_calls(kernel, signature, law.libm).items():
         raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
     return address
@@ -93,7 +97,15 @@ def _short(error: Exception) -> str:
         return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [line for line in lines if line and not line.startswith(("During:", "- Resolution", "Failed in", "[", "<<"))]
-    return " ".join(kept)[:MAX_CHARACTERS]
+    end = next((i for i, line in enumerate(kept) if line.startswith(("File ", "There are", "def "))), len(kept))
+    return " ".join(kept[: max(end, 1)])[:MAX_CHARACTERS]
+
+
+def _line(error: Exception, file: str) -> str:
+    """Where in the law's own file it happened, as the compiler says."""
+    found = re.findall(r'File "([^"]+)", line (\d+)', str(error))
+    lines = [number for name, number in found if Path(name).name == Path(file).name]
+    return f" ({Path(file).name}), line {lines[-1]}" if lines else ""
 
 
 def _from_addresses(function: Callable[..., Any], keeps: LawRecords) -> Callable[..., Any]:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -177,12 +178,25 @@ def record_of(law: Law) -> Any:
     _announce(law)
     dtype = law.records().coefficients
     found = np.zeros(1, dtype)
-    for name, value in law.build().items():
-        if dtype.fields is None or name not in dtype.fields:
-            raise ValueError(f"{name}: not among the coefficients of {law.kind}, {', '.join(dtype.names or ())}")
+    known = [name for name in dtype.names or () if name not in ("reserved", "scratch")]
+    built = law.build()
+    if other := [name for name in built if name not in known]:
+        raise ValueError(f"{_place(law)}gives {', '.join(other)}; the coefficients are {', '.join(known)}")
+    if not law.shipped and (absent := [name for name in known if name not in built]):
+        raise ValueError(f"{_place(law)}gives no {', '.join(absent)}; the coefficients are {', '.join(known)}")
+    for name, value in built.items():
         numbers, target = np.asarray(value), found[name]
+        if numbers.dtype.kind not in "biuf":
+            raise ValueError(f"{_place(law)}gives {name} = {value!r}, which is no number")
         room = target.shape[1:]
         if numbers.ndim != len(room) or any(n > most for n, most in zip(numbers.shape, room, strict=True)):
-            raise ValueError(f"{name}: {numbers.shape} numbers; at most {room} fit")
+            raise ValueError(f"{_place(law)}gives {name} {numbers.shape} numbers; at most {room} fit")
         target[(0, *(slice(0, length) for length in numbers.shape))] = numbers
     return found
+
+
+def _place(law: Law) -> str:
+    """Where a law's `build` begins, for a message."""
+    code = type(law).build.__code__
+    part = "feedforward" if isinstance(law, Feedforward) else "controller"
+    return f"{part}: {Path(code.co_filename).name}, build in line {code.co_firstlineno}: it "

@@ -21,6 +21,7 @@ from types import ModuleType
 from rtloop.law.memory import Layout
 from rtloop.laws.contract import Law
 from rtloop.laws.limited.announced import announce, is_limited
+from rtloop.laws.mistakes import mistakes
 
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
@@ -124,6 +125,9 @@ def _module(text: str, file: str) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         raise ValueError(f"{file}: cannot be run: {_said(error)}") from error
+    for mistake in mistakes(text, vars(module)):
+        del sys.modules[name]
+        raise ValueError(f"{file}, line {mistake.line}: {mistake.what}")
     return module
 
 

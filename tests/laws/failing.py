@@ -52,7 +52,7 @@ CLASS = "class Mine(Controller):\n"
 USLEEP = "from numba import types\nusleep = types.ExternalFunction('usleep', types.int32(types.uint32))\n"
 BY_ADDRESS = "import ctypes\nusleep = ctypes.CDLL(None).usleep\nusleep.argtypes = [ctypes.c_uint]\n"
 REFUSED = {
-    "prints": (text("print(s.seen)"), "needs the interpreter"),
+    "prints": ("say = print\n" + text("say(s.seen)"), "needs the interpreter"),
     "takes memory": ("import numpy as np\n" + text("return np.zeros(3)[0]"), "takes memory"),
     "calls libm": ("import math\n" + text("return math.sin(told.error_um)"), "differs between processors"),
     "calls what is no intrinsic": (
@@ -63,8 +63,8 @@ REFUSED = {
     "sleeps by the C library": (USLEEP + text("usleep(1000)"), "usleep, which is outside of the law, and may wait"),
     "sleeps with libm": (USLEEP + text("usleep(1000)").replace(CLASS, f"{CLASS}    libm = True\n"), "calls usleep"),
     "sleeps by an address": (BY_ADDRESS + text("usleep(1000)"), "calls an address, which is outside of the law"),
-    "opens a file": (text("open('x')"), "cannot be compiled"),
-    "names what is not there": (text("return s.nothing"), "cannot be compiled"),
+    "opens a file": ("opened = open\n" + text("opened('x')"), "cannot be compiled"),
+    "names what is not there": (text("return s.nothing"), "s.nothing: not among its state"),
     "is no Python": ("def f(:\n", "SyntaxError in line 1"),
     "defines no law": ("x = 1\n", "defines no law"),
     "raises when it is read": ("1 / 0\n", "ZeroDivisionError"),

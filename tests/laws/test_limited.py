@@ -29,9 +29,9 @@ THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daem
 PROCESS_LEFT = "import os, time\nif not (pid := os.fork()):\n    time.sleep(1e6)\nopen('pid', 'w').write(str(pid))\n"
 AT_IMPORT = {
     "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was given up"),
-    "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
-    "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt"),
-    "raises what has no words": (NASTY, "raised OSError: no words"),
+    "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0, in line 2"),
+    "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt, in line 1"),
+    "raises what has no words": (NASTY, "raised OSError: no words, in line 3"),
     "ends its process": ("import os\nos._exit(0)\n", "ended its process (exit code 0)"),
     "reads where nothing is": ("import ctypes\nctypes.string_at(0)\n", "ended its process (SIGSEGV)"),
     "prints for ever": ("while True:\n    print('x' * 1000)\n", f"printed more than {MOST_PRINTED >> 10} KiB"),

@@ -13,6 +13,7 @@ import os
 import pickle
 import signal
 import sys
+import traceback
 from collections.abc import Callable
 from typing import IO, Any, NamedTuple
 
@@ -98,7 +99,7 @@ class Worker:
                 return "error", str(error)
         if self._law is not None:
             kind, file = self._law
-            return "faults", ("law", [f"law {kind!r} ({file}): raised {_words(error)}"])
+            return "faults", ("law", [f"law {kind!r} ({file}): raised {_words(error)}{_line(error, file)}"])
         if isinstance(error, ArithmeticError):
             return "faults", ("", [f"its numbers cannot be computed with ({error})"])
         raise error
@@ -121,6 +122,12 @@ def _load_compiler() -> None:
 
 def _identity(number: float) -> float:
     return number
+
+
+def _line(error: BaseException, file: str) -> str:
+    """Where in the law's own file it was raised."""
+    lines = [number for frame, number in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == file]
+    return f", in line {lines[-1]}" if lines else ""
 
 
 def _words(error: BaseException) -> str:
