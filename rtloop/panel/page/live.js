@@ -5,6 +5,9 @@ import { decode } from "./message.js";
 
 const SILENCE_MS = 600;
 /** State comes 20 times a second; without any for so long, what is shown is not the present. */
+const WATCH_MS = 100;
+const GONE_WATCHES = 30;
+/** Without any state in so many watches, the service counts as gone. Not a time: a page that was itself held up heard nothing. */
 const AGAIN_MS = [250, 500, 1000, 2000];
 
 export class Live extends EventTarget {
@@ -12,12 +15,16 @@ export class Live extends EventTarget {
   #wishes = {};
   #failures = 0;
   #heard_ms = -Infinity;
+  #watches = 0; // since then
   #age_s = null;
   #answered = false;
 
   constructor() {
     super();
-    setInterval(() => this.#watch(), 100);
+    setInterval(() => {
+      this.#watches++;
+      this.#watch();
+    }, WATCH_MS);
   }
 
   /** Once is enough: it comes again by itself. */
@@ -56,6 +63,7 @@ export class Live extends EventTarget {
   #take(message) {
     if (message.kind === "state") {
       this.#heard_ms = performance.now();
+      this.#watches = 0;
       this.#age_s = message.age_s;
       this.#answered = message.state !== "unreachable";
       this.#watch();
@@ -69,7 +77,7 @@ export class Live extends EventTarget {
     const connected = this.#socket?.readyState === WebSocket.OPEN && silence_ms < SILENCE_MS;
     const age_s = this.#age_s == null ? null : this.#age_s + (connected ? 0 : silence_ms / 1000);
     const fresh = connected && this.#answered && age_s != null && age_s * 1000 < SILENCE_MS;
-    const detail = { connected, answered: connected && this.#answered, fresh, age_s, silence_s: silence_ms / 1000 };
+    const detail = { connected, answered: this.#answered && this.#watches < GONE_WATCHES, fresh, age_s, silence_s: silence_ms / 1000 };
     this.dispatchEvent(new CustomEvent("freshness", { detail }));
   }
 }

@@ -11,8 +11,8 @@ from rtloop.service.client import Client
 from rtloop.service.client.client import Unanswered
 
 AGAIN_S = 0.5
-SILENT_S = 1.0
-"""A service that says nothing for so long is not there."""
+SILENT_S = 3.0
+"""A service that says nothing for so long is not there; one whose connection broke is not there at once."""
 UNREACHABLE = "unreachable"
 NO_ANSWER = "the service does not answer"
 
@@ -44,7 +44,10 @@ class State:
                 for said in self._client.watch():
                     self._said, self._heard_s = said, time.monotonic()
             except Unanswered as error:
-                self._fault = f"{NO_ANSWER}: {error.reason}"
+                self._lose(f"{NO_ANSWER}: {error.reason}")
             except RtloopError as error:
-                self._fault = str(error)
+                self._lose(str(error))
             time.sleep(AGAIN_S)
+
+    def _lose(self, fault: str) -> None:
+        self._fault, self._heard_s = fault, float("-inf")

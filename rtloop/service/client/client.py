@@ -64,8 +64,10 @@ class Unanswered(UnavailableError):
                 self.reason = "it was stopped, or never started"
             case ConnectionRefusedError():
                 self.reason = "it has died: nobody listens at its socket any more"
+            case OSError():
+                self.reason = error.strerror or str(error)
             case _:
-                self.reason = str(getattr(error, "strerror", None) or error)
+                self.reason = "it broke off in the middle of an answer"
         super().__init__(f"{path}: no service answers there ({self.reason})")
 
 

@@ -158,6 +158,21 @@ def test_what_the_service_refuses_is_said_beside_the_field(page: Any, bench: Ben
     stopped(page)
 
 
+def test_a_page_that_is_held_up_for_a_second_loses_nothing_that_was_typed_or_said(page: Any, bench: Bench) -> None:
+    running(page, bench)
+    page.fill("#setpoint", "twelve")
+    page.keyboard.press("Enter")
+    said(page, "#setpoint-error", "no number")
+    page.fill("#setpoint", "4.5")
+    page.evaluate("() => { for (const begun = performance.now(); performance.now() - begun < 1500; ); }")
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.activeElement.id") == "setpoint"
+    said(page, "#setpoint-error", "no number")
+    page.keyboard.press("Enter")
+    near(page, "#position-x", 4.5)
+    stopped(page)
+
+
 def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, address: str, bench: Bench) -> None:
     running(page, bench)
     other = opened(browser, address)
