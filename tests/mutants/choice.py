@@ -35,7 +35,11 @@ class Choice:
         )
 
     def survey(self, rooms: set[str], trees: list[Tree]) -> None:
-        """Survey the test files of rooms that were not yet, one process each, as many at once as there are trees."""
+        """Survey the test files of rooms that were not yet, one process each, as many at once as there are trees.
+
+        Raises RuntimeError for a file whose tests cannot be collected, or whose survey takes too long: mutants would
+        be tried without its tests, and survive.
+        """
         wanted = sorted({(file, ROOMS[room].compiled) for room in rooms for file in room_tests(ROOMS[room])})
         missing = [entry for entry in wanted if not self._path(*entry).exists()]
         idle, running = list(trees), list[tuple[int, float, Tree, Path]]()
@@ -46,8 +50,9 @@ class Choice:
                 running.append((_start(file, compiled, tree, path), time.monotonic(), tree, path))
             for entry in list(running):
                 child, began, tree, path = entry
-                if ended(child, began + SURVEY_LIMIT_S) is not None:
-                    _say(path, tree, time.monotonic() - began)
+                code = ended(child, began + SURVEY_LIMIT_S)
+                if code is not None:
+                    _report_survey(path, code, tree, time.monotonic() - began)
                     running.remove(entry)
                     idle.append(tree)
             time.sleep(0.05)
@@ -84,9 +89,10 @@ def _start(file: str, compiled: bool, tree: Tree, path: Path) -> int:
 
     def run() -> int:
         survey = Survey(tree.root, compiled=compiled)
-        pytest.main([*OPTIONS, f"--timeout={TEST_LIMIT_S}", file], plugins=[survey])
-        _write(path, survey.result())
-        return 0
+        code = pytest.main([*OPTIONS, f"--timeout={TEST_LIMIT_S}", file], plugins=[survey])
+        if code in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+            _write(path, survey.result())
+        return int(code)
 
     return tree.start(run, compiled=compiled, writes_bytecode=True)
 
@@ -98,11 +104,12 @@ def _write(path: Path, told: dict[str, Any]) -> None:
     partial.rename(path)
 
 
-def _say(path: Path, tree: Tree, seconds: float) -> None:
-    if not path.exists():  # it did not come to its end
-        _write(path, {"seconds": {}, "failed": {path.stem: tree.output()[-400:]}, "lines": {}})
-    told = json.loads(path.read_text())
-    counts = f"{len(told['seconds'])} tests, {len(told['failed'])} left out"
+def _report_survey(path: Path, code: int, tree: Tree, seconds: float) -> None:
+    """Print the counts of a surveyed test file. Raises RuntimeError if the process `code` ended left no survey."""
+    if not path.exists():
+        raise RuntimeError(f"survey {path.stem}: exit code is {code}; allowed: 0, 1\n{tree.output()[-2000:]}")
+    survey = json.loads(path.read_text())
+    counts = f"{len(survey['seconds'])} tests, {len(survey['failed'])} left out"
     print(f"surveyed {path.stem}: {counts}, {seconds:.0f} s", file=sys.stderr, flush=True)
 
 

@@ -9,6 +9,7 @@ from tests.mutants.uncompiled import install
 
 OPTIONS = (
     *("-q", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist"),
+    *("-p", "no:unraisableexception"),  # a process that a test leaves behind would end the whole session
     *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # of plug-ins that the forking process has imported
 )
 EXAMPLES = 20

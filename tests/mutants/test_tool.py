@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 
 import pytest
 
+from tests.mutants import choice
 from tests.mutants.account import EQUIVALENT, Equivalent, Result, Verdict, equivalents, keep, kept, table
 from tests.mutants.mutant import Mutant
 from tests.mutants.rooms import LEAST, ROOMS, ROOT, room_tests, shares, sources_of
@@ -112,3 +116,18 @@ def test_the_newest_result_of_a_mutant_counts(tmp_path):
     for verdict in (Verdict.SURVIVED, Verdict.DIED):
         keep(path, one, Result(one.key, verdict, 1.5, "a test"))
     assert kept(path) == {one.key: Result(one.key, Verdict.DIED, 1.5, "a test")}
+
+
+def test_a_test_file_that_cannot_be_collected_stops_the_survey(scratch, tmp_path, monkeypatch):
+    (scratch.tree.root / "tests" / "test_limits.py").write_text("import rtloop.no_such_module\n")
+    monkeypatch.setattr(choice, "room_tests", lambda room: ["tests/test_limits.py"])
+    monkeypatch.setattr(choice.Choice, "_path", lambda self, file, compiled: tmp_path / "survey.json")
+    with pytest.raises(RuntimeError, match=r"survey survey: exit code is 2; allowed: 0, 1\n(.|\n)*no_such_module"):
+        choice.Choice(tmp_path).survey({"analysis"}, [scratch.tree])
+
+
+def test_loop_and_drivers_can_be_imported_without_the_compiler():
+    modules = "rtloop.engine.assembly, rtloop.engine.ring, rtloop.drivers.sim, rtloop.drivers.shm"
+    script = f"from tests.mutants.uncompiled import install; install(); import {modules}"
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    subprocess.run([sys.executable, "-c", script], cwd=ROOT, env=environment, check=True)

@@ -81,13 +81,14 @@ def install() -> None:
     def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
         return lambda function: CFunction(ctypes.PYFUNCTYPE(*typed(signature))(function))
 
-    def external(name: str, signature: str) -> Any:
+    def external(name: str, signature: str, written: Any = None) -> Any:  # the C library itself is at hand here
         result, *given = typed(signature)
         function = ctypes.CDLL(None)[name]
         function.restype, function.argtypes = result, given
         return lambda *arguments: function(*map(int, arguments))
 
+    np.seterr(over="ignore")  # compiled integers wrap around without a warning
     intrinsic = compiled.intrinsic
     uncompiled.carray = lambda pointer, shape, dtype=np.float64: array(pointer, shape, dtype)  # of C doubles, if unsaid
     uncompiled.call, compiled.cfunc, compiled.entry, compiled.external = call, cfunc, entry, external
-    compiled.intrinsic = lambda function: _ORDERED.get(function.__name__) or intrinsic(function)
+    compiled.intrinsic = lambda function, written=None: _ORDERED.get(function.__name__) or intrinsic(function, written)
