@@ -50,8 +50,8 @@ class CFunction:
         self.address = ctypes.cast(callback, ctypes.c_void_p).value or 0
 
     def __call__(self, *arguments: int) -> Any:
-        """Run it."""
-        return self._callback(*arguments)
+        """Run it; numbers of any integer type become what C passes."""
+        return self._callback(*map(int, arguments))
 
 
 def install() -> None:
@@ -68,17 +68,7 @@ def install() -> None:
     def typed(signature: str) -> list[Any]:
         return [types[name] for name in re.findall(r"\w+\(float64\)|\w+", signature)]
 
-    def entry(signature: str) -> Callable[[Callable[..., Any]], Any]:
-        result, *given = typed(signature)
-
-        def called(function: Callable[..., Any]) -> Any:
-            return lambda *arguments: (
-                result(int(function(*(kind(int(one)).value for kind, one in zip(given, arguments, strict=True))))).value
-            )
-
-        return called
-
-    def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
+    def c_function_of(signature: str) -> Callable[[Callable[..., Any]], CFunction]:
         return lambda function: CFunction(ctypes.PYFUNCTYPE(*typed(signature))(function))
 
     def external(name: str, signature: str, written: Any = None) -> Any:  # the C library itself is at hand here
@@ -90,5 +80,6 @@ def install() -> None:
     np.seterr(over="ignore")  # compiled integers wrap around without a warning
     intrinsic = compiled.intrinsic
     uncompiled.carray = lambda pointer, shape, dtype=np.float64: array(pointer, shape, dtype)  # of C doubles, if unsaid
-    uncompiled.call, compiled.cfunc, compiled.entry, compiled.external = call, cfunc, entry, external
+    uncompiled.call, compiled.external = call, external
+    compiled.cfunc = compiled.entry = c_function_of
     compiled.intrinsic = lambda function, written=None: _ORDERED.get(function.__name__) or intrinsic(function, written)
