@@ -61,30 +61,39 @@ def main() -> int:
 
 
 def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -> None:
-    """Keep a mutant in each tree until all have their results."""
+    """Try a mutant in each tree until all have their results.
+
+    One that survives uncompiled is tried again with compiled kernels, by the tests that take too long without.
+    """
     left, idle, running = list(reversed(waiting)), list(trees), dict[int, tuple[Tree, Trial]]()
     while left or running:
         while left and idle:
             tree, mutant = idle.pop(), left.pop()
-            running[id(tree)] = tree, _started(tree, mutant, choice)
-        for number, (_, trial) in list(running.items()):
+            compiled = ROOMS[mutant.room].compiled
+            running[id(tree)] = tree, _started(tree, mutant, choice.tests(mutant), compiled=compiled)
+        for number, (tree, trial) in list(running.items()):
             try:
                 result = trial.result()
             except RuntimeError as error:  # it stays without a result, and is tried again by the next call
                 print(f"{trial.mutant.place}: {error}", file=sys.stderr, flush=True)
                 idle.append(running.pop(number)[0])
                 continue
-            if result is not None:
-                keep(path, trial.mutant, result)
-                _say(trial.mutant, result, len(left))
-                idle.append(running.pop(number)[0])
+            if result is None:
+                continue
+            survived = result.verdict in (Verdict.SURVIVED, Verdict.UNTESTED)
+            if survived and not trial.compiled and (tests := choice.left_out(trial.mutant)):
+                running[number] = tree, _started(tree, trial.mutant, tests, compiled=True)
+                continue
+            keep(path, trial.mutant, result)
+            _say(trial.mutant, result, len(left))
+            idle.append(running.pop(number)[0])
         time.sleep(POLL_S)
 
 
-def _started(tree: Tree, mutant: Mutant, choice: Choice) -> Trial:
+def _started(tree: Tree, mutant: Mutant, tests: dict[str, float], *, compiled: bool) -> Trial:
     text = mutated((ROOT / mutant.file).read_text(encoding="utf-8"), Change(mutant.operator, mutant.occurrence))
     assert text is not None  # it was drawn
-    return Trial(tree, mutant, text, choice.tests(mutant), compiled=ROOMS[mutant.room].compiled)
+    return Trial(tree, mutant, text, tests, compiled=compiled)
 
 
 def _say(mutant: Mutant, result: Result, left: int) -> None:

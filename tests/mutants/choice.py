@@ -19,6 +19,8 @@ from tests.mutants.trees import Tree, ended
 
 SURVEY_LIMIT_S = 1200.0
 """For the tests of one file."""
+LEFT_OUT_S = 5.0
+"""A test that is left out uncompiled takes about so long with compiled kernels."""
 TEST_LIMIT_S = 60
 """A test that waits for longer is left out, as one is that computes for long."""
 
@@ -70,6 +72,30 @@ class Choice:
         chosen = at_line or {name: seconds for _, known in surveyed for name, seconds in _executing(known, mutant)}
         stem = Path(mutant.file).stem
         return dict(sorted(chosen.items(), key=lambda item: (stem not in item[0], item[1])))
+
+    def left_out(self, mutant: Mutant) -> dict[str, float]:
+        """Tests that reach a mutant's line, but take too long uncompiled, each with the seconds that it may take."""
+        room = ROOMS[mutant.room]
+        known = [] if room.compiled else [self._known[file, False] for file in room_tests(room)]
+        return {
+            name: LEFT_OUT_S
+            for survey in known
+            for name in survey["failed"]
+            if any(
+                _reaches(survey, context, mutant)
+                for context in survey["lines"]
+                if _function(context) == _function(name)
+            )
+        }
+
+
+def _function(test: str) -> str:
+    """Name of a test without its parameters."""
+    return test.partition("[")[0]
+
+
+def _reaches(survey: dict[str, Any], context: str, mutant: Mutant) -> bool:
+    return mutant.line in survey["lines"][context].get(mutant.file, [])
 
 
 def _executing(known: dict[str, Any], mutant: Mutant, *, line: bool = False) -> list[tuple[str, float]]:

@@ -88,7 +88,7 @@ class Survey(Steady):
             self.failed[report.nodeid] = str(report.longrepr)[-400:]
 
     def result(self) -> dict[str, Any]:
-        """For each test that passed: seconds, and its lines by file; beside them what did not, and why."""
+        """Seconds of each test that passed, the reason of each that did not, and the lines of both by file."""
         self._coverage.stop()
         data = self._coverage.get_data()
         lines: dict[str, dict[str, list[int]]] = {}
@@ -98,8 +98,11 @@ class Survey(Steady):
                 for context in contexts:
                     lines.setdefault(context, {}).setdefault(path, []).append(line)
         passed = {name: seconds for name, seconds in self.seconds.items() if name not in self.failed}
-        names = {name for name in lines if name in passed or name.endswith(f"::{SHARED}")}
-        return {"seconds": passed, "failed": self.failed, "lines": {name: lines[name] for name in sorted(names)}}
+        return {
+            "seconds": passed,
+            "failed": self.failed,
+            "lines": {name: lines[name] for name in sorted(lines) if name},
+        }
 
 
 def _raise_too_long(_: int, frame: FrameType | None) -> None:

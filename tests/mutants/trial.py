@@ -12,11 +12,12 @@ import pytest
 
 from tests.mutants.account import Result, Verdict
 from tests.mutants.mutant import Mutant
+from tests.mutants.rooms import ROOMS
 from tests.mutants.steady import OPTIONS, Steady
 from tests.mutants.trees import NOT_RUN, TIMED_OUT, Tree, ended
 
-TIMES, MORE_S = 3.0, 30.0
-"""A mutant may take so many times as long as its tests without it, and so much more."""
+TIMES, MORE_S, COMPILER_S = 3.0, 30.0, 180.0
+"""A mutant may take so many times as long as its tests without it, and so much more; kernels may be compiled anew."""
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 
 
@@ -24,9 +25,11 @@ class Trial:
     """A mutant whose tests run: the module with its mistake is `text`; to be asked until there is a result."""
 
     def __init__(self, tree: Tree, mutant: Mutant, text: str, tests: dict[str, float], *, compiled: bool) -> None:
-        self.mutant = mutant
+        self.mutant, self.compiled = mutant, compiled
         self._tree, self._began = tree, time.monotonic()
-        self._limit_s = TIMES * sum(tests.values()) + MORE_S
+        self._limit_s = (
+            TIMES * sum(tests.values()) + MORE_S + (COMPILER_S if compiled and not ROOMS[mutant.room].compiled else 0)
+        )
         self._path = tree.root / mutant.file
         self._source, self._stamp = self._path.read_text(encoding="utf-8"), self._path.stat()
         self._child = 0
