@@ -63,7 +63,7 @@ def main() -> int:
 def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -> None:
     """Try a mutant in each tree until all have their results.
 
-    One that survives uncompiled is tried again with compiled kernels, by the tests that take too long without.
+    One that survives is tried again with compiled kernels, by tests that start processes or take too long uncompiled.
     """
     left, idle, running = list(reversed(waiting)), list(trees), dict[int, tuple[Tree, Trial]]()
     while left or running:
@@ -81,8 +81,8 @@ def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -
             if result is None:
                 continue
             survived = result.verdict in (Verdict.SURVIVED, Verdict.UNTESTED)
-            if survived and not trial.compiled and (tests := choice.left_out(trial.mutant)):
-                running[number] = tree, _started(tree, trial.mutant, tests, compiled=True)
+            if survived and not trial.second and (tests := choice.second_look(trial.mutant)):
+                running[number] = tree, _started(tree, trial.mutant, tests, compiled=True, second=True)
                 continue
             keep(path, trial.mutant, result)
             _say(trial.mutant, result, len(left))
@@ -90,10 +90,10 @@ def _try(waiting: list[Mutant], choice: Choice, trees: list[Tree], path: Path) -
         time.sleep(POLL_S)
 
 
-def _started(tree: Tree, mutant: Mutant, tests: dict[str, float], *, compiled: bool) -> Trial:
+def _started(tree: Tree, mutant: Mutant, tests: dict[str, float], *, compiled: bool, second: bool = False) -> Trial:
     text = mutated((ROOT / mutant.file).read_text(encoding="utf-8"), Change(mutant.operator, mutant.occurrence))
     assert text is not None  # it was drawn
-    return Trial(tree, mutant, text, tests, compiled=compiled)
+    return Trial(tree, mutant, text, tests, compiled=compiled, second=second)
 
 
 def _say(mutant: Mutant, result: Result, left: int) -> None:

@@ -73,20 +73,21 @@ class Choice:
         stem = Path(mutant.file).stem
         return dict(sorted(chosen.items(), key=lambda item: (stem not in item[0], item[1])))
 
-    def left_out(self, mutant: Mutant) -> dict[str, float]:
-        """Tests that reach a mutant's line, but take too long uncompiled, each with the seconds that it may take."""
+    def second_look(self, mutant: Mutant) -> dict[str, float]:
+        """Tests for a mutant that survived the others, in order, with their seconds.
+
+        They start processes, in which its line may be reached unseen, or reach it and take too long uncompiled.
+        """
         room = ROOMS[mutant.room]
-        known = [] if room.compiled else [self._known[file, False] for file in room_tests(room)]
-        return {
-            name: LEFT_OUT_S
-            for survey in known
-            for name in survey["failed"]
-            if any(
-                _reaches(survey, context, mutant)
-                for context in survey["lines"]
-                if _function(context) == _function(name)
-            )
+        surveyed = [self._known[file, room.compiled] for file in room_tests(room)]
+        tests = {
+            name: known["seconds"].get(name, LEFT_OUT_S) for known in surveyed for name in known["starting"] if name
         }
+        for known in [] if room.compiled else surveyed:
+            reaching = {_function(context) for context in known["lines"] if _reaches(known, context, mutant)}
+            tests |= {name: LEFT_OUT_S for name in known["failed"] if _function(name) in reaching}
+        stem = Path(mutant.file).stem
+        return dict(sorted(tests.items(), key=lambda item: (stem not in item[0], item[1])))
 
 
 def _function(test: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,19 +35,33 @@ class Survey(Steady):
         self.root = root
         self.seconds: dict[str, float] = {}
         self.failed: dict[str, str] = {}
+        self.starting: set[str] = set()
+        """Tests that start processes, in which no line is seen."""
         self._coverage = coverage.Coverage(
             data_file=None, config_file=False, include=[f"{root}/{place}/*" for place in ("rtloop", "hil", "drivers")]
         )
         self._too_long: set[str] = set()
         """Functions of which one case was too long, so that the others need not be tried."""
+        self._current = ""
+        self._watch_processes()
         signal.signal(signal.SIGPROF, _raise_too_long)
         self._coverage.start()
+
+    def _watch_processes(self) -> None:
+        """Add the current test to `starting` whenever a process is started."""
+        start = subprocess.Popen.__init__
+
+        def watched(popen: Any, *arguments: Any, **options: Any) -> None:
+            self.starting.add(self._current)
+            start(popen, *arguments, **options)
+
+        subprocess.Popen.__init__ = watched
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
         """Run one test under its own name."""
         self._coverage.switch_context(item.nodeid)
-        start = time.monotonic()
+        self._current, start = item.nodeid, time.monotonic()
         try:
             return (yield)
         finally:
@@ -88,7 +103,7 @@ class Survey(Steady):
             self.failed[report.nodeid] = str(report.longrepr)[-400:]
 
     def result(self) -> dict[str, Any]:
-        """Seconds of each test that passed, the reason of each that did not, and the lines of both by file."""
+        """Seconds of each test that passed, why others did not, which start processes, and the lines of all by file."""
         self._coverage.stop()
         data = self._coverage.get_data()
         lines: dict[str, dict[str, list[int]]] = {}

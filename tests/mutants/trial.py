@@ -24,8 +24,10 @@ _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 class Trial:
     """A mutant whose tests run: the module with its mistake is `text`; to be asked until there is a result."""
 
-    def __init__(self, tree: Tree, mutant: Mutant, text: str, tests: dict[str, float], *, compiled: bool) -> None:
-        self.mutant, self.compiled = mutant, compiled
+    def __init__(
+        self, tree: Tree, mutant: Mutant, text: str, tests: dict[str, float], *, compiled: bool, second: bool = False
+    ) -> None:
+        self.mutant, self.second = mutant, second
         self._tree, self._began = tree, time.monotonic()
         self._limit_s = (
             TIMES * sum(tests.values()) + MORE_S + (COMPILER_S if compiled and not ROOMS[mutant.room].compiled else 0)
