@@ -161,9 +161,10 @@ soak-response: $(READY)
 soak-closed-loop: $(READY)
 	$(BIN)/python -m tests.soak.closed_loop --draws $(or $(DRAWS),50)
 
-# A service whose resonance has moved measures it, makes its taps anew, and steps and scans: four minutes.
+# A service whose resonance or gain has moved measures both, makes its taps anew, and steps and scans: fifteen minutes.
 soak-retune: $(READY)
 	$(BIN)/python -m tests.soak.retune
+	$(BIN)/python -m tests.soak.retune_gain
 
 # A simulated day with 20 events, recorded around them: bytes, replay, `info`; a quota and, as root, a disk that fills:
 # a quarter of an hour to half an hour, 1 GB in the temporary folder; `HOURS=1` for less.

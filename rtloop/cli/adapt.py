@@ -51,11 +51,17 @@ def learn(
     help="The position is moved by no more than this while the resonance is measured.",
 )
 @click.option(
+    "--gain-um",
+    type=click.FloatRange(0),
+    help="References so far from the one held, towards the middle of the range, are held while the gain is measured; "
+    "0: it is not, and the model's is taken [a quarter of the specification's largest step].",
+)
+@click.option(
     "--bound-percent",
     default=15.0,
     show_default=True,
     type=click.FloatRange(0, 50, min_open=True),
-    help="A resonance further from the model's changes nothing.",
+    help="A resonance or gain further from the model's changes nothing.",
 )
 @click.option(
     "--within-percent",
@@ -70,11 +76,11 @@ def learn(
 @click.pass_context
 @fails_clearly
 def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
-    """Make the taps of AXIS anew for its resonance as it is now.
+    """Make the taps of AXIS anew for its resonance and gain as they are now.
 
-    It is measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in at
-    a tick, after a look at a step before and after. With --json and without --yes nothing is swapped. Exit 1 where the
-    taps stayed.
+    Both are measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in
+    at a tick, after a look at a step before and after. Taps that are no better than those in force are not swapped in,
+    --yes or not; with --json and without --yes none are. Exit 1 where the taps stayed.
     """
     from rtloop.commands.adapt.retune import Asked
     from rtloop.commands.adapt.retune import retune as retune_axis

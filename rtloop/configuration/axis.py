@@ -180,9 +180,12 @@ class AdaptOptions(Options):
 
     every_s: float = Field(ge=10)
     amplitude_um: float = Field(default=0.5, gt=0)
-    """The position is moved by no more than this."""
+    """The position is moved by no more than this while the resonance is measured."""
+    gain_um: float = Field(default=0.0, ge=0)
+    """Other references, so far from the one that is held, are held while the gain is measured; 0: it is not, and the
+    model's is taken."""
     bound_percent: float = Field(default=10.0, gt=0, le=50)
-    """A resonance further from the model's changes nothing."""
+    """A resonance or gain further from the model's changes nothing."""
     within_percent: float = Field(default=1.0, ge=0, le=50)
     """The taps are made for resonances so near the measured one."""
 

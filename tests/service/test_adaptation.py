@@ -15,18 +15,21 @@ from rtloop.configuration.axis import AdaptOptions
 from rtloop.service.measuring.adaptation import Schedule
 from rtloop.service.service import State
 
-TUNED = {"resonance": {"hz": 643.125}, "percent_from_model": 8.0, "tick": 523005}
+TUNED = {
+    "resonance": {"hz": 643.125}, "percent_from_model": 8.0, "gain": None, "better": True, "tick": 523005
+}  # fmt: skip
+GAIN = {"gain": {"value": 1.0204, "std": 0.0014}, "gain_percent_from_model": 2.04}
 
 
 class Desk:
     """A service with two axes, of which one adapts, and whoever runs commands for it."""
 
-    def __init__(self, code: int = 0, stderr: str = "") -> None:
+    def __init__(self, code: int = 0, stderr: str = "", answer: dict[str, Any] = TUNED) -> None:
         adapts = AdaptOptions(every_s=60.0, bound_percent=7.0)
         axes = [SimpleNamespace(name="x", adapt=adapts), SimpleNamespace(name="y", adapt=None)]
         self.service: Any = SimpleNamespace(state=State.RUNNING, configuration=SimpleNamespace(axes=axes))
         self.ran: list[list[str]] = []
-        self._answer = subprocess.CompletedProcess([], code, json.dumps(TUNED), stderr)
+        self._answer = subprocess.CompletedProcess([], code, json.dumps(answer), stderr)
         self.schedule = Schedule(self.service, Path("/run/lab.sock"), self._run)
 
     def _run(self, command: Any) -> subprocess.CompletedProcess[str]:
@@ -48,6 +51,7 @@ def test_it_is_due_after_the_loop_has_run_for_so_long():
     said = " ".join(desk.ran[0])
     assert "ctl --socket /run/lab.sock retune x --yes --json" in said
     assert "--bound-percent 7.0" in said
+    assert "--gain-um 0.0" in said
 
 
 @pytest.mark.parametrize("state", [one for one in State if one is not State.RUNNING])
@@ -62,9 +66,16 @@ def test_never_while_it_does_not_run_and_a_trip_begins_the_waiting_anew(state: S
 
 
 def test_the_journal_has_what_was_done_and_what_was_refused(caplog: pytest.LogCaptureFixture):
+    refusal = "reference of axis x: a sine; a hold is needed"
     with caplog.at_level(logging.INFO):
         Desk().looks(0.0, 60.0)
-        Desk(1, "rtloop: reference of axis x: a sine; a hold is needed\n").looks(0.0, 60.0)
-    done, refused = (record.getMessage() for record in caplog.records)
-    assert done == "axis x retuned: resonance 643.12 Hz, +8.00 % from the model's, at tick 523005"
-    assert refused == "axis x is not retuned: reference of axis x: a sine; a hold is needed"
+        Desk(answer=TUNED | GAIN).looks(0.0, 60.0)
+        Desk(1, answer=TUNED | {"better": False, "tick": None}).looks(0.0, 60.0)
+        Desk(1, f"rtloop: {refusal}\n", {"error": refusal, "exit_code": 1}).looks(0.0, 60.0)
+    resonance = "resonance 643.12 Hz, +8.00 % from the model's"
+    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
+        ("INFO", f"axis x retuned: {resonance}; at tick 523005"),
+        ("INFO", f"axis x retuned: {resonance}; gain 1.0204 ± 0.0014, +2.04 % from the model's; at tick 523005"),
+        ("INFO", f"axis x keeps its taps: {resonance}; new ones would be no better"),
+        ("WARNING", f"axis x is not retuned: {refusal}"),
+    ]

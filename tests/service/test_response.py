@@ -225,6 +225,18 @@ def test_it_is_shown(shown: Shown) -> None:
     assert shown.picture.startswith(b"\x89PNG")
 
 
+def test_the_gain_at_rest_is_measured_and_told(bench: Bench) -> None:
+    """The rig's is 1: its actuator is that of the inverse, and D(0) = 1."""
+    asked = {"axis": "x", "duration_s": 1.0, "resonance_only": True, "near_hz": 800.0, "gain_um": 4.0}
+    gain = bench.client.post("/response", asked, 60.0)["gain"]
+    assert (gain["from_um"], gain["to_um"]) == (HELD_UM, HELD_UM - 4.0)
+    assert 0.0 < gain["std"] < 0.002
+    assert abs(gain["value"] - 1.0) < 4.0 * gain["std"]
+    assert bench.status()["measured"]["x"]["gain"] == gain
+    assert f'rtloop_gain{{axis="x"}} {gain["value"]!r}' in bench.client.get("/metrics")
+    assert reference_um(bench) == HELD_UM
+
+
 def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
     quick = ("--duration", "1", "--near-hz", "780", "--json")
     found = json.loads(command(bench, "ctl", "--socket", bench.client.path, "resonance", "x", *quick))
@@ -241,6 +253,7 @@ def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
         ({"from_hz": 300.0, "to_hz": 200.0}, 422, "rising frequencies"),
         ({"to_hz": 4999.0}, 422, "up to 4500 Hz"),
         ({"duration_s": 1000.0}, 422, "duration_s"),
+        ({"gain_um": -1.0}, 422, "gain_um"),
         ({"near_hz": None, "resonance_only": True}, 422, "near_hz: missing"),
     ],
 )

@@ -15,9 +15,11 @@ import pytest
 from scipy import signal
 
 from rtloop.commands.adapt.retune import Asked, retune
-from rtloop.errors import LoopFault
+from rtloop.design.robust.shape import Subject
+from rtloop.errors import LoopFault, NoDesign
 
 HZ, DAMPING, PERIOD_S = 600.0, 0.02, 1e-4
+LOW_GAIN = 0.95, 0.001
 OMEGA = 2 * np.pi * HZ
 TEXT = f"""
 [loop]
@@ -57,34 +59,52 @@ points_per_tick = 2
 
 
 class Service:
-    """Runs TEXT, and measured `hz`."""
+    """Runs TEXT with `taps`, and measured `hz` and, where it is given, `gain` with its standard deviation."""
 
-    def __init__(self, folder: Path, hz: float | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        hz: float | None,
+        gain: tuple[float, float] | None = None,
+        taps: dict[str, list[float]] | None = None,
+    ) -> None:
         (folder / "spec.toml").write_text(SPECIFICATION)
-        self._folder, self._hz, self.tuned = folder, hz, dict[str, Any]()
+        self._folder, self._hz, self._gain, self._taps = folder, hz, gain, taps
+        self.tuned, self.gain_um = dict[str, Any](), 0.0
 
     def get(self, resource: str) -> Any:
         assert resource == "/configuration"
-        return {"folder": str(self._folder), "values": tomllib.loads(TEXT)}
+        values = tomllib.loads(TEXT)
+        if self._taps is not None:
+            values["axis"][0]["prefilter"] = self._taps
+        return {"folder": str(self._folder), "values": values}
 
     def post(self, resource: str, body: dict[str, Any], _: float) -> Any:
         if resource == "/response":
             assert body["resonance_only"]
-            return {"resonance": None if self._hz is None else {"hz": self._hz, "hz_std": 0.1}}
+            self.gain_um = body["gain_um"]
+            mode = None if self._hz is None else {"hz": self._hz, "hz_std": 0.1}
+            if self._gain is None:
+                return {"resonance": mode, "gain": None}
+            value, std = self._gain
+            gain = {"value": value, "std": std, "from_um": 0.0, "to_um": self.gain_um}
+            return {"resonance": mode, "gain": gain}
         assert (resource, body["axis"], body["section"]) == ("/tune", "x", "prefilter")
         self.tuned = body["values"]
         return {"tick": 1234}
 
 
 def asked(**changes: Any) -> Asked:
-    plain: dict[str, Any] = {"axis": "x", "amplitude_um": 0.5, "bound_percent": 15.0, "within_percent": 0.0}
+    plain: dict[str, Any] = {
+        "axis": "x", "amplitude_um": 0.5, "gain_um": None, "bound_percent": 15.0, "within_percent": 0.0
+    }  # fmt: skip
     return Asked(**plain | {"yes": True, "spec": None} | changes)
 
 
-def overshoot(hz: float, taps: dict[str, list[float]]) -> float:
-    """Of a step of the loop with another resonance, by scipy, a tick at a time."""
+def overshoot(hz: float, taps: dict[str, list[float]], gain: float = 1.0) -> float:
+    """Of a step of the loop with another resonance and gain, by scipy, a tick at a time."""
     omega = 2 * np.pi * hz
-    plant = signal.tf2ss([omega**2], [1.0, 2 * DAMPING * omega, omega**2])
+    plant = signal.tf2ss([gain * omega**2], [1.0, 2 * DAMPING * omega, omega**2])
     a, b, c, _, _ = signal.cont2discrete(plant, PERIOD_S, "zoh")
     step = np.ones(400)
     wanted, added = (signal.lfilter(taps[name], 1.0, step) for name in ("taps", "command_taps"))
@@ -105,6 +125,55 @@ def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsy
     assert "swapped at tick 1234" in said
     assert overshoot(1.06 * HZ, service.tuned) < 0.011
     assert overshoot(HZ, service.tuned) > 0.02
+
+
+@pytest.fixture(scope="module")
+def sent(tmp_path_factory: pytest.TempPathFactory) -> Service:
+    """A service with a gain 5 % below its model's, after a retuning."""
+    service = Service(tmp_path_factory.mktemp("gain"), HZ, LOW_GAIN)
+    assert retune(service, asked(), as_json=True) == 0  # type: ignore[arg-type]
+    return service
+
+
+def test_the_taps_that_are_sent_fit_the_measured_gain(sent: Service):
+    assert sent.gain_um == pytest.approx(2.5, rel=0.01)  # a quarter of the specification's largest step
+    assert overshoot(HZ, sent.tuned, LOW_GAIN[0]) < 0.011
+    assert overshoot(HZ, sent.tuned) > 0.02
+
+
+def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
+    sent: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    service = Service(tmp_path, HZ, LOW_GAIN, sent.tuned)
+    assert retune(service, asked(), as_json=False) == 1  # type: ignore[arg-type]
+    text = capsys.readouterr().out
+    assert "gain 0.9500 ± 0.0010 between 0 and 2.5" in text
+    assert "-5.00 % from the model's" in text
+    assert "the new taps are no better than those in force, which stay" in text
+    assert not service.tuned
+
+
+@pytest.mark.parametrize(("std", "gain"), [(0.009, 0.95), (0.02, 1.0)])
+def test_a_gain_that_is_too_uncertain_is_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, std: float, gain: float
+):
+    made_for = list[float]()
+
+    def no_taps(subject: Subject, **_: Any) -> None:
+        made_for.append(subject.plant.dc_gain)
+        raise NoDesign("none")
+
+    monkeypatch.setattr("rtloop.commands.adapt.retune.shaped", no_taps)
+    with pytest.raises(NoDesign):
+        retune(Service(tmp_path, HZ, (0.95, std)), asked(), as_json=False)  # type: ignore[arg-type]
+    assert made_for == [pytest.approx(gain)]
+
+
+def test_a_gain_too_far_from_the_model_s_changes_nothing(tmp_path: Path):
+    service = Service(tmp_path, HZ, (0.8, 0.001))
+    with pytest.raises(LoopFault, match=r"gain is 0.8000, -20.00 % .*within ±15 % is allowed"):
+        retune(service, asked(), as_json=False)  # type: ignore[arg-type]
+    assert not service.tuned
 
 
 def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

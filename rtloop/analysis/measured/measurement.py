@@ -11,6 +11,7 @@ import numpy as np
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import margins
+from rtloop.analysis.measured.gain import StaticGain
 from rtloop.analysis.measured.loop import MeasuredLoop, measured_loop
 from rtloop.analysis.measured.margins import MeasuredMargins, measured_margins
 from rtloop.analysis.measured.mode import BAND, LEAST_LINES, LightMode, light_mode
@@ -29,13 +30,16 @@ IN_STEP = "sim"
 
 @dataclass(frozen=True)
 class Measurement:
-    """A response with its margins, the light mode where one stands out, and the loop that the model promises."""
+    """A response with its margins, the light mode where one stands out, the loop that the model promises, and the gain
+    at rest where it was measured.
+    """
 
     response: Response
     loop: MeasuredLoop
     margins: MeasuredMargins
     mode: LightMode | None
     model: Loop | None
+    gain: StaticGain | None = None
 
     def figures(self) -> dict[str, Any]:
         """What status and metrics tell: no curves."""
@@ -49,6 +53,7 @@ class Measurement:
                 "moved_um": found.moved_um,
                 "margins": self.margins,
                 "resonance": self.mode,
+                "gain": self.gain,
                 "model": self._model_figures(),
             }
         )

@@ -1,4 +1,4 @@
-"""`rtloop ctl retune`: the resonance measured in a running loop, taps made anew for it, and swapped in at a tick."""
+"""`rtloop ctl retune`: resonance and gain measured in a running loop, taps made anew for them, swapped in at a tick."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
-from rtloop.analysis.perturbation import resonance_hz, with_resonance_shifted
+from rtloop.analysis.perturbation import resonance_hz, with_gain_changed, with_resonance_shifted
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import parse
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.section import taps_values
-from rtloop.design.robust.shape import Judged, judged_of, shaped
+from rtloop.design.robust.shape import EXCESS, PROOF_POINTS, Judged, Subject, judged_of, shaped
 from rtloop.design.robust.subject import subject_in
 from rtloop.design.toml_text import section
 from rtloop.errors import ConfigError, LoopFault
@@ -24,21 +24,38 @@ from rtloop.terminal.table import console, table
 
 STAGES = 4
 """In which new taps take over from old ones, so that a scan that goes on meanwhile feels none of them."""
+GAIN_PART = 4.0
+"""The gain is measured over this part of the largest step: over less, what is left of hysteresis counts for more."""
+GAIN_CERTAIN_PERCENT = 1.0
+"""A gain that is less certain than this is not taken into the model: it would cost half as much overshoot."""
 MEASURED_S, MEASUREMENT_S = 1.0, 120.0
 """How long the loop is excited at most amplitude, and how long an answer may take."""
 
 
 class Asked(NamedTuple):
-    """What a retuning may do: move the position, how far the resonance may be from the model's, for how much around it
-    the taps are made, and whether it may swap them in without asking.
+    """What a retuning may do: move the position, and hold references so far from the one held (None: a quarter of the
+    largest step); how far resonance and gain may be from the model's; for how much around the resonance the taps are
+    made; whether it may swap them in without asking.
     """
 
     axis: str
     amplitude_um: float
+    gain_um: float | None
     bound_percent: float
     within_percent: float
     yes: bool
     spec: Path | None
+
+
+class Stage(NamedTuple):
+    """The stage as it was measured: `percent` is its resonance's distance from the model's. `gain` is None where it was
+    not measured; its distance `gain_percent` is None where the model's gain is taken instead.
+    """
+
+    mode: dict[str, Any]
+    percent: float
+    gain: dict[str, Any] | None
+    gain_percent: float | None
 
 
 def retune(client: Client, asked: Asked, as_json: bool) -> int:
@@ -47,37 +64,73 @@ def retune(client: Client, asked: Asked, as_json: bool) -> int:
     text, folder = section("", running["values"]), Path(running["folder"])
     configuration = parse(text, "running", folder, "the running configuration")
     axis, subject, _ = subject_in(configuration, asked.axis, asked.spec)
-    model_hz = resonance_hz(subject.plant)
-    if model_hz is None:
-        raise ConfigError("retune", [f"axis.{asked.axis}.model: no light mode; there is no resonance to measure"])
-    body = {"axis": asked.axis, "amplitude_um": asked.amplitude_um, "duration_s": MEASURED_S, "resonance_only": True}
-    mode = client.post("/response", body, MEASUREMENT_S)["resonance"]
-    if mode is None:
-        raise LoopFault("retune: no light mode stands out about the model's; the taps stay as they are")
-    percent = 100 * (mode["hz"] / model_hz[0] - 1)
-    if abs(percent) > asked.bound_percent:
-        raise LoopFault(
-            f"retune: the resonance is at {mode['hz']:.2f} Hz, {percent:+.2f} % from the model's; within "
-            f"±{asked.bound_percent:g} % is allowed, and the taps stay as they are"
-        )
-    there = replace(subject.around(asked.within_percent), plant=with_resonance_shifted(subject.plant, percent))
-    found = shaped(there)
+    stage = _measured(client, asked, subject)
+    shifted = with_gain_changed(with_resonance_shifted(subject.plant, stage.percent), stage.gain_percent or 0.0)
+    there = replace(subject.around(asked.within_percent), plant=shifted)
+    found, in_force = shaped(there, may_be_late=True), _taps_of(axis)
     nominal = there.family().nominal
-    before, after = judged_of(there, _taps_of(axis), nominal), judged_of(there, found.taps, nominal)
-    swapped = asked.yes
+    before, after = judged_of(there, in_force, nominal), judged_of(there, found.taps, nominal)
+    better, swapped = _is_better(there, before, after), False
     if not as_json:
-        _show(mode, percent, before, after)
-        swapped = asked.yes or click.confirm("swap the taps in?", err=True)
+        _show(stage, before, after, _with_gain_off(stage, there, found.taps))
+    if better:
+        swapped = asked.yes or (not as_json and click.confirm("swap the taps in?", err=True))
     tick = None
     if swapped:
         for part in np.arange(1, STAGES + 1) / STAGES:
-            tick = _swapped(client, asked.axis, _between(_taps_of(axis), found.taps, part))
+            tick = _swapped(client, asked.axis, _between(in_force, found.taps, part))
     if as_json:
-        said = {"resonance": mode, "percent_from_model": percent, "before": before._asdict(), "after": after._asdict()}
-        echo_json({**said, "settling_ms": found.settling_ms, "tick": tick})
+        measured = {"resonance": stage.mode, "percent_from_model": stage.percent, "gain": stage.gain,
+                    "gain_percent_from_model": stage.gain_percent}  # fmt: skip
+        steps = {"before": before._asdict(), "after": after._asdict(), "better": better}
+        echo_json({**measured, **steps, "settling_ms": found.settling_ms, "tick": tick})
     elif tick is not None:
         click.echo(f"swapped at tick {tick}")
+    elif not better:
+        click.echo("the new taps are no better than those in force, which stay")
     return 0 if swapped else LoopFault.exit_code
+
+
+def _measured(client: Client, asked: Asked, subject: Subject) -> Stage:
+    """Measure resonance and gain. Raises LoopFault for what is missing or too far from the model's."""
+    model_hz = resonance_hz(subject.plant)
+    if model_hz is None:
+        raise ConfigError("retune", [f"axis.{asked.axis}.model: no light mode; there is no resonance to measure"])
+    gain_um = subject.bounds.step_um / GAIN_PART if asked.gain_um is None else asked.gain_um
+    body = {"axis": asked.axis, "amplitude_um": asked.amplitude_um, "duration_s": MEASURED_S, "resonance_only": True,
+            "gain_um": gain_um}  # fmt: skip
+    content = client.post("/response", body, MEASUREMENT_S)
+    mode, gain = content["resonance"], content["gain"]
+    if mode is None:
+        raise LoopFault("retune: no light mode stands out about the model's; the taps stay as they are")
+    percent, model_gain = 100 * (mode["hz"] / model_hz[0] - 1), subject.plant.dc_gain
+    _require_near(f"resonance is at {mode['hz']:.2f} Hz", percent, asked.bound_percent)
+    if gain is None or 100 * gain["std"] > GAIN_CERTAIN_PERCENT * gain["value"]:
+        return Stage(mode, percent, gain, None)
+    gain_percent = 100 * (gain["value"] / model_gain - 1)
+    _require_near(f"gain is {gain['value']:.4f}", gain_percent, asked.bound_percent)
+    return Stage(mode, percent, gain, gain_percent)
+
+
+def _require_near(measured: str, percent: float, bound_percent: float) -> None:
+    """Raise LoopFault for what was measured further than `bound_percent` from the model's."""
+    if abs(percent) > bound_percent:
+        raise LoopFault(
+            f"retune: the {measured}, {percent:+.2f} % from the model's; within ±{bound_percent:g} % is allowed, and "
+            "the taps stay as they are"
+        )
+
+
+def _is_better(subject: Subject, before: Judged, after: Judged) -> bool:
+    """Whether new taps settle sooner, by more than a point between ticks, or mend what the ones in force do not keep:
+    the specification's overshoot, and the limits of v.
+    """
+    point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS
+    return (
+        round((before.settling_ms - after.settling_ms) / point_ms) > 1
+        or before.overshoot > max(subject.overshoot, after.overshoot)
+        or before.excess > max(EXCESS, after.excess)
+    )
 
 
 def _swapped(client: Client, axis: str, taps: Taps) -> int:
@@ -104,9 +157,30 @@ def _taps_of(axis: AxisOptions) -> Taps:
     return Taps(reference, command, 0.0)
 
 
-def _show(mode: dict[str, Any], percent: float, before: Judged, after: Judged) -> None:
-    click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {percent:+.2f} % from the model's")
+def _with_gain_off(stage: Stage, subject: Subject, taps: Taps) -> Judged | None:
+    """Judge the new taps with the gain off by its standard deviation, to the worse side in each figure; None where the
+    gain is the model's.
+    """
+    if stage.gain is None or stage.gain_percent is None:
+        return None
+    off, nominal = 100 * stage.gain["std"] / stage.gain["value"], subject.family().nominal
+    ends = [judged_of(subject, taps, nominal._replace(gain=percent)) for percent in (-off, off)]
+    return Judged(*(max(values) for values in zip(*ends, strict=True)))
+
+
+def _show(stage: Stage, before: Judged, after: Judged, with_gain_off: Judged | None) -> None:
+    """Print what was measured, and a step with either taps."""
+    mode, gain, percent = stage.mode, stage.gain, stage.gain_percent
+    click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {stage.percent:+.2f} % from the model's")
+    if gain is None:
+        click.echo("gain not measured; the model's is taken")
+    else:
+        used = "too uncertain; the model's is taken" if percent is None else f"{percent:+.2f} % from the model's"
+        span = f"between {gain['from_um']:.4g} and {gain['to_um']:.4g} µm"
+        click.echo(f"gain {gain['value']:.4f} ± {gain['std']:.4f} {span}, {used}")
     shown = table("of a step there", "settling / ms", "overshoot / %", "largest v per unit")
-    for name, one in (("with the taps in force", before), ("with the new ones", after)):
-        shown.add_row(name, f"{one.settling_ms:.3f}", f"{100 * one.overshoot:.3f}", f"{one.highest_command:.4f}")
+    rows = {"with the taps in force": before, "with the new ones": after, "the same, gain off by its ±": with_gain_off}
+    for name, one in rows.items():
+        if one is not None:
+            shown.add_row(name, f"{one.settling_ms:.3f}", f"{100 * one.overshoot:.3f}", f"{one.highest_command:.4f}")
     console().print(shown)

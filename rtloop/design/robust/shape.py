@@ -79,8 +79,17 @@ class Shaped(NamedTuple):
     curve: tuple[tuple[float, float], ...]
 
 
-def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], None] = lambda _: None) -> Shaped:
-    """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none."""
+def shaped(
+    subject: Subject,
+    *,
+    curve: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+    may_be_late: bool = False,
+) -> Shaped:
+    """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none.
+
+    `may_be_late`: where `settling_ms` cannot be reached, the taps are the fastest ones.
+    """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.swept(PLACES)]))
     fastest, rounds, aim = 0.0, 0, subject.overshoot
@@ -94,6 +103,8 @@ def shaped(subject: Subject, *, curve: bool = False, progress: Callable[[str], N
             f"{len(scenarios)} scenarios: fastest {fastest * tick_ms:.4g} ms, overshoot {100 * subject.overshoot:g} %"
         )
         settling = fastest if options.settling_ms is None else options.settling_ms / tick_ms
+        if may_be_late:
+            settling = max(settling, fastest)
         if settling < fastest - 1e-9:
             raise NoDesign(
                 f"shape.settling_ms: {options.settling_ms:g} ms cannot be reached in all scenarios with overshoot ≤ "

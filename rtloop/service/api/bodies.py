@@ -104,7 +104,9 @@ class WaveformBody(Body):
 
 
 class ResponseBody(Body):
-    """What `Asked` says: the added motion at most, in µm, the band, how long, where a light mode is expected."""
+    """What `Asked` says: the added motion at most, in µm, the band, how long, where a light mode is expected, and
+    whether the gain at rest is measured.
+    """
 
     axis: Name
     amplitude_um: float = Field(default=Asked.amplitude_um, gt=0)
@@ -114,6 +116,7 @@ class ResponseBody(Body):
     period_s: float | None = Field(default=None, ge=0.05, le=10)
     near_hz: float | None = Field(default=None, gt=0)
     resonance_only: bool = False
+    gain_um: float = Field(default=Asked.gain_um, ge=0)
 
 
 class LearnBody(Body):

@@ -77,7 +77,7 @@ def metrics_text(service: Service) -> str:
 
 
 def _measured(service: Service, registry: CollectorRegistry) -> None:
-    """Margins and resonance as they were last measured, with standard deviations."""
+    """Margins, resonance and gain as they were last measured, with standard deviations."""
     if not service.measured:
         return
     at = Gauge("rtloop_measured_unixtime_seconds", "When the loop was last measured", ["axis"], registry=registry)
@@ -85,6 +85,8 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
     margin_std = Gauge("rtloop_margin_std", "Its standard deviation", ["axis", "margin"], registry=registry)
     mode = Gauge("rtloop_resonance", "Light mode as last measured: hz, damping", ["axis", "of"], registry=registry)
     mode_std = Gauge("rtloop_resonance_std", "Its standard deviation", ["axis", "of"], registry=registry)
+    gain = Gauge("rtloop_gain", "Position per command at rest as last measured", ["axis"], registry=registry)
+    gain_std = Gauge("rtloop_gain_std", "Its standard deviation", ["axis"], registry=registry)
     for axis, results in service.measured.items():
         newest = results.newest
         at.labels(axis).set(newest["unix_time_s"])
@@ -95,6 +97,9 @@ def _measured(service: Service, registry: CollectorRegistry) -> None:
         for name in ("hz", "damping") if newest["resonance"] else ():
             mode.labels(axis, name).set(newest["resonance"][name])
             mode_std.labels(axis, name).set(newest["resonance"][f"{name}_std"])
+        if newest["gain"]:
+            gain.labels(axis).set(newest["gain"]["value"])
+            gain_std.labels(axis).set(newest["gain"]["std"])
 
 
 class _Summed(Collector):

@@ -1,6 +1,6 @@
 """Taps made anew on a schedule, by consent of the configuration: `rtloop ctl retune`, as somebody at the desk would.
 
-The command measures the resonance through the control API, works beside the loop in a process of its own, and is
+The command measures resonance and gain through the control API, works beside the loop in a process of its own, and is
 refused by the service where the loop does not run in closed loop about a reference that it holds.
 """
 
@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from rtloop.configuration.axis import AdaptOptions
 from rtloop.service.service import Service, State
@@ -80,16 +81,28 @@ class Schedule:
     def _retune(self, axis: str, options: AdaptOptions) -> None:
         ctl = [sys.executable, "-m", "rtloop", "ctl", "--socket", str(self._socket)]
         command = [*ctl, "retune", axis, "--yes", "--json"]
-        for name in ("amplitude_um", "bound_percent", "within_percent"):
+        for name in ("amplitude_um", "gain_um", "bound_percent", "within_percent"):
             command += [f"--{name.replace('_', '-')}", repr(getattr(options, name))]
         try:
             ran = self._run(command)
         except (OSError, subprocess.TimeoutExpired) as error:
             log.warning("axis %s is not retuned: %s", axis, error)
             return
-        if ran.returncode:
+        answer = json.loads(ran.stdout or "{}")
+        if "better" in answer:
+            log.info("axis %s %s", axis, _outcome(answer))
+        else:
             log.warning("axis %s is not retuned: %s", axis, ran.stderr.strip().removeprefix("rtloop: "))
-            return
-        said = json.loads(ran.stdout)
-        found = said["resonance"]["hz"], said["percent_from_model"], said["tick"]
-        log.info("axis %s retuned: resonance %.2f Hz, %+.2f %% from the model's, at tick %d", axis, *found)
+
+
+def _outcome(answer: dict[str, Any]) -> str:
+    """Say in words what a retuning measured and did; `answer` is that of `ctl retune --json`."""
+    hz, percent, gain = answer["resonance"]["hz"], answer["percent_from_model"], answer["gain"]
+    measured = f"resonance {hz:.2f} Hz, {percent:+.2f} % from the model's"
+    if gain is not None:
+        off = answer["gain_percent_from_model"]
+        used = "too uncertain" if off is None else f"{off:+.2f} % from the model's"
+        measured += f"; gain {gain['value']:.4f} ± {gain['std']:.4f}, {used}"
+    if answer["tick"] is None:
+        return f"keeps its taps: {measured}; new ones would be no better"
+    return f"retuned: {measured}; at tick {answer['tick']}"

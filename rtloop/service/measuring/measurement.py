@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,10 +23,11 @@ from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
 from rtloop.analysis.measured.response import Signals
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.checks import delay_ticks, promised_loop
-from rtloop.errors import ConfigError, RtloopError
+from rtloop.errors import ConfigError
 from rtloop.hil.modal import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
+from rtloop.service.measuring.gain import measure_gain
 from rtloop.service.measuring.playing import REST_S, Player
 from rtloop.supervision.supervisor import Supervisor
 
@@ -82,6 +83,9 @@ class Asked:
     near_hz: float | None = None
     resonance_only: bool = False
     """Excite nothing but the band about the light mode."""
+    gain_um: float = 0.0
+    """Hold references so far from the one that is held, towards the middle of the range, and measure the gain at rest;
+    0: do not."""
 
 
 def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Measurement:
@@ -106,11 +110,15 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
         asked = replace(asked, from_hz=(1 - EXCITED) * near_hz, to_hz=(1 + EXCITED) * near_hz)
     lines = _grid(asked, rate_hz, near_hz, half_width_hz)
     periods = max(2, round(asked.duration_s * rate_hz / lines.samples) - 1)
-    run = _Run(Player(supervisor, live, number, "response"), live.prepared.plan.driver_kind)
+    player = Player(supervisor, live, number, "response")
+    run = _Run(player, live.prepared.plan.driver_kind)
     with run.about_the_reference(asked.amplitude_um):
         found = run.approach(lines, asked.amplitude_um, periods)
     try:
-        return measurement(found, rate_hz, near_hz, model, options.prefilter.command_taps)
+        answer = measurement(found, rate_hz, near_hz, model, options.prefilter.command_taps)
+        if not asked.gain_um:
+            return answer
+        return replace(answer, gain=measure_gain(player, options.limits, asked.gain_um))
     except ValueError as error:
         raise Refused(f"response: {error}") from None
 
@@ -144,12 +152,8 @@ class _Run:
         rest = player.column(player.read(player.tick, round(REST_S * player.rate_hz)), signals.POSITION)
         slack_um = REST_MARGIN * np.abs(rest - rest.mean()).max()
         self._lowest_um, self._highest_um = rest.mean() + np.array([-1, 1]) * (amplitude_um + slack_um)
-        try:
+        with player.coming_back():
             yield
-        finally:
-            if player.ours:
-                with suppress(RtloopError):
-                    player.hold(player.hold_um)
 
     def approach(self, lines: Grid, amplitude_um: float, periods: int) -> dict[str, Real]:
         """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
@@ -174,9 +178,7 @@ class _Run:
         """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
         player = self._player
         samples = played(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
-        rows = player.read(player.play(samples[:, np.newaxis]), samples.size, self._judge)
-        if not np.array_equal(player.column(rows, signals.REFERENCE), samples):
-            raise Refused("response: the reference was changed meanwhile")
+        rows = player.played(samples, self._judge)
         found = {name: player.column(rows, signal) for name, signal in NAMES.items()}
         return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != IN_STEP else {})
 

@@ -6,12 +6,14 @@ What is read is the ring that the recorder reads: it is in the recording as well
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
 from rtloop import signals
 from rtloop.engine.ring import drain
+from rtloop.errors import RtloopError
 from rtloop.hil.modal import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refused
@@ -58,6 +60,23 @@ class Player:
         self._set += 1
         time.sleep(REST_S)
 
+    @contextmanager
+    def coming_back(self) -> Iterator[None]:
+        """At the end hold what was held, unless somebody else has set a reference."""
+        try:
+            yield
+        finally:
+            if self.ours:
+                with suppress(RtloopError):
+                    self.hold(self.hold_um)
+
+    def played(self, samples: Real, judge: Callable[[Real], None] = lambda _: None) -> Real:
+        """Records of the ticks in which references (ticks,) were played. Raises as `play` and `read` do."""
+        rows = self.read(self.play(samples[:, np.newaxis]), samples.size, judge)
+        if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
+            raise Refused(f"{self._doing}: the reference was changed meanwhile")
+        return rows
+
     def column(self, rows: Real, signal: int) -> Real:
         """A signal (ticks,) of the axis, such as POSITION, in records that were read."""
         return rows[:, signals.axis_column(self._number, signal)]
@@ -94,5 +113,5 @@ class Player:
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
             raise Refused(f"{self._doing}: not in closed loop")
         if flags & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED):
-            less = "another setpoint, or a smaller amplitude, is needed"
+            less = "another setpoint, or less motion, is needed"
             raise Refused(f"{self._doing}: command or drive is clipped: {less}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -112,9 +113,7 @@ def bench(
     given = configuration.driver_options
     assert isinstance(given, RigOptions)
     if truth != NOMINAL:
-        there = TRUTH.plant(truth)
-        zeros, poles = ([(root.real, root.imag) for root in roots.tolist()] for roots in (there.zeros, there.poles))
-        plant["dynamics"] = DynamicsOptions(form="zpk", gain=there.gain, zeros=tuple(zeros), poles=tuple(poles))
+        plant["dynamics"] = _dynamics(truth)
     if noise_um is not None:
         plant["sensor"] = given.plant.sensor.model_copy(update={"noise_um": noise_um})
     rig = given.model_copy(update={"seed": seed, "plant": given.plant.model_copy(update=plant)})
@@ -160,14 +159,25 @@ def taps_for(
     return shaped(replace(about, plant=plant, overshoot=overshoot, options=options)).taps
 
 
-def written(configuration_name: str, truth_percent: float, folder: Path) -> Path:
-    """A file of one of deploy/'s loops on a rig whose resonance is elsewhere, for what runs files."""
+def written(configuration_name: str, truth_percent: float, folder: Path, gain_percent: float = 0.0) -> Path:
+    """A file of one of deploy/'s loops on a rig whose resonance and gain are elsewhere, for what runs files."""
     text = (DEPLOY / f"{configuration_name}.toml").read_text(encoding="utf-8")
     text = text.replace("# [driver.plant.dynamics]", "[driver.plant.dynamics]")
     text = text.replace("# resonance_shift = 0.0", "resonance_shift = 0.0")
     assert text.count("resonance_shift = 0.0") == 1
-    path = folder / f"{configuration_name}{truth_percent:+g}.toml"
-    path.write_text(text.replace("resonance_shift = 0.0", f"resonance_shift = {truth_percent / 100}"))
+    path = folder / f"{configuration_name}{truth_percent:+g}{gain_percent:+g}.toml"
+    lines = f"resonance_shift = {truth_percent / 100}"
+    if gain_percent:
+        values = _dynamics(NOMINAL._replace(gain=gain_percent)).model_dump(mode="json", exclude_unset=True)
+        lines += "".join(f"\n{name} = {json.dumps(value)}" for name, value in values.items())
+    path.write_text(text.replace("resonance_shift = 0.0", lines))
     for name in ("robust-spec.toml", "paper-spec.toml"):
         (folder / name).write_bytes((DEPLOY / name).read_bytes())
     return path
+
+
+def _dynamics(truth: Scenario) -> DynamicsOptions:
+    """The rig's dynamics with another truth."""
+    there = TRUTH.plant(truth)
+    zeros, poles = ([(root.real, root.imag) for root in roots.tolist()] for roots in (there.zeros, there.poles))
+    return DynamicsOptions(form="zpk", gain=there.gain, zeros=tuple(zeros), poles=tuple(poles))

@@ -1,0 +1,60 @@
+"""The gain of a plant at rest, measured in closed loop: position per command at references that are held in turn.
+
+    x̄_i, v̄_i   means of position and command while reference i is held         K̂ = Σ |x̄_i+1 − x̄_i| / Σ |v̄_i+1 − v̄_i|
+
+The references go out in equal steps and back in the same ones. A step after a turn is left out: there hysteresis
+answers with its narrow loops alone. The slopes of the others scatter by noise and by what an inverse leaves of the
+hysteresis: that gives the standard deviation of their mean.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.hil.modal import Real
+
+STEPS = 8
+"""To each side."""
+RAMP_S, HELD_S, JUDGED = 0.05, 0.2, 0.5
+"""From one reference to the next; how long it is held; the last part of that, over which means are taken."""
+
+
+class StaticGain(NamedTuple):
+    """µm of position per µm of command with its standard deviation, between two references in µm."""
+
+    value: float
+    std: float
+    from_um: float
+    to_um: float
+
+
+def staircase(from_um: float, to_um: float, rate_hz: float) -> Real:
+    """References (ticks,) from one value to another and back; the last sample is `from_um`."""
+    ramp, held = round(RAMP_S * rate_hz), round(HELD_S * rate_hz)
+    out = np.linspace(from_um, to_um, STEPS + 1)
+    levels = np.concatenate([out, out[-2::-1]])
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(ramp) / ramp)
+    before = np.concatenate([levels[:1], levels[:-1]])
+    ramps = before[:, None] + (levels - before)[:, None] * rising
+    return np.hstack([ramps, np.repeat(levels[:, None], held, axis=1)]).ravel()
+
+
+def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) -> StaticGain:
+    """Of a `staircase` that was played, and of position and command meanwhile, each (ticks,), in µm.
+
+    Raises ValueError where the command, or the position, does not follow the reference.
+    """
+    count = round(JUDGED * HELD_S * rate_hz)
+    x, v = (signal.reshape(2 * STEPS + 1, -1)[:, -count:].mean(axis=1) for signal in (position, command))
+    moved, asked = (np.delete(np.diff(means), [0, STEPS]) for means in (x, v))
+    slopes = moved / np.where(asked == 0, np.nan, asked)
+    from_um, to_um = float(reference[0]), float(reference.reshape(2 * STEPS + 1, -1)[STEPS, -1])
+    if not np.all(slopes > 0):
+        raise ValueError(
+            f"gain: position or command does not follow references of {from_um:g} … {to_um:g} µm; larger steps are "
+            "needed (gain_um)"
+        )
+    value = float(np.abs(moved).sum() / np.abs(asked).sum())
+    return StaticGain(value, float(slopes.std(ddof=1)) / float(np.sqrt(slopes.size)), from_um, to_um)

@@ -1,0 +1,48 @@
+"""The gain at rest from a staircase: of a plant with a known gain, with noise, and with hysteresis that is left."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rtloop.analysis.measured.gain import STEPS, staircase, static_gain
+from rtloop.hysteresis.plays import play_outputs
+
+RATE_HZ = 10_000.0
+
+
+def test_a_staircase_goes_out_and_back_in_equal_steps_without_a_jump():
+    reference = staircase(3.0, -5.0, RATE_HZ)
+    levels = np.unique(np.round(reference.reshape(2 * STEPS + 1, -1)[:, -1], 9))
+    np.testing.assert_allclose(levels, np.linspace(-5.0, 3.0, STEPS + 1))
+    assert (reference[0], reference[-1], reference.min()) == (3.0, 3.0, -5.0)
+    assert np.abs(np.diff(reference)).max() < 0.01
+
+
+@pytest.mark.parametrize(("noise_um", "misses"), [(0.01, 0.001), (0.1, 0.01)])
+def test_its_standard_deviation_covers_the_error_that_noise_makes(noise_um: float, misses: float):
+    random, reference = np.random.default_rng(1), staircase(0.0, 10.0, RATE_HZ)
+    found = []
+    for _ in range(20):
+        position = reference + noise_um * random.standard_normal(reference.size)
+        found.append(static_gain(reference, position, reference / 0.95 + 2.0, RATE_HZ))
+    errors = np.array([(one.value - 0.95) / one.std for one in found])
+    assert np.abs(errors).max() < 3.0
+    assert max(one.std for one in found) < misses
+    assert (found[0].from_um, found[0].to_um) == (0.0, 10.0)
+
+
+def test_hysteresis_that_is_left_is_in_the_standard_deviation_and_its_turns_are_left_out():
+    """x = 0.97 v + 0.03 F_0.5[v]: of slope 1, and 0.97 for 1 µm after a turn."""
+    command = staircase(0.0, 10.0, RATE_HZ)
+    position = 0.97 * command + 0.03 * play_outputs(command, [0.5])[:, 0]
+    found = static_gain(command, position, command, RATE_HZ)
+    assert found.value == pytest.approx(1.0, abs=0.001)
+    assert 0.0 < found.std < 0.001
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0])
+def test_a_position_that_does_not_follow_is_refused(factor: float):
+    reference = staircase(0.0, 10.0, RATE_HZ)
+    with pytest.raises(ValueError, match="does not follow references of 0 … 10 µm"):
+        static_gain(reference, factor * reference, reference, RATE_HZ)
