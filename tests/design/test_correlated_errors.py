@@ -13,10 +13,9 @@ from rtloop.design.identification.dynamics.prediction_error import Excitation, d
 PERIOD_S, TICKS, LONG, NOISE_UM = 1e-4, 4000, 3000, 0.02
 RESONANCE = 2 * np.pi * 800.0 * (-0.02 + 1j * np.sqrt(1 - 0.02**2))
 NONE = np.zeros(1, dtype=complex)
-IMAGE = np.exp(RESONANCE * PERIOD_S)
-RESIDUE = np.array([-0.5j * (1 - abs(IMAGE) ** 2 + 1)])
+RESIDUE = np.array([-1j], dtype=complex)
 SCALE = Innovations(PERIOD_S, np.array([RESONANCE]), RESIDUE, NONE).static_gain
-TRUTH = Innovations(PERIOD_S, np.array([RESONANCE]), RESIDUE / SCALE, NONE)
+TRUTH = Innovations(PERIOD_S, np.array([RESONANCE]), np.array([RESIDUE[0] / SCALE]), NONE)
 
 
 @pytest.mark.parametrize("pole", [0.0, -0.9])
