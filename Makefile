@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export PYTHONDONTWRITEBYTECODE :=
 READY := $(VENV)/.ready
 
-.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants planted strace soak-syscalls
+.PHONY: run demo test viewers browser soak-panel-triggers panel-load bench faults faults-pairs faults-mutants soak-live-changes soak-laws soak-daemon soak-flood soak-connections soak-swaps soak-recordings soak-forged soak-chain soak-delay soak-robust soak-aborts soak-response soak-closed-loop soak-retune soak-backends soak-day check install uninstall test-systemd rig clean soak-identification soak-parts soak-truths soak-afm soak-verify flagship soak-conformance mutants planted strace soak-syscalls
 
 # The paper's closed loop for ten seconds, installed first where it is not.
 run: $(READY)
@@ -139,6 +139,11 @@ soak-afm: $(READY)
 # Recordings, identification, synthesis and a run on forty rigs drawn at random: about ten minutes.
 soak-chain: $(READY)
 	$(BIN)/python -m tests.soak.chain
+
+# Ten rigs behind a lag and a delay, promise beside run, and how often ± covers the truth in twice DRAWS (50)
+# identifications: about a quarter of an hour of one core.
+soak-delay: $(READY)
+	$(BIN)/python -m tests.soak.delay --draws $(or $(DRAWS),50)
 
 # The same by `design auto --robust`, promise beside run, on DRAWS rigs (20): a minute or two of one core each.
 soak-robust: $(READY)

@@ -97,7 +97,8 @@ def print_dynamics(report: dict[str, Any]) -> None:
     out.print(shown)
     tests = report["tests"]
     out.print(
-        f"static gain {report['static_gain']:.6g}, which belongs to the hysteresis (D(0) = 1); "
+        f"static gain {report['static_gain']:.6g} ± {report['static_gain_std']:.2g} (1σ), which belongs to the "
+        f"hysteresis (D(0) = 1); "
         f"delay {report['delay_ticks']} samples; fit {report['fit_percent']:.2f} %"
     )
     out.print(
@@ -106,6 +107,13 @@ def print_dynamics(report: dict[str, Any]) -> None:
         f"{'independent of' if tests['independent'] else 'correlated with'} the input "
         f"({tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % bound)"
     )
+    if not tests["white"]:
+        out.print("± is that of noise with the correlation of these residuals; a wrong input is not in it")
+    if report["level_correction"]:
+        out.print(
+            f"levels of the input corrected by up to {report['level_correction']:.3g}: the settled position measures "
+            "what the model of the hysteresis misses there"
+        )
     _print_response(out, report["frequency_response"])
     _print_files(out, report)
 

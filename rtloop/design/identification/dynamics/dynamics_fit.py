@@ -50,6 +50,7 @@ class DynamicsFit:
 
     transfer: Transfer
     static_gain: float
+    static_gain_std: float
     modes: tuple[Mode, ...]
     rms_error_um: float
     fit_percent: float
@@ -59,6 +60,8 @@ class DynamicsFit:
     delay_ticks: int
     """Samples between input and position beyond the one that a held output takes; `model` comes behind them."""
     method: str
+    level_correction: float = 0.0
+    """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""
 
 
 def transfer_of(model: Innovations) -> Transfer:
@@ -91,6 +94,18 @@ def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode
         found.append(Mode(size / (2 * np.pi), size_std / (2 * np.pi), damping, damping_std, float(share)))
         i += (3 if noise else 2) * width
     return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
+
+
+def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
+    """Standard deviation of `model.static_gain`, from the covariance of `model.pack(noise=noise)`."""
+    slopes: list[float] = []
+    for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
+        by_rate, by_residue = residue * model.period_s * image / (1 - image) ** 2, 1 / (1 - image)
+        for slope in (by_rate, by_residue, *([0.0] if noise else [])):
+            slopes += [2 * slope.real, -2 * slope.imag] if rate.imag != 0 else [slope.real]
+    gradient = np.array(slopes)
+    part = covariance[: gradient.size, : gradient.size]
+    return float(np.sqrt(max(gradient @ part @ gradient, 0.0)))
 
 
 def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:

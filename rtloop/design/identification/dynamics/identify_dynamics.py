@@ -16,9 +16,17 @@ from typing import Literal
 
 import numpy as np
 
-from rtloop.design.identification.dynamics.dynamics_fit import Candidate, DynamicsFit, modes_of, transfer_of
+from rtloop.design.identification.dynamics.dynamics_fit import (
+    Candidate,
+    DynamicsFit,
+    modes_of,
+    static_gain_std,
+    transfer_of,
+)
+from rtloop.design.identification.dynamics.estimate_covariance import estimate_covariance
 from rtloop.design.identification.dynamics.identify_delay import delayed, first_part, held_out_from, identified_delay
 from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.measured_levels import with_measured_levels
 from rtloop.design.identification.dynamics.prediction_error import (
     LARGEST_ORDER,
     WORTH,
@@ -30,7 +38,6 @@ from rtloop.design.identification.dynamics.prediction_error import (
 )
 from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.design.identification.measured import UnsuitableData
-from rtloop.hil.modal import Real
 
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
@@ -63,7 +70,7 @@ def identify_dynamics(
             f"{run.name}: too little excitation: the input can tell {excited} poles apart, {wanted} are asked for; "
             "a step or a chirp over all frequencies of interest would help"
         )
-    centred = replace(run, position_um=run.position_um - run.position_um[0])
+    centred, corrected = with_measured_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited) + 1)
     if delay_ticks is None:
         delay_ticks = identified_delay(centred, orders)
@@ -80,7 +87,7 @@ def identify_dynamics(
     model = fitted[_chosen(candidates, score, by_aic=criterion != "validation" and start is None)]
     if start is not None and (better := refined(model, centred)) and _has_settled(better, centred):
         model = better
-    return _described(model, centred, tuple(candidates), delay_ticks)
+    return _described(model, centred, tuple(candidates), delay_ticks, corrected)
 
 
 def _settled_within(fitted: Sequence[Innovations], run: Excitation) -> list[Innovations]:
@@ -128,28 +135,25 @@ def _chosen(candidates: Sequence[Candidate], score: Callable[[Candidate], float]
     return int(np.argmin([score(candidate) for candidate in candidates]))
 
 
-def _described(model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int) -> DynamicsFit:
+def _described(
+    model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
+) -> DynamicsFit:
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
     left = run.position_um - model.output(run.input)
+    tests = residual_tests(run.input, errors, model.pack(noise=True).size)
+    covariance = estimate_covariance(model, run, errors, white=tests.white)
     return DynamicsFit(
         transfer_of(model),
         model.static_gain,
-        modes_of(model, _covariance(model, run, errors), noise=True),
+        static_gain_std(model, covariance, noise=True),
+        modes_of(model, covariance, noise=True),
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(left) / np.std(run.position_um))),
-        residual_tests(run.input, errors, model.pack(noise=True).size),
+        tests,
         candidates,
         model,
         delay_ticks,
         METHOD,
+        corrected,
     )
-
-
-def _covariance(model: Innovations, run: Excitation, errors: Real) -> Real:
-    """Of `model.pack(noise=True)`: σ²(ΨΨᵀ)⁻¹ (Ljung 1999, section 9.4)."""
-    rows = model.sensitivities(run.input, errors, noise=True)
-    scale = np.linalg.norm(rows, axis=1)
-    scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv((rows / scale[:, None]).T, rcond=1e-12)
-    return (inverse @ inverse.T) * np.mean(errors**2) / np.outer(scale, scale)

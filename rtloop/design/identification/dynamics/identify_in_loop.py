@@ -11,7 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtloop.design.identification.dynamics.dynamics_fit import Candidate, DynamicsFit, Mode, modes_of, transfer_of
+from rtloop.design.identification.dynamics.dynamics_fit import (
+    Candidate,
+    DynamicsFit,
+    Mode,
+    modes_of,
+    static_gain_std,
+    transfer_of,
+)
 from rtloop.design.identification.dynamics.identify_delay import MOST_TICKS, delayed
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion, identify_dynamics
 from rtloop.design.identification.dynamics.instrumental import (
@@ -173,6 +180,7 @@ def _described(name: str, chosen: Final, data: Instrumented, candidates: tuple[C
     return DynamicsFit(
         transfer_of(model),
         model.static_gain,
+        static_gain_std(model, chosen.estimate.covariance, noise=False),
         modes,
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(left) / np.std(data.run.position_um))),

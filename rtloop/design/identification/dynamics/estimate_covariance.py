@@ -1,0 +1,42 @@
+"""Covariance of the unknowns of a model that was fitted by prediction errors.
+
+    (ΨΨᵀ)⁻¹ σ²                          white errors                        Ljung 1999, section 9.4
+    (ΨΨᵀ)⁻¹ Ψ R Ψᵀ (ΨΨᵀ)⁻¹              errors that correlate               White 1980; Newey & West 1987
+
+R_jk = (1 − |j − k|/(m + 1)) r_|j−k| holds the autocovariance r of the errors up to a lag m, tapered as Bartlett does,
+so that no variance is negative. It makes standard deviations right where the noise model lacks a colour of the noise.
+It does not see an error that follows from the input, such as that of a wrong model of the hysteresis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import oaconvolve
+
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.hil.modal import Real
+
+LAGS_PART = 20
+"""A recording has so many times the samples of the largest lag m."""
+
+
+def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, white: bool) -> Real:
+    """Covariance (unknowns, unknowns) of `model.pack(noise=True)`, from the one-step-ahead `errors` (samples,)."""
+    rows = model.sensitivities(run.input, errors, noise=True)
+    scale = np.linalg.norm(rows, axis=1)
+    scale[scale == 0] = 1.0
+    rows = rows / scale[:, None]
+    inverse = np.linalg.pinv(rows.T, rcond=1e-12)
+    coloured = inverse * np.mean(errors**2) if white else _correlated(inverse, errors)
+    return (inverse @ coloured.T) / np.outer(scale, scale)
+
+
+def _correlated(rows: Real, errors: Real) -> Real:
+    """Each of `rows` (k, samples) times R (samples, samples) of the errors."""
+    most = errors.size // LAGS_PART
+    spectrum = np.fft.rfft(errors - errors.mean(), 2 * errors.size)
+    covariances = np.fft.irfft(np.abs(spectrum) ** 2)[: most + 1] / errors.size
+    tapered = covariances * (1 - np.arange(most + 1) / (most + 1))
+    kernel = np.concatenate([tapered[:0:-1], tapered])
+    return np.asarray(oaconvolve(rows, kernel[None, :], mode="same", axes=1), dtype=float)

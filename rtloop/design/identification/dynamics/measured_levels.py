@@ -1,0 +1,61 @@
+"""Levels that an input holds, corrected by the position that settles at each of them.
+
+    p_l = a + g u_l + e_l,     u_l ← u_l + e_l/g          least squares over the levels, each by its duration
+
+The input of D(s) comes from a model of the hysteresis, which errs by a constant at each level. A fit takes such errors
+for noise and colours its noise model with them, which moves the fast real poles by a standard deviation, or it takes
+them for modes. The position at rest measures the levels to within the noise of a mean. Two levels leave no e_l: only a
+recording with three or more is corrected, and only where the position settles at each to within its noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.design.identification.measured import noise_of
+from rtloop.hil.modal import Real
+
+SHORTEST_TAIL = 50
+"""Samples of a mean, at least."""
+RESTLESS = 1.2
+"""A position that spreads by more than so many times its noise still rings, drifts or creeps."""
+APART = 4.0
+"""Standard errors by which the two halves of a settled position may differ."""
+
+
+class CorrectedLevels(NamedTuple):
+    """The recording with its levels corrected, and the largest correction, in the input's unit."""
+
+    run: Excitation
+    largest: float
+
+
+def with_measured_levels(run: Excitation) -> CorrectedLevels:
+    """Correct the levels of `run.input`: none where it holds fewer than three, or the position does not settle."""
+    changes = np.flatnonzero(np.diff(run.input)) + 1
+    holds = [slice(*ends) for ends in pairwise([0, *changes.tolist(), run.input.size])]
+    unchanged = CorrectedLevels(run, 0.0)
+    if len(holds) < 3 or min(hold.stop - hold.start for hold in holds) < 2 * SHORTEST_TAIL:
+        return unchanged
+    tails = [run.position_um[(hold.start + hold.stop) // 2 : hold.stop] for hold in holds]
+    noise_um = noise_of(run.position_um)
+    if not all(_is_settled(tail, noise_um) for tail in tails):
+        return unchanged
+    durations = np.array([hold.stop - hold.start for hold in holds])
+    levels = run.input[[hold.start for hold in holds]]
+    gain, offset_um = np.polyfit(levels, [tail.mean() for tail in tails], 1, w=np.sqrt(durations))
+    measured = np.array([(tail.mean() - offset_um) / gain for tail in tails])
+    corrected = measured - measured[0] + levels[0]
+    return CorrectedLevels(replace(run, input=np.repeat(corrected, durations)), float(np.abs(corrected - levels).max()))
+
+
+def _is_settled(tail: Real, noise_um: float) -> bool:
+    """Whether a position neither drifts nor rings beyond its noise."""
+    first, second = np.array_split(tail, 2)
+    bound_um = APART * noise_um * np.sqrt(1 / first.size + 1 / second.size)
+    return bool(tail.std() <= RESTLESS * noise_um and abs(first.mean() - second.mean()) <= bound_um)
