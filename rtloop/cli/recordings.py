@@ -170,8 +170,8 @@ def export(
     """Write a recording as CSV, Parquet, npz, HDF5 or MAT.
 
     Every number exactly, and never over an existing file. MAT files are laid out as dSPACE ControlDesk's: scripts that
-    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is that of the file. They are of version 5, and beyond
-    512 MiB of numbers of version 7.3.
+    read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is that of the file. They are of version 5, which holds
+    up to 2 GiB.
     """
     from rtloop.interchange.export import export as export_recording
     from rtloop.recording.views.selection import Selection

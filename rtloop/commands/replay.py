@@ -21,7 +21,6 @@ from rtloop.laws.limited.first import try_first
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
-from rtloop.recording.replay.earlier import as_of_today
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws, require_law
 from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
 
@@ -70,7 +69,7 @@ def trust_in(files: Sequence[Path], recorded: bool) -> Trust:
 def _opened(files: Sequence[Path]) -> Recording:
     recording = load(files)
     require_law(recording)
-    return as_of_today(recording)
+    return recording
 
 
 def _about(recording: Recording, other: Path | None) -> dict[str, Any]:

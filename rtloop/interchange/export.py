@@ -50,7 +50,8 @@ def export(
     writers = {"csv": _write_csv, "parquet": _write_parquet, "npz": _write_npz, "hdf5": _write_hdf5}
     with _new_file(target) as part:
         if to == "mat":
-            ticks = write_mat(recording, part, target, selection, tell)
+            ticks = write_mat(recording, part, target, selection)
+            tell(ticks)
         else:
             ticks = writers[to](recording, part, selection, tell)
     size = target.stat().st_size

@@ -16,10 +16,9 @@ def path_of(file: IO[bytes]) -> str:
     return f"/proc/self/fd/{file.fileno()}"
 
 
-def begin(place: Any, name: str, *, column: bool = False) -> Any:
-    """An empty dataset of doubles in a group or file; of shape (ticks, 1) with `column`."""
-    shape, most, chunk = ((0, 1), (None, 1), (CHUNK_TICKS, 1)) if column else ((0,), (None,), (CHUNK_TICKS,))
-    return place.create_dataset(name, shape, "<f8", maxshape=most, chunks=chunk, **COMPRESSION)
+def begin(place: Any, name: str) -> Any:
+    """An empty dataset of doubles in a group or file."""
+    return place.create_dataset(name, (0,), "<f8", maxshape=(None,), chunks=(CHUNK_TICKS,), **COMPRESSION)
 
 
 def append(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
@@ -27,4 +26,4 @@ def append(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
     for dataset, values in zip(datasets, rows.T, strict=True):
         there = dataset.shape[0]
         dataset.resize(there + len(values), axis=0)
-        dataset[there:] = values.reshape(-1, *dataset.shape[1:])
+        dataset[there:] = values

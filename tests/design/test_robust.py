@@ -13,11 +13,10 @@ from rtloop.cli import main
 from rtloop.design.robust import certificate
 from rtloop.design.robust.certificate import certified
 from rtloop.design.robust.controller import bounds, candidates, transfer_of
-from rtloop.design.robust.evolution import evolve
 from rtloop.design.robust.objective import Objective, Walls
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.scenarios import Family, Scenario, light_modes
-from rtloop.design.robust.search import robust_controller
+from rtloop.design.robust.search import minimise, robust_controller
 from rtloop.design.robust.section import robust_configuration
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions
@@ -131,13 +130,26 @@ def test_two_modes_move_by_themselves_in_every_combination() -> None:
     assert set(swept) == {(ticks, percent) for ticks in (0, 1) for percent in (-8.0, 0.0, 8.0)}
 
 
-def test_evolution_finds_the_minimum_of_a_bent_valley_and_its_seed_decides() -> None:
+def test_a_search_finds_the_minimum_of_a_bent_valley_and_its_seed_alone_decides(tmp_path, monkeypatch) -> None:
+    """Neither numpy's global generator nor files in the working directory have a part in it."""
+
     def rosenbrock(points):
         return np.sum(100 * (points[:, 1:] - points[:, :-1] ** 2) ** 2 + (1 - points[:, :-1]) ** 2, axis=1)
 
-    found = [evolve(rosenbrock, np.zeros(4), 0.5, 800, np.random.default_rng(3)) for _ in range(2)]
-    assert found[0].point == pytest.approx(np.ones(4), abs=1e-4)
-    assert np.array_equal(found[0].point, found[1].point)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cma_signals.in").write_text("{'timeout': 0}")
+    points = []
+    for number in range(2):
+        np.random.seed(number)
+        points.append(minimise(rosenbrock, np.zeros(4), 0.5, 800, np.random.default_rng(3)).point)
+    assert points[0] == pytest.approx(np.ones(4), abs=1e-4)
+    assert np.array_equal(*points)
+    assert [path.name for path in tmp_path.iterdir()] == ["cma_signals.in"]
+
+
+def test_a_search_that_finds_nothing_better_stays_where_it_started() -> None:
+    found = minimise(lambda points: np.sum(points**2, axis=1), np.zeros(3), 1.0, 2, np.random.default_rng(1))
+    assert (found.point.tolist(), found.cost) == ([0.0, 0.0, 0.0], 0.0)
 
 
 def test_what_is_written_is_the_controller_that_was_searched() -> None:

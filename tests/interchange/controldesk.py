@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from scipy.io import loadmat, savemat
 
@@ -32,24 +31,3 @@ def read_v5(path: Path) -> tuple[Array, dict[str, Array], dict[str, str]]:
     assert all(values.shape == time_s.shape == (1, time_s.size) for values in signals.values())
     assert all(one.XIndex[0, 0] == 1 and one.Raster[0] == variable.X[0, 0].Raster[0] for one in variable.Y[0])
     return time_s[0], {name: values[0] for name, values in signals.items()}, units
-
-
-def read_v73(path: Path) -> tuple[Array, dict[str, Array], dict[str, str]]:
-    """The same of version 7.3: MATLAB's 1×n is (n, 1) there, and the fields of a structure array are references."""
-    head = path.read_bytes()[:128]
-    assert head.startswith(b"MATLAB 7.3 MAT-file")
-    assert head[124:] == b"\x00\x02IM"
-    with h5py.File(path) as file:
-        variable = file[path.stem]
-        assert variable.attrs["MATLAB_class"] == variable["Y"].attrs["MATLAB_class"] == b"struct"
-
-        def each(field: str) -> list[Any]:
-            return [file[place] for place in variable["Y"][field][:, 0]]
-
-        def text(one: Any) -> str:
-            assert one.attrs["MATLAB_class"] == b"char"
-            return "" if "MATLAB_empty" in one.attrs else "".join(map(chr, one[:, 0]))
-
-        names = [text(one) for one in each("Name")]
-        data = dict(zip(names, (one[:, 0] for one in each("Data")), strict=True))
-        return variable["X"]["Data"][:, 0], data, dict(zip(names, map(text, each("Unit")), strict=True))

@@ -212,4 +212,4 @@ def test_a_file_that_was_cut_off_gives_what_is_whole(tmp_path: Path):
     rows = len(table.columns["counts"])
     assert 20 < rows < ROWS
     assert table.columns["accel.x"].tobytes() == TRUTH[:rows, 0].tobytes()
-    assert "bytes are left out" in table.about["problems"]
+    assert "what comes behind it is left out" in table.about["problems"]

@@ -19,13 +19,11 @@ from rtloop.interchange.wanted import Wanted
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import Selection
 from rtloop.recording.views.summary import summarise
-from tests.interchange.controldesk import read_v5, read_v73
+from tests.interchange.controldesk import read_v5
 from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
 
 COUNT = 4_000
 ODD = (-0.0, 5e-324, -np.inf, 1.7976931348623157e308, 1 / 3, np.nan)
-EVERY_KIND = [(to, 1 << 29) for to in FORMATS] + [("mat", 0)]
-"""Formats, and up to how many bytes a MAT file is of version 5."""
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +44,8 @@ def imported(path: Path) -> Recording:
     return load(report["output"])
 
 
-@pytest.mark.parametrize(("to", "v5_bytes"), EVERY_KIND)
-def test_import_of_export_is_the_recording(
-    to: str, v5_bytes: int, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(to_mat, "LARGEST_V5_BYTES", v5_bytes)
+@pytest.mark.parametrize("to", FORMATS)
+def test_import_of_export_is_the_recording(to: str, recording: Recording, tmp_path: Path):
     back = imported(exported(recording, to, tmp_path))
     assert set(back) == set(recording)
     assert [name for name in recording if back[name].tobytes() != recording[name].tobytes()] == []
@@ -59,16 +54,24 @@ def test_import_of_export_is_the_recording(
     assert back.units == recording.units
 
 
-@pytest.mark.parametrize(("v5_bytes", "read"), [(1 << 29, read_v5), (0, read_v73)])
-def test_mat_is_what_a_script_for_controldesk_reads(
-    v5_bytes: int, read, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(to_mat, "LARGEST_V5_BYTES", v5_bytes)
-    time_s, signals, units = read(exported(recording, "mat", tmp_path))
+def test_mat_is_what_a_script_for_controldesk_reads(recording: Recording, tmp_path: Path):
+    time_s, signals, units = read_v5(exported(recording, "mat", tmp_path))
     assert np.array_equal(time_s, recording.time_s)
     assert list(signals) == list(COLUMNS)
     assert [name for name in signals if signals[name].tobytes() != recording[name].tobytes()] == []
     assert units == recording.units
+
+
+def test_a_recording_too_large_for_a_mat_file_is_refused_with_the_remedy(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    numbers = 8 * COUNT * (len(COLUMNS) + 1)
+    monkeypatch.setattr(to_mat, "LARGEST_BYTES", numbers)  # the texts are beyond it
+    with pytest.raises(RtloopError, match=r"back\.mat: .* allowed in a MAT file: 2 GiB\. Use --to hdf5"):
+        exported(recording, "mat", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(to_mat, "LARGEST_BYTES", 2 * numbers)
+    assert exported(recording, "mat", tmp_path).stat().st_size > numbers
 
 
 def test_mat_says_where_it_comes_from(recording: Recording, tmp_path: Path):

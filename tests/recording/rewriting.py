@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
-ENCODINGS = ("as it is", "json", "protobuf", "proto2", "proto3")
+ENCODINGS = ("as it is", "json", "proto3")
 
 
 class Said(NamedTuple):
@@ -112,8 +112,7 @@ class Encoding:
         if self._ticks == "json":
             return "json", None, json.dumps({field.name: value for field, value in message.ListFields()}).encode()
         if self._kind is None:
-            names = [field.name for field in message.DESCRIPTOR.fields]
-            self._kind = type(message) if self._ticks == "protobuf" else backwards(names, self._ticks)
+            self._kind = backwards([field.name for field in message.DESCRIPTOR.fields])
         again = self._kind(**{field.name: value for field, value in message.ListFields()})
         described = build_file_descriptor_set(self._kind).SerializeToString()
         return "protobuf", (self._kind.DESCRIPTOR.full_name, "protobuf", described), again.SerializeToString()
@@ -123,9 +122,9 @@ def _schema(name: str, encoding: str, data: bytes) -> Schema:
     return Schema(id=1, name=name, encoding=encoding, data=data)
 
 
-def backwards(names: Sequence[str], syntax: str) -> Any:
+def backwards(names: Sequence[str]) -> Any:
     """A message of the same fields with their numbers the other way round; proto3 leaves zeros out."""
-    file = FileDescriptorProto(name="another/tick.proto", package="another", syntax=syntax)
+    file = FileDescriptorProto(name="another/tick.proto", package="another", syntax="proto3")
     message = file.message_type.add(name="Sample")
     for place, name in enumerate(names):
         kind, label = FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.LABEL_OPTIONAL

@@ -179,6 +179,17 @@ def test_malformed_headers_are_refused_by_name(key: str, value: Any, said: str, 
     assert "\n" not in str(caught.value)
 
 
+def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(base: Base, tmp_path: Path):
+    """The records of version 0.1.0 have no x_feed_um."""
+    columns = [name for name in base.header["columns"] if name != "x_feed_um"]
+    header = {**base.header, "columns": columns, "versions": {"rtloop": "0.1.0"}}
+    path = tmp_path / "run.mcap"
+    path.write_bytes(packed(base, first_chunk(header, columns)))
+    for use in (load, recover, summarise):
+        with pytest.raises(RecordingError, match=r"made by rtloop 0\.1\.0: read it with that version"):
+            use(path)
+
+
 @pytest.mark.parametrize(
     ("column", "value"),
     [("tick", np.nan), ("tick", -1.0), ("tick", 3.5), ("deadline_ns", np.inf), ("deadline_ns", 1e19), ("flags", np.nan),

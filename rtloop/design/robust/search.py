@@ -1,4 +1,7 @@
-"""The search for C(z): short ones from many places, long ones from the best, and once more with what proved worst."""
+"""The search for C(z): short ones from many places, long ones from the best, and once more with what proved worst.
+
+The evolution strategy is the package `cma` (Hansen, "The CMA evolution strategy: a tutorial", 2016).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ import numpy as np
 
 from rtloop.design.robust.certificate import Certificate, certified
 from rtloop.design.robust.controller import bounds, transfer_of
-from rtloop.design.robust.evolution import Minimum, evolve
 from rtloop.design.robust.objective import FAR, Objective, Walls
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.hinf.assumptions import NoController
@@ -25,6 +27,13 @@ how many are taken to the end; how often the worst plants of a proof may join th
 LEAST_TIGHTENED = 0.9
 """A round lowers no wall by more."""
 Progress = Callable[[str], None]
+
+
+class Minimum(NamedTuple):
+    """The best point of a search, (n,), and its cost."""
+
+    point: Real
+    cost: float
 
 
 class Robust(NamedTuple):
@@ -58,7 +67,7 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
         if best is None:
             best = _searched(objective, design, random, progress)
         else:
-            best = evolve(objective, best.point, 0.05, options.generations, random, POPULATION)
+            best = minimise(objective, best.point, 0.05, options.generations, random)
         if best.cost >= FAR:
             raise NoController(
                 f"robust: no controller of order {1 + 2 * options.biquads} found that is stable in all of "
@@ -81,6 +90,34 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
             + ". More room there, a smaller [scenarios], more robust.restarts or biquads would help"
         )
     return Robust(controller, family, walls, proof, len(scenarios))
+
+
+def minimise(
+    cost: Callable[[Real], Real], start: Real, spread: float, generations: int, random: np.random.Generator
+) -> Minimum:
+    """Minimise `cost`, which takes points (k, n) and returns (k,), from `start` (n,) with standard deviation `spread`.
+
+    All random numbers come from `random`. Returns `start` where no generation is better.
+    """
+    import cma  # takes a second: only a search needs it
+
+    options = {
+        "popsize": POPULATION,
+        "maxiter": generations,
+        "randn": lambda *shape: random.standard_normal(shape),
+        "seed": np.nan,  # leave numpy's own generator alone
+        "verbose": -10,  # say nothing, and read no options from the working directory
+        "verb_log": 0,
+    }
+    strategy, best = cma.CMAEvolutionStrategy(start, spread, options), Minimum(start, float(cost(start[None])[0]))
+    while not strategy.stop():
+        points = np.array(strategy.ask())
+        costs = cost(points)
+        strategy.tell(points, costs)
+        least = int(np.argmin(costs))
+        if costs[least] < best.cost:
+            best = Minimum(points[least], float(costs[least]))
+    return best
 
 
 def walls_of(design: DesignOptions) -> Walls:
@@ -115,11 +152,11 @@ def _searched(objective: Objective, design: DesignOptions, random: np.random.Gen
     for number in range(options.restarts):
         points = _anywhere(objective, options.biquads, random)
         start = points[np.argmin(objective(points))]
-        found.append(evolve(objective, start, 0.3, max(1, options.generations // SHORT), random, POPULATION))
+        found.append(minimise(objective, start, 0.3, max(1, options.generations // SHORT), random))
         progress(f"search {number + 1} of {options.restarts}: {_words(objective, found[-1])}")
     found.sort(key=lambda one: one.cost)
     for number, one in enumerate(found[:TAKEN_ON]):
-        found.append(evolve(objective, one.point, 0.1, options.generations, random, POPULATION))
+        found.append(minimise(objective, one.point, 0.1, options.generations, random))
         progress(f"continued {number + 1} of {min(TAKEN_ON, len(found))}: {_words(objective, found[-1])}")
     return min(found, key=lambda one: one.cost)
 

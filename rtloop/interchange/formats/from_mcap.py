@@ -9,6 +9,7 @@ A file that was cut off or is damaged gives what is whole of it, and `about["pro
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -16,39 +17,26 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.hil.modal import Real
+from rtloop.interchange.formats.mcap_fields import Fields, Undecodable, decoder
 from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.foreign.fields import Undecodable, decoder, encoding
-from rtloop.recording.file.foreign.stretches import Run, Topics, contents, runs, stretches
 from rtloop.recording.file.mcap.chunks import Source
-from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk
+from rtloop.recording.file.mcap.stock import Item, described, encoding, read_messages
 
 LOG_TIME = "log_time_s"
 MOST_TIMES, SPARE_BYTES = 64, 64 << 20
 """What a table may take of memory: so many times what its messages take in the file, and a little more."""
-MOST_SHOWN, SHOWN = 12, 60
-"""Topics in a message, and characters of a name."""
+SHOWN = 60
+"""Characters of a name in a message."""
 
 
 class Contents(NamedTuple):
-    """What is in a file: its topics, how many messages of each channel, what they take, and what is wrong with it."""
+    """The number of messages by topic and encoding, the bytes of each topic's messages, and the damage of a file."""
 
-    topics: Topics
-    counts: Counter[int]
-    bytes: int
+    counts: Counter[tuple[str, str]]
+    bytes: Counter[str]
     problems: list[str]
-
-    def channels(self, topic: str) -> list[int]:
-        """The channels of a topic."""
-        return [number for number in self.counts if self.topics.channels[number].topic == topic]
-
-    def described(self) -> str:
-        """The topics in words."""
-        return ", ".join(
-            f"{self.topics.channels[number].topic[:SHOWN]!r} "
-            f"({encoding(self.topics.channels[number], self.topics.schema_of(number))}, {count} messages)"
-            for number, count in self.counts.most_common(MOST_SHOWN)
-        )
 
 
 def read_mcap(path: Path | str, topic: str | None = None) -> Table:
@@ -69,24 +57,24 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
 
 def _contents(source: Source) -> Contents:
     """Every message counted."""
-    topics, size = Topics(), 0
-    counts: Counter[int] = Counter()
-    places, problems = stretches(source)
-    for stretch in places:
-        try:
-            found = [run for records in contents(source, stretch) for run in runs(records, topics)]
-        except DamagedChunk as reason:
-            problems.append(f"bytes {stretch.offset} to {stretch.offset + stretch.length} are damaged ({reason})")
-            continue
-        for run in found:
-            counts[run.channel] += len(run.records)
-            size += run.records.size
-    return Contents(topics, counts, size, problems)
+    found = Contents(Counter(), Counter(), [])
+    for schema, channel, message in _whole(source, found.problems):
+        found.counts[channel.topic, encoding(channel, schema)] += 1
+        found.bytes[channel.topic] += MESSAGE_HEAD.size + len(message.data)
+    return found
+
+
+def _whole(source: Source, problems: list[str]) -> Iterator[Item]:
+    """The messages of a file up to the first damage, which becomes one of `problems`."""
+    try:
+        yield from read_messages(source)
+    except DamagedChunk as reason:
+        problems.append(f"{reason}: what comes behind it is left out")
 
 
 def _chosen(path: Path, found: Contents, topic: str | None) -> str:
     """The topic that is meant. Raises UnreadableData where nobody knows which."""
-    there = {found.topics.channels[number].topic for number in found.counts}
+    there = set(found.bytes)
     if topic is not None and topic in there:
         return topic
     if not there:
@@ -94,9 +82,9 @@ def _chosen(path: Path, found: Contents, topic: str | None) -> str:
             f"{path}: an MCAP file without messages" + "".join(f"; {one}" for one in found.problems[:1])
         )
     if topic is not None:
-        raise UnreadableData(f"{path}: no topic {topic[:SHOWN]!r}; there are {found.described()}")
+        raise UnreadableData(f"{path}: no topic {topic[:SHOWN]!r}; there are {described(found.counts)}")
     if len(there) > 1:
-        raise UnreadableData(f"{path}: holds several topics, of which one is to be named: {found.described()}")
+        raise UnreadableData(f"{path}: holds several topics, of which one is to be named: {described(found.counts)}")
     return there.pop()
 
 
@@ -106,34 +94,20 @@ class _Reading:
     def __init__(self, source: Source, found: Contents, topic: str) -> None:
         self._source, self._found, self._topic = source, found, topic
         self._where = f"{source.path}: {topic[:SHOWN]!r}"
-        channels = found.channels(topic)
-        self._rows = sum(found.counts[number] for number in channels)
+        self._rows = sum(count for (name, _), count in found.counts.items() if name == topic)
         if self._rows > ROWS_AT_MOST:
             raise UnreadableData(
                 f"{self._where}: {self._rows} messages; at most {ROWS_AT_MOST} are read, by `mcap filter`"
             )
-        try:
-            topics = found.topics
-            self._decoders = {one: decoder(topics.channels[one], topics.schema_of(one)) for one in channels}
-        except Undecodable as reason:
-            raise UnreadableData(f"{self._where}: {reason}") from None
+        self._decoders: dict[int, Callable[[bytes], Fields]] = {}
         self._columns: dict[str, Real] = {}
         self._log_times = np.zeros(self._rows, np.uint64)
 
     def table(self) -> Table:
         """All of it."""
-        fill, problems = 0, self._found.problems
-        for stretch in stretches(self._source)[0]:
-            try:
-                found = [
-                    run for records in contents(self._source, stretch) for run in runs(records, self._found.topics)
-                ]
-            except DamagedChunk:
-                continue  # it was counted as such
-            for run in found:
-                if run.channel in self._decoders:
-                    self._take(run, fill)
-                    fill += len(run.records)
+        problems, own = self._found.problems, (one for one in _whole(self._source, []) if one[1].topic == self._topic)
+        for row, item in enumerate(own):
+            self._take(item, row)
         if not self._columns:
             raise UnreadableData(f"{self._where}: there is no number in its messages")
         order = np.argsort(self._log_times, kind="stable")
@@ -148,22 +122,26 @@ class _Reading:
         }
         return Table({LOG_TIME: elapsed_ns * 1e-9} | columns, {LOG_TIME: "s"}, LOG_TIME, about)
 
-    def _take(self, run: Run, first: int) -> None:
-        """The messages of a run as rows from `first` on. Raises UnreadableData."""
-        self._log_times[first : first + len(run.records)] = run.log_times
-        decode = self._decoders[run.channel]
-        for row, payload in enumerate(run.payloads, first):
-            try:
-                fields = decode(payload)
-            except Undecodable as reason:
-                raise UnreadableData(f"{self._where}: message {row}: {reason}") from None
-            for name, value in fields.items():
-                column = self._columns.get(name)
-                (self._new(name) if column is None else column)[row] = value
+    def _take(self, item: Item, row: int) -> None:
+        """The numbers of a message as a row. Raises UnreadableData, MissingExtra."""
+        schema, channel, message = item
+        self._log_times[row] = message.log_time
+        try:
+            if channel.id not in self._decoders:
+                self._decoders[channel.id] = decoder(channel, schema)
+        except Undecodable as reason:
+            raise UnreadableData(f"{self._where}: {reason}") from None
+        try:
+            fields = self._decoders[channel.id](message.data)
+        except Undecodable as reason:
+            raise UnreadableData(f"{self._where}: message {row}: {reason}") from None
+        for name, value in fields.items():
+            column = self._columns.get(name)
+            (self._new(name) if column is None else column)[row] = value
 
     def _new(self, name: str) -> Real:
         """A column, of NaN."""
-        if (len(self._columns) + 1) * self._rows * 8 > MOST_TIMES * self._found.bytes + SPARE_BYTES:
+        if (len(self._columns) + 1) * self._rows * 8 > MOST_TIMES * self._found.bytes[self._topic] + SPARE_BYTES:
             much = f"{len(self._columns)} fields and more in {self._rows} messages, each of which has few of them"
             raise UnreadableData(f"{self._where}: {much}: that is no table")
         self._columns[name] = np.full(self._rows, np.nan)

@@ -1,12 +1,12 @@
-"""Where the chunks of a recording are, by who wrote the file: rtloop, whose layout is read as it stands, or another."""
+"""Where the chunks of a recording are: in the file itself where rtloop wrote it, else in a converted copy."""
 
 from __future__ import annotations
 
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.foreign.rewritten import NoRecording, Rewritten
-from rtloop.recording.file.foreign.stretches import library
+from rtloop.recording.file.conversion import converted
 from rtloop.recording.file.mcap.chunks import Entry, Source, indexed_chunks, scanned_chunks
 from rtloop.recording.file.mcap.container import MAGIC, DamagedChunk, unpack_chunk
+from rtloop.recording.file.mcap.stock import library
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import read_chunk
 from rtloop.recording.file.topics.header import own_header, read_header
@@ -20,9 +20,6 @@ class Own:
 
     Raises RecordingError where its header is malformed.
     """
-
-    ahead = 16
-    """Chunks that are decompressed beyond the one that is asked for."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -54,24 +51,34 @@ class Own:
             return entries
 
 
-def layout_of(source: Source) -> Own | Rewritten:
-    """The chunks of a recording. Raises RecordingError where the file is another's, of a newer version, or damaged."""
-    written_by = library(source)
-    if written_by not in OWN:
+def open_layout(source: Source) -> tuple[Source, Own]:
+    """The chunks of a recording, and the file that holds them: `source`, or its copy where another tool wrote it.
+
+    Raises RecordingError where the file holds no recording, or is damaged or of a newer version.
+    """
+    if library(source) not in OWN:
         try:
-            return Rewritten(source)
-        except NoRecording as reason:
+            return _open_converted(source)
+        except RecordingError as reason:
             try:  # it may be rtloop's own with a damaged name
-                return Own(source)
+                return source, Own(source)
             except DamagedChunk:
                 raise reason from None
     try:
         own = Own(source)
     except DamagedChunk as damage:
         try:
-            return Rewritten(source)
-        except NoRecording:
+            return _open_converted(source)
+        except RecordingError as reason:
             if format.PROFILE.encode() not in source.read(len(MAGIC), 64):
                 raise
-            raise RecordingError(f"{source.path}: the beginning of the recording is damaged ({damage})") from None
-    return Rewritten(source) if own.is_mixed else own
+            raise RecordingError(f"{source.path}: the beginning of the recording is damaged ({damage})") from reason
+    return _open_converted(source) if own.is_mixed else (source, own)
+
+
+def _open_converted(source: Source) -> tuple[Source, Own]:
+    """The chunks of the copy of `source`, which is closed. Raises RecordingError."""
+    copy = converted(source)
+    own = Own(copy)
+    source.close()
+    return copy, own

@@ -21,7 +21,7 @@ import numpy as np
 from rtloop.hil.trusted import open_named
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.account import Account
-from rtloop.recording.file.layout import layout_of
+from rtloop.recording.file.layout import open_layout
 from rtloop.recording.file.mcap.chunks import Entry, Opener, Source
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
@@ -40,6 +40,8 @@ from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
 WORKERS = 3
+AHEAD = 16
+"""Chunks that are decompressed beyond the one that is asked for."""
 DIGEST_BYTES = 32
 
 
@@ -62,8 +64,10 @@ class Reader:
     def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_named) -> None:
         self.path, self.tolerant = Path(path), tolerant
         self._source = Source(self.path, opener)
+        self.size_bytes: int = self._source.size
+        """Size of the file."""
         try:
-            self._layout = layout_of(self._source)
+            self._source, self._layout = open_layout(self._source)
         except BaseException:
             self._source.close()
             raise
@@ -103,11 +107,6 @@ class Reader:
     def repeated(self) -> int:
         """Ticks at the beginning of the file that are taken from a part before it."""
         return max(self._repeated_before - self.header.get("first_tick", 0), 0)
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the file."""
-        return self._source.size
 
     @cached_property
     def start_unix_ns(self) -> int:
@@ -247,7 +246,7 @@ class Reader:
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
                 waiting.append((entry, pool.submit(self._ticks_of, entry, names)))
-                if len(waiting) >= self._layout.ahead:
+                if len(waiting) >= AHEAD:
                     yield waiting.popleft()
             while waiting:
                 yield waiting.popleft()

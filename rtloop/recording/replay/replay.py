@@ -24,7 +24,6 @@ from rtloop.recording.file.topics.checked import extras_of
 from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_of
 from rtloop.recording.file.topics.overview import uncovered
 from rtloop.recording.load import Recording
-from rtloop.recording.replay.earlier import as_of_today, with_effect
 from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
 from rtloop.recording.replay.rerun import Rerun, Rows, Tape
 from rtloop.recording.replay.snapshots import first_difference
@@ -40,7 +39,6 @@ Progress = Callable[[int], None]
 
 def replay(recording: Recording, progress: Progress | None = None, trust: Trust = NOTHING) -> ReplayReport:
     """Replay up to the first difference. Raises RecordingError for a recording of another layout, or without a law."""
-    recording = as_of_today(recording)
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         return _Replay(recording, laws, snapshots, progress).run()
@@ -199,7 +197,6 @@ class _Replay:
         """Coefficients and state after the commands of a tick; a tick whose outputs differ was reported already."""
         replayed, recorded = rerun.snapshot()[8:], snapshot.data[8:]
         self._report.snapshots += 1
-        replayed, recorded = (with_effect(self._recording, law) for law in (replayed, recorded))
         if replayed != recorded and not self._report.first_difference:
             self._differs(
                 snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"], rerun.law)

@@ -35,15 +35,11 @@ LARGEST_SUMMARY_BYTES = 16 << 20
 
 
 class Entry(NamedTuple):
-    """Where a chunk record is, in bytes, and what the index says about it, if there is one.
-
-    `span`: of slow messages out of a file that another tool wrote, the first and the last log time of those meant.
-    """
+    """Where a chunk record is, in bytes, and what the index says about it, if there is one."""
 
     offset: int
     length: int
     index: ChunkIndex | None  # pyright: ignore[reportIncompatibleMethodOverride]
-    span: tuple[int, int] | None = None
 
 
 class Source:
@@ -56,7 +52,10 @@ class Source:
         self.path = path
         try:
             self._fd = opener(path)
-            self.size = os.fstat(self._fd).st_size
+            status = os.fstat(self._fd)
+            self.size = status.st_size
+            self.identity = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+            """Tells whether a file is the same, and unchanged."""
             magic = os.pread(self._fd, len(MAGIC), 0)
         except FileNotFoundError:
             raise RecordingError(f"{path}: no such file{_hint(path)}") from None

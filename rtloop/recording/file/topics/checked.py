@@ -231,10 +231,12 @@ def require_columns(header: dict[str, Any]) -> None:
         return
     axes, observed, extras = header["axes"], header["observed"], extras_of(header).columns
     expected = list(signals.columns(axes, observed, extras))
-    feeds = {f"{axis}_{signals.PER_AXIS[signals.FEED].name}" for axis in axes}
-    before = [name for name in expected if name not in feeds]  # up to revision 3 of the law
-    if header["columns"] not in (expected, before):
-        raise Malformed(f"columns: {_shown(header['columns'])}; axes and observed make {_shown(expected)}")
+    if header["columns"] != expected:
+        version = header["versions"].get("rtloop") or "of an unknown version"
+        raise Malformed(
+            f"columns: {_shown(header['columns'])}; axes and observed make {_shown(expected)}. The recording was "
+            f"made by rtloop {version}: read it with that version"
+        )
 
 
 def extras_of(header: Mapping[str, Any]) -> Extras:

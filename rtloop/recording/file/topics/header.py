@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import struct
-from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -65,25 +64,6 @@ def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dic
     return header
 
 
-def merged_header(path: Path, payloads: Sequence[bytes]) -> tuple[dict[str, Any], list[int]]:
-    """The header of a file that was made of the parts of one run, that of the first; and the numbers of all.
-
-    Raises RecordingError where they are not of one run.
-    """
-    headers = sorted((read_header(path, one) for one in payloads), key=lambda one: one.get("sequence", 1))
-    first, numbers = headers[0], [int(header.get("sequence", 1)) for header in headers]
-    runs = {tuple(str(header.get(key)) for key in OF_A_RUN): header for header in headers}
-    if len(runs) > 1:
-        names = ", ".join(f"{one['name']!r} of {_moment(one['created_unix_ns'])}" for one in runs.values())
-        raise RecordingError(
-            f"{path}: holds {len(runs)} runs, {names}, whose ticks cannot be told apart; the files that it was merged "
-            "from can be read, each by itself"
-        )
-    if len(set(numbers)) < len(numbers):
-        raise RecordingError(f"{path}: holds a part of the run twice: the same file was merged with itself")
-    return first, numbers
-
-
 def absent(numbers: Iterable[int]) -> list[str]:
     """What is missing between, or in front of, the parts of a rotated run that are there; one alone is a whole one."""
     there = set(numbers)
@@ -95,7 +75,3 @@ def absent(numbers: Iterable[int]) -> list[str]:
 def absent_part(number: int) -> str:
     """The sentence for one part."""
     return f"part {number} of the run is missing"
-
-
-def _moment(unix_ns: int) -> str:
-    return f"{datetime.fromtimestamp(unix_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -14,6 +14,7 @@ import pydantic_core
 from mcap.records import Channel, Schema
 
 from rtloop.errors import MissingExtra
+from rtloop.recording.file.mcap.stock import encoding
 
 MOST_FIELDS = 2000
 MOST_ITEMS = 1000
@@ -44,13 +45,6 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields
     if (channel.message_encoding, described) == ("cdr", "ros2msg") and schema:
         return _ros2(schema)
     raise Undecodable(f"its messages are {encoding(channel, schema)}; {ENCODINGS} can be read")
-
-
-def encoding(channel: Channel, schema: Schema | None) -> str:
-    """Of a channel's messages, in words."""
-    described = schema.encoding if schema else ""
-    same = described in ("", channel.message_encoding, f"{channel.message_encoding}schema")
-    return (channel.message_encoding or "of no encoding") + ("" if same else f" ({described})")
 
 
 def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
