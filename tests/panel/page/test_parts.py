@@ -101,10 +101,10 @@ def test_jogs_go_on_from_what_was_asked_for_until_it_is_seen(parts: Any) -> None
 
 
 def test_an_event_that_is_told_again_is_shown_once(parts: Any) -> None:
-    event = "{tick: 5, kind: 'set_mode', who: 'ada', axis: null, what: {text: 'off'}}"
+    event = "{tick: 5, kind: 'set_mode', who: 'ada', axis: null, what: {mode: 'off', text: 'closed loop → off'}}"
     for _ in range(2):
         parts.evaluate(f"tell('events', {{events: [{event}]}})")
-    assert parts.locator("#events li").all_inner_texts() == ["5\nada\nset mode · off"]
+    assert parts.locator("#events li").all_inner_texts() == ["5\nada\nstopped · closed loop → off"]
 
 
 def test_late_ticks_are_one_row_that_grows(parts: Any) -> None:
