@@ -15,7 +15,7 @@ from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
 from rtloop.panel.views.lateness import BEGINS, OVER, Lateness
 from rtloop.panel.views.link import Description, Service
-from rtloop.panel.views.words import InForce, words
+from rtloop.panel.views.words import OFF, InForce, words
 from rtloop.recording.file.topics.events import Event, event_of
 
 KEPT = 200
@@ -64,7 +64,9 @@ class Events:
         """Add records of MESSAGE, (n,), or none, of the run that is read; who asked is asked of the service."""
         answers = self._ask()
         if run != self._run:
-            self._run, self._in_force = run, InForce(loop.axes if len(messages) <= KEPT else {})
+            whole = len(messages) <= KEPT  # else older events are not told, and nobody knows what they left in force
+            mode = OFF if whole and not loop.values.get("schedule") else None
+            self._run, self._in_force = run, InForce(loop.axes if whole else {}, mode)
         for message in messages[-KEPT:]:
             answer, identity = Answer(), int(message["identity"])
             asked = int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR

@@ -9,16 +9,18 @@ from rtloop.recording.file.topics.events import Event
 from rtloop.values import counted
 
 OFF, RAW = "off", "raw"
-"""Modes, in words."""
+"""Modes, in words. A service whose configuration has no schedule begins with the outputs off."""
 
 
 class InForce:
     """References and mode of a run, as its events so far leave them: an event is told with its before and after."""
 
-    def __init__(self, axes: dict[str, dict[str, Any]]) -> None:
-        """`axes` are the configured ones, by name: their references play until events name others."""
+    def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
+        """`axes` are the configured ones, by name: their references play until events name others. `mode` is that of
+        the first tick, in words; None where it is not known.
+        """
         self._references = {name: configured(axis.get("reference") or {}) for name, axis in axes.items()}
-        self._mode: str | None = None
+        self._mode = mode
 
     def change(self, event: Event) -> str:
         """Words of the run's next event: `0 → 12.5 µm`, `closed loop → off`; those of `words` for other kinds."""
