@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -29,6 +30,8 @@ ANSWER_TIMEOUT_S = 2.0
 ANSWER_PERIODS = 3.0
 """A loop that is slower than ANSWER_TIMEOUT_S has so many periods to answer."""
 POLL_S = 0.001
+MOST_CHANGES = 1000
+"""Changes of a law that are remembered in words."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,18 @@ class Desk:
         self._block, self._period_s, self._names = block, 1.0 / rate_hz, names
         self._lock = threading.Lock()
         self._identity = 0
+        self._changes: OrderedDict[int, str] = OrderedDict()
 
-    def submit(self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = ()) -> int:
-        """Send a command and wait until its tick was executed, which it returns. Raises Refused, Taken, QueueFull."""
+    def change_of(self, identity: int) -> str | None:
+        """The change that a command made, in words; None where none was given, or MOST_CHANGES came after it."""
+        return self._changes.get(identity)
+
+    def submit(
+        self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = (), change: str | None = None
+    ) -> int:
+        """Send a command and wait until its tick was executed, which it returns; `change` says in words what it
+        changes. Raises Refused, Taken, QueueFull.
+        """
         asker = _asker.get()
         command = message(kind, axis=axis, origin=asker.origin, values=values)
         safe = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
@@ -84,6 +96,10 @@ class Desk:
             cursor = int(self._block["events_head"][0])
             if self._names is not None and asker.name != OPERATOR:
                 self._names.note(identity, asker.name)
+            if change is not None:
+                self._changes[identity] = change
+                if len(self._changes) > MOST_CHANGES:
+                    self._changes.popitem(last=False)
             position = send(self._block, command, urgent=safe)
         return self._answer(kind, identity, cursor, position)
 

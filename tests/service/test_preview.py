@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.changes import Change, Changes
-from rtloop.service.changing.preview import figures
+from rtloop.service.changing.preview import figures, step_end_ms, with_longer_step
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT, built
 from tests.service.http import answer
@@ -111,3 +112,24 @@ def test_a_loop_that_controls_has_no_problem() -> None:
     found = figures(built(), 0)
     assert found["problems"] == []
     assert found["static_error_percent"] == pytest.approx(0.166384, abs=1e-5)
+
+
+def test_both_steps_of_a_preview_end_at_one_time(running: Bench):
+    """A slower loop makes the present one's step longer, a faster one has its own made longer."""
+    for gain in (0.004, 0.02):
+        body = {"axis": "x", "section": "controller", "values": {"gain": gain}}
+        found = running.client.post("/preview", body)
+        before, after = found["before"]["step"], found["after"]["step"]
+        assert before["t_ms"] == pytest.approx(after["t_ms"], abs=2e-6)
+        slowest_ms = max(found[which]["settling_ms"] for which in ("before", "after"))
+        assert before["t_ms"][-1] == pytest.approx(3 * slowest_ms, rel=1e-6)
+
+
+def test_a_longer_step_is_the_same_step():
+    prepared = built()
+    short = figures(prepared, 0)
+    longer = with_longer_step(short, prepared.checks[0], 2.5 * step_end_ms(short))["step"]
+    assert longer["t_ms"][-1] == pytest.approx(2.5 * step_end_ms(short))
+    again = np.interp(short["step"]["t_ms"], longer["t_ms"], longer["y"])
+    assert np.allclose(again, short["step"]["y"], atol=0.02)
+    assert with_longer_step(short, prepared.checks[0], 0.5) is short

@@ -42,6 +42,7 @@ export class Keys {
       event.preventDefault();
       target.click();
     }
+    if (key === "Enter" && event.repeat && target.matches?.("button")) event.preventDefault(); // a key that is held presses it once
     const inside = document.querySelector("dialog:modal") || target.closest?.("[role=listbox]");
     if (inside || event.repeat || (key !== "Escape" && (typed(target) || !this.letters))) return;
     const action = this.#actions.get(key.length === 1 ? key.toLowerCase() : key);

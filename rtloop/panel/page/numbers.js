@@ -40,6 +40,16 @@ export function significant(value, digits = 4) {
 
 /** Decimals that a quantity of a unit is shown with, where it is measured. */
 export const DECIMALS = { "µm": 3, V: 3, "µs": 1, nm: 1, "1": 0, ns: 0 };
+const COUNTS = 2e4; // of the last decimal, at least, in a stroke
+const [FEWEST, MOST] = [3, 7];
+
+/** Show micrometres with as many decimals as a stroke in µm needs: three for 80, five for 0.2. */
+export function suitStroke(stroke_um) {
+  DECIMALS["µm"] = Math.min(Math.max(Math.ceil(Math.log10(COUNTS / stroke_um) - 1e-9), FEWEST), MOST);
+}
+
+/** The smallest span of a quantity that a plot is drawn over: so many of its last decimal. */
+export const leastSpan = (unit, count = 20) => (DECIMALS[unit] ? count * 10 ** -DECIMALS[unit] : 0.5);
 
 export function quantity(value, unit) {
   return fixed(value, DECIMALS[unit] ?? 3);

@@ -9,13 +9,13 @@ import json
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
 from rtloop.panel.views.lateness import BEGINS, OVER, Lateness
 from rtloop.panel.views.link import Description, Service
-from rtloop.panel.views.words import words
+from rtloop.panel.views.words import OFF, InForce, words
 from rtloop.recording.file.topics.events import Event, event_of
 
 KEPT = 200
@@ -32,6 +32,18 @@ class Row:
     event: Event
 
 
+class Answer(NamedTuple):
+    """What the service knows of a command: the operator's name, and the change of a law; None for what it does not."""
+
+    name: str | None = None
+    change: str | None = None
+
+    def added_to(self, event: Event) -> Event:
+        """An event that was told before the service answered."""
+        text = {"change": self.change, "text": self.change} if self.change else {}
+        return {**event, "who": self.name or event["who"], "what": {**event["what"], **text}}
+
+
 class Events:
     """The last KEPT rows. What is told has a number, from 1 on; a row that grew is told again, under another one."""
 
@@ -40,6 +52,8 @@ class Events:
         self._kept: deque[Row] = deque(maxlen=KEPT)
         self._late: tuple[Row, Lateness] | None = None
         """The last one of late ticks."""
+        self._run, self._in_force = -1, InForce({})
+        """The run that was told last, and its references and mode."""
         self._lock = threading.Lock()
         self._unasked: deque[tuple[Row, int]] = deque(maxlen=KEPT)
         """Rows whose operator's name the service has not said yet, and the identity of each."""
@@ -49,16 +63,24 @@ class Events:
     def take(self, messages: Any, loop: Description, run: int) -> None:
         """Add records of MESSAGE, (n,), or none, of the run that is read; who asked is asked of the service."""
         answers = self._ask()
+        if run != self._run:
+            whole = len(messages) <= KEPT  # else older events are not told, and nobody knows what they left in force
+            mode = OFF if whole and not loop.values.get("schedule") else None
+            self._run, self._in_force = run, InForce(loop.axes if whole else {}, mode)
         for message in messages[-KEPT:]:
-            name, identity = None, int(message["identity"])
+            answer, identity = Answer(), int(message["identity"])
             asked = int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR
             if asked and answers:
                 try:
-                    name = self._name(identity)
+                    answer = self._answer(identity)
                 except RtloopError:
                     answers = False
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
-            event = {**event_of(message, tuple(loop.axes), time_ns, name=name), "run": run}
+            event = {**event_of(message, tuple(loop.axes), time_ns, name=answer.name), "run": run}
+            if answer.change:
+                event["what"]["change"] = answer.change
+            if event["kind"] not in (BEGINS, OVER):
+                event = told(event, self._in_force.change(event))
             with self._lock:
                 self.newest += 1
                 self._add(event, loop.rate_hz)
@@ -70,14 +92,14 @@ class Events:
         while self._unasked:
             row, identity = self._unasked[0]
             try:
-                name = self._name(identity)
+                answer = self._answer(identity)
             except RtloopError:
                 return False
             self._unasked.popleft()
-            if name is not None:
+            if answer.name or answer.change:
                 with self._lock:
                     self.newest += 1
-                    row.number, row.event = self.newest, {**row.event, "who": name}
+                    row.number, row.event = self.newest, answer.added_to(row.event)
         return True
 
     def after(self, number: int) -> list[tuple[int, Event]]:
@@ -87,7 +109,7 @@ class Events:
 
     def _add(self, event: Event, rate_hz: float) -> None:
         if event["kind"] not in (BEGINS, OVER):
-            self._kept.append(Row(self.newest, told(event)))
+            self._kept.append(Row(self.newest, event))
             return
         if (grown := self._grown_by(event)) is not None:
             row, lateness = grown
@@ -104,12 +126,13 @@ class Events:
             return None
         return self._late if event["kind"] == OVER or self._late[0] is self._kept[-1] else None
 
-    def _name(self, identity: int) -> str | None:
-        """Of the operator; None where no name was given. Raises UnavailableError, HostRefused."""
+    def _answer(self, identity: int) -> Answer:
+        """Answer of the service about a command. Raises UnavailableError, HostRefused."""
         status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, ASK_S)
-        return json.loads(data)["name"] if status == 200 else None
+        said = json.loads(data) if status == 200 else {}
+        return Answer(said.get("name"), said.get("change"))
 
 
-def told(event: Event) -> Event:
-    """An event with its words."""
-    return {**event, "what": {**event["what"], "text": words(event)}}
+def told(event: Event, text: str | None = None) -> Event:
+    """An event with its words, those of `words` by default."""
+    return {**event, "what": {**event["what"], "text": words(event) if text is None else text}}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rtloop.panel.rest import MODE, Rest, axis_of, reference_of
 from rtloop.panel.spectrum import Spectrum
 from rtloop.panel.stretch import Batch, Stretch
 from rtloop.panel.views.frames import pack
@@ -18,6 +19,7 @@ class Analyser:
         self._wish, self._rate_hz = wish, loop.rate_hz
         self._spectrum = Spectrum(loop.rate_hz, loop.unit(wish.signal))
         self._batch = Batch(loop.rate_hz)
+        self._axis, self._rest = axis_of(wish.signal, loop.axes), Rest()
         self._run = -1
 
     def rewished(self, wish: SpectrumWish, loop: Description) -> bool:
@@ -32,12 +34,15 @@ class Analyser:
         """Average anew."""
         self._batch.take()
         self._spectrum.reset()
+        self._rest.reset()
 
     def feed(self, stretch: Stretch) -> None:
         """Average what came, in the end; another run begins anew."""
         if stretch.run != self._run:
             self._run = stretch.run
             self.reset()
+        if self._axis is not None:
+            self._rest.feed(stretch[reference_of(self._axis)], stretch[MODE])
         self._average(self._batch.add(stretch))
 
     def frame(self) -> bytes:
@@ -56,6 +61,7 @@ class Analyser:
                 "averages_least": int(np.min(averages, initial=averages.max(initial=0))),
                 "averages_most": int(averages.max(initial=0)),
                 "bridged": self._spectrum.bridged,
+                "at_rest": self._axis is not None and self._rest.at_rest,
             },
             {"hz": density.hz, "amplitude": density.amplitude, "averages": averages},
         )

@@ -2,9 +2,56 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rtloop.law.reference import Generator
 from rtloop.recording.file.topics.events import Event
 from rtloop.values import counted
+
+OFF, RAW = "off", "raw"
+"""Modes, in words. A service whose configuration has no schedule begins with the outputs off."""
+
+
+class InForce:
+    """References and mode of a run, as its events so far leave them: an event is told with its before and after."""
+
+    def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
+        """`axes` are the configured ones, by name: their references play until events name others. `mode` is that of
+        the first tick, in words; None where it is not known.
+        """
+        self._references = {name: configured(axis.get("reference") or {}) for name, axis in axes.items()}
+        self._mode = mode
+
+    def change(self, event: Event) -> str:
+        """Words of the run's next event: `0 → 12.5 µm`, `closed loop → off`; those of `words` for other kinds."""
+        kind, text = event["kind"], words(event)
+        if kind == "set_reference":
+            return self._reference(event["axis"], text)
+        if kind == "set_mode":
+            before, self._mode = self._mode, text
+            if RAW in (before, text):
+                self._references.clear()  # the loop holds what was in force, which no event says
+            return f"{before} → {text}" if before not in (None, text) else text
+        if kind == "tripped":
+            self._mode = OFF
+        return text
+
+    def _reference(self, axis: str, text: str) -> str:
+        """The reference before, as far as it is known, and the one that takes over."""
+        before, self._references[axis] = self._references.get(axis), text
+        unit = "V" if self._mode == RAW else "µm"
+        return f"{before} → {text} {unit}" if before else f"{text} {unit}"
+
+
+def configured(reference: dict[str, Any]) -> str:
+    """Words of a reference as a configuration has it; empty for one of many samples or levels."""
+    match reference.get("kind", "hold"):
+        case "hold":
+            return _reference([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4])
+        case "sine" | "triangle" as kind:
+            values = [float(reference.get(key, 0.0)) for key in ("amplitude", "frequency_hz", "offset")]
+            return _reference([Generator[kind.upper()], *values, 0.0, 0.0])
+    return ""
 
 
 def words(event: Event) -> str:
@@ -16,7 +63,7 @@ def words(event: Event) -> str:
         case "set_mode":
             return what["mode"].replace("_", " ")
         case "load_law":
-            return "another controller" if what["values"][0] else "other numbers"
+            return what.get("change") or ("another controller" if what["values"][0] else "other numbers")
         case "tripped":
             return what["reason"] or ", ".join(what["causes"])
         case "periods_missed":

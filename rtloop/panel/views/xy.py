@@ -11,6 +11,7 @@ from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import PlayModel
+from rtloop.panel.rest import MODE, is_at_rest, reference_of
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.link import Description
 from rtloop.panel.views.past import BLOCK, Past
@@ -35,6 +36,7 @@ class Drawn:
         self._wish = wish
         self._ticks = max(round(wish.seconds * loop.rate_hz), 2)
         self._signals = [f"{wish.axis}_drive_v", f"{wish.axis}_position_um"]
+        self._rest = [reference_of(wish.axis), MODE]
         self._model = play_model(loop.axes[wish.axis])
         self._shown = (-1, 0)
         """Run and last tick of what was shown."""
@@ -46,12 +48,19 @@ class Drawn:
             return None
         self._shown = past.run, end
         drive, position = past.values(self._signals, first, end)
+        at_rest = is_at_rest(*past.values(self._rest, first, end))
         good = np.isfinite(drive) & np.isfinite(position)
         drive, position = drive[good], position[good]
         shown = extremes([drive, position], BINS)
-        header: dict[str, Any] = {"axis": self._wish.axis, "run": past.run, "end": end, "loop_percent": None}
+        header: dict[str, Any] = {
+            "axis": self._wish.axis,
+            "run": past.run,
+            "end": end,
+            "at_rest": at_rest,
+            "loop_percent": None,
+        }
         arrays = {"drive_v": drive[shown], "position_um": position[shown]}
-        if drive.size and np.ptp(drive) > 0:
+        if drive.size and np.ptp(drive) > 0 and not at_rest:
             percent = loop_shape(means(drive, SHAPE_BINS), means(position, SHAPE_BINS)).percent
             header["loop_percent"] = percent if np.isfinite(percent) else None
         if self._model is not None and drive.size:

@@ -180,11 +180,12 @@ def application(service: Service) -> Starlette:
             return refusal(error)
 
     async def get_asked_by(request: Request) -> Response:
-        """Of a command's identity, as its event has it."""
-        supervisor, identity = service.supervisor, request.query_params.get("identity", "")
+        """Name and change of a command's identity, as its event has it."""
+        supervisor, live, identity = service.supervisor, service.live, request.query_params.get("identity", "")
         if not (identity.isascii() and identity.isdigit() and len(identity) < 19):
             return refused(422, "identity: that of a command, a number, is needed")
-        return JSONResponse({"name": None if supervisor is None else supervisor.names.of(int(identity))})
+        name = None if supervisor is None else supervisor.names.of(int(identity))
+        return JSONResponse({"name": name, "change": None if live is None else live.change_of(int(identity))})
 
     async def get_metrics(_: Request) -> Response:
         return PlainTextResponse(metrics_text(service), media_type="text/plain; version=0.0.4")
@@ -272,7 +273,8 @@ def openapi() -> dict[str, Any]:
         "/status": {"get": {"summary": "State, rate, faults, newest signals."}},
         "/configuration": {"get": {"summary": "The configuration as it runs, with what was tuned since; what a record "
                                               "holds, and where shared block and recordings lie."}},
-        "/asked_by": {"get": {"summary": "Who asked for a command, by the `identity` of its event; null: no name."}},
+        "/asked_by": {"get": {"summary": "Who asked for a command, by the `identity` of its event, and the change that "
+                                         "it made of a law; null: unknown."}},
         "/metrics": {"get": {"summary": "Prometheus text."}},
     }  # fmt: skip
     answers = {"200": {"description": "done; a command's `tick` is when it took effect"},

@@ -19,9 +19,9 @@ def prepare_limited(configuration: Configuration) -> Prepared:
     return PROCESS.run(prepare, configuration, compiles=_compiles(configuration))
 
 
-def figures_limited(configuration: Configuration, number: int) -> Figures:
-    """What a configuration makes of axis `number`. Raises as `prepare_limited`."""
-    return PROCESS.run(_prepared_figures, configuration, number, compiles=_compiles(configuration))
+def figures_limited(configuration: Configuration, number: int, least_step_ms: float = 0.0) -> Figures:
+    """What a configuration makes of axis `number`, as `figures` does. Raises as `prepare_limited`."""
+    return PROCESS.run(_prepared_figures, configuration, number, least_step_ms, compiles=_compiles(configuration))
 
 
 def expect_changes() -> None:
@@ -38,8 +38,8 @@ def builder_ended() -> Iterator[None]:
         PROCESS.end()
 
 
-def _prepared_figures(configuration: Configuration, number: int) -> Figures:
-    return figures(prepare(configuration), number)
+def _prepared_figures(configuration: Configuration, number: int, least_step_ms: float) -> Figures:
+    return figures(prepare(configuration), number, least_step_ms)
 
 
 def _compiles(configuration: Configuration) -> bool:

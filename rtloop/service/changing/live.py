@@ -22,7 +22,8 @@ from rtloop.errors import ConfigError, RtloopError
 from rtloop.laws.limited.first import must_be_limited, try_first
 from rtloop.service.changing.building import figures_limited, prepare_limited
 from rtloop.service.changing.changes import Change, Changes
-from rtloop.service.changing.preview import Figures
+from rtloop.service.changing.differences import differences
+from rtloop.service.changing.preview import Figures, step_end_ms, with_longer_step
 from rtloop.service.changing.references import LiveReferences, axis_number, unsuitable
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Desk, Refused, Taken
@@ -63,6 +64,10 @@ class LiveLaw:
         """Raises ConfigError for a name that is no axis."""
         return axis_number(self.prepared, name)
 
+    def change_of(self, identity: int) -> str | None:
+        """The change that a command made, in words, by the `identity` of its event; None where it is not known."""
+        return self._staging.desk.change_of(identity)
+
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
         """Change keys of [axis.SECTION]; returns the tick. Raises ConfigError, Refused."""
         with self._building:
@@ -74,13 +79,17 @@ class LiveLaw:
             return self._change(*self._with_controller(self.axis_number(axis), controller, keep=False), "controller")
 
     def preview(self, axis: str, section: str, changes: Mapping[str, Any]) -> dict[str, Figures]:
-        """Figures of the loop as it is, and as `tune` would make it; changes nothing. Raises ConfigError, Refused."""
+        """Figures of the loop as it is, and as `tune` would make it, both with a step of one length; changes nothing.
+        Raises ConfigError, Refused.
+        """
         with self._building:
             number, configuration = self.axis_number(axis), self.prepared.configuration
             changed = self._configured(*self._tuned(axis, section, changes))
             if (known := self._figures.get(number)) is None or known[0] is not configuration:
                 known = self._figures[number] = configuration, figures_limited(configuration, number)
-            return {"before": known[1], "after": figures_limited(changed, number)}
+            after = figures_limited(changed, number, step_end_ms(known[1]))
+            before = with_longer_step(known[1], self.prepared.checks[number], step_end_ms(after))
+            return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
         """Go back to before the last change of an axis, or of the controller that it shares; the tick, and what that
@@ -130,7 +139,8 @@ class LiveLaw:
         """Make `offset_v` the reading at position 0; returns the tick."""
         with self._staging.lock:
             self.offsets_v[number] = offset_v
-            return self._stage(number, self.prepared, self.prepared.configuration.axes[number])
+            axis = self.prepared.configuration.axes[number]
+            return self._stage(number, self.prepared, axis, f"position 0 is now at {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Take over another configuration; what changed. Raises Refused where that needs a restart."""
@@ -211,8 +221,10 @@ class LiveLaw:
             raise Refused(OTHER_AXES)
         return changed
 
-    def _stage(self, number: int, prepared: Prepared, axis: AxisOptions) -> int:
+    def _stage(self, number: int, prepared: Prepared, axis: AxisOptions, change: str | None = None) -> int:
         """Copy coefficients to where the loop takes them from, have it take them; note `axis`. Raises Taken, too.
+
+        `change` says in words what changes; by default, the keys of `axis` that differ.
 
         Axes that share a controller are taken together, by the number of the first, where that one changes.
         """
@@ -229,8 +241,9 @@ class LiveLaw:
         staged = self._staging.block["staged"][begin : begin + coefficients.nbytes]
         staged[:] = np.frombuffer(coefficients.tobytes(), np.uint8)
         another = before.controller != after.controller
+        change = change or differences(self.prepared.configuration.axes[number], axis) or None
         try:
-            tick = self._staging.submit(Kind.LOAD_LAW, first, [float(another)])
+            tick = self._staging.submit(Kind.LOAD_LAW, first, [float(another)], change)
         except Taken:
             self._note(number, prepared, axis)
             raise

@@ -22,8 +22,9 @@ LEAST_STEP_PERIODS = 30
 Figures = dict[str, Any]
 
 
-def figures(prepared: Prepared, number: int) -> Figures:
-    """Of the loop of axis `number` as it will run on its model; null for what does not exist.
+def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figures:
+    """Of the loop of axis `number` as it will run on its model; null for what does not exist. Its step lasts for
+    `least_step_ms` at least.
 
     The shift of the resonance is looked for up to ∓50 %. `problems` are the axis's warnings, among them that the loop
     does not follow its reference.
@@ -49,7 +50,7 @@ def figures(prepared: Prepared, number: int) -> Figures:
         "settling_ms": 1e3 * running.settling_time_s,
         "static_error_percent": running.static_error_percent,
         "tolerated_shift_percent": _tolerated_shift_percent(check),
-        "step": _step(check, running),
+        "step": _step(check, running, 1e-3 * least_step_ms),
     }
     return {name: None if isinstance(one, float) and not math.isfinite(one) else one for name, one in found.items()}
 
@@ -63,12 +64,24 @@ def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
     return [-(resonance.down if down is None else down), resonance.up if up is None else up]
 
 
-def _step(check: AxisCheck, running: LoopAnalysis) -> dict[str, list[float]] | None:
+def step_end_ms(found: Figures) -> float:
+    """The last moment of the step in figures; 0 where they have none."""
+    return found["step"]["t_ms"][-1] if found["step"] else 0.0
+
+
+def with_longer_step(found: Figures, check: AxisCheck, end_ms: float) -> Figures:
+    """Figures of the axis of `check` whose step, where they have one, lasts until `end_ms` at least."""
+    if check.running is None or not 0 < step_end_ms(found) < end_ms:
+        return found
+    return found | {"step": _step(check, check.running, 1e-3 * end_ms)}
+
+
+def _step(check: AxisCheck, running: LoopAnalysis, least_s: float) -> dict[str, list[float]] | None:
     """Of 1 µm, at STEP_POINTS moments; None for a loop that does not settle."""
     loop = check.on_model
     if loop is None or loop.period_s is None or not math.isfinite(running.settling_time_s):
         return None
-    duration_s = max(STEP_SETTLINGS * running.settling_time_s, LEAST_STEP_PERIODS * loop.period_s)
+    duration_s = max(STEP_SETTLINGS * running.settling_time_s, LEAST_STEP_PERIODS * loop.period_s, least_s)
     response = step_response(loop, duration_s)
     time_s = np.linspace(0.0, duration_s, STEP_POINTS)
     position_um = np.interp(time_s, response.time_s, response.position)

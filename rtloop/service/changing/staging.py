@@ -27,10 +27,13 @@ class Staging:
             raise Refused("an earlier change has been taken by the loop, which stands still")
         self._unsettled_tick = None
 
-    def submit(self, kind: Kind, number: int, values: list[float]) -> int:
-        """Tell it what was staged for an axis; returns the tick. Raises Refused, and Taken where it may yet read it."""
+    def submit(self, kind: Kind, number: int, values: list[float], change: str | None = None) -> int:
+        """Tell it what was staged for an axis; returns the tick. Raises Refused, and Taken where it may yet read it.
+
+        `change` as in `Desk.submit`.
+        """
         try:
-            return self.desk.submit(kind, axis=number, values=values)
+            return self.desk.submit(kind, axis=number, values=values, change=change)
         except Taken:
             self._unsettled_tick = int(self.block["ticks_head"][0])
             raise

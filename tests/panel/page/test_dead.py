@@ -1,4 +1,4 @@
-"""What the page shows when the loop, and then its service, have died, and when they are back; a service of its own."""
+"""What the page shows when the loop, its service and its panel have died, and when the service is back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from rtloop.hil import board
-from rtloop.service.client import Client
 from tests.faults.bench import Bench
 from tests.panel.page.browser import chromium, opened, panel_of, running, said, stopped
 
@@ -35,7 +34,8 @@ def blank(page: Any, selector: str) -> None:
 
 
 def test_who_died_is_said_in_words_and_what_is_old_is_grey_and_locked(browser: Any, doomed: Bench) -> None:
-    page = opened(browser, panel_of(doomed)[0])
+    address, panel = panel_of(doomed)
+    page = opened(browser, address)
     running(page, doomed)
     doomed.ask_for(board.FROZEN_INPUT)
     said(page, "#alarm", "Tripped: x: frozen 2000 ticks")
@@ -71,16 +71,13 @@ def test_who_died_is_said_in_words_and_what_is_old_is_grey_and_locked(browser: A
     assert not page.evaluate("document.querySelector('#desk').inert")
     running(page, doomed)
     stopped(page)
+
+    panel.kill()
+    page.wait_for_selector("body.stale")
+    said(page, "#said", "No connection: .* Use the emergency stop")
+    said(page, "#age", "s old")
+    assert "what is shown is" in page.get_attribute("#scope-plot .veil", "data-says")
+    assert page.evaluate("getComputedStyle(document.querySelector('#scope-plot .uplot')).filter") != "none"
+    page.keyboard.press("Space")
+    said(page, "#stop-alarm", "STOP did not get through.*emergency stop")
     page.context.close()
-
-
-def test_a_loop_that_does_not_control_is_not_shown_as_running(page: Any, bench: Bench) -> None:
-    running(page, bench)
-    driver = Client(bench.client.path, "ada")
-    driver.post("/tune", {"axis": "x", "section": "limits", "values": {"settled_within_um": 1e-4}})
-    said(page, "#state-word", "x not settled")
-    assert page.get_attribute("#state", "data-state") == "uncontrolled"
-    assert page.title().startswith("!")
-    driver.post("/tune", {"axis": "x", "section": "limits", "values": {"settled_within_um": None}})
-    said(page, "#state-word", "^running$")
-    page.click("#release")

@@ -1,35 +1,81 @@
-"""The page on screens of all sizes, in both themes, for people who see or use it otherwise."""
+"""The page on screens of all sizes, in both themes, for people who see or use it otherwise, and for strangers.
+
+Pages of other origins, and a page without the token, neither see nor move anything.
+"""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import AXE, running, said, stopped
+from tests.panel.page.browser import AXE, opened, running, said, stopped
 
 MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings")
-RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
+TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
+
+ATTACKS = """async (panel) => {
+  const tried = {};
+  const post = (name, path, options) => fetch(panel + path, {method: "POST", credentials: "include", ...options})
+    .then((answer) => (tried[name] = answer.type + answer.status), (error) => (tried[name] = "failed"));
+  const body = JSON.stringify({axis: "x", value: 30});
+  await post("json", "/api/setpoint?as=ada", {body, headers: {"Content-Type": "application/json"}});
+  await post("plain", "/api/setpoint?as=ada", {body, mode: "no-cors", headers: {"Content-Type": "text/plain"}});
+  await post("stop", "/api/stop", {mode: "no-cors", body: "{}"});
+  await post("mode", "/api/mode?as=ada", {mode: "no-cors", body: '{"mode": "off"}'});
+  tried.read = await fetch(panel + "/api/status", {credentials: "include"}).then((a) => a.text(), () => "failed");
+  tried.socket = await new Promise((resolve) => {
+    const socket = new WebSocket(panel.replace("http", "ws") + "/live");
+    socket.onopen = () => resolve("open");
+    socket.onerror = () => resolve("failed");
+  });
+  const form = document.createElement("form");
+  Object.assign(form, {method: "post", action: panel + "/api/stop", target: "in"});
+  const frame = Object.assign(document.createElement("iframe"), {name: "in"});
+  document.body.append(frame, form);
+  form.submit();
+  await new Promise((resolve) => setTimeout(resolve, 500));
+  return tried;
+}"""
+
+
+class Page(BaseHTTPRequestHandler):
+    """An empty one."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<!doctype html><title>elsewhere</title><body></body>")
+
+    def log_message(self, format: str, *_: Any) -> None:
+        """Nothing."""
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_violation_in_any_view(shown: Any, scheme: str) -> None:
+    """The dark theme differs from the light one in its colours alone."""
     if not AXE.exists():
         pytest.skip(f"{AXE} is not there: make browser")
     page = shown
     page.emulate_media(color_scheme=scheme)
     page.wait_for_selector(f"html[data-theme={scheme}]", state="attached")
     page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
-    check = "async (tags) => (await axe.run({runOnly: {type: 'tag', values: tags}})).violations"
+    rules = {"type": "tag", "values": TAGS} if scheme == "light" else {"type": "rule", "values": ["color-contrast"]}
+    check = "async (rules) => (await axe.run({runOnly: rules})).violations"
     for view in (*VIEWS, "help"):
         page.keyboard.press("Escape")
         page.keyboard.press(str(VIEWS.index(view) + 1) if view in VIEWS else "?")
         if view == "scope":
             page.keyboard.press("m")
         drawn(page)
-        found = page.evaluate(check, RULES)
+        found = page.evaluate(check, rules)
         assert [(view, one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
 
 
@@ -56,6 +102,10 @@ def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(shown: Any, width:
                 return within && !!there.closest("#stop")}"""
             )
             assert seen, (view, scrolled)
+            top, bottom = page.evaluate(
+                "(({top, bottom}) => [top, bottom])(document.querySelector('#state').getBoundingClientRect())"
+            )
+            assert 0 <= top < bottom <= 100, "the state stays in view"
     page.click("#theme")
     assert page.get_attribute("html", "data-theme") != scheme
     page.click("#theme")
@@ -84,3 +134,55 @@ def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any, bench: Bench) 
 def drawn(page: Any) -> None:
     """Wait until what was asked for is on the screen: in the second frame from now."""
     page.evaluate("() => new Promise((seen) => requestAnimationFrame(() => requestAnimationFrame(seen)))")
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> Iterator[str]:
+    """A second origin of the same host: to a browser the same site, whose cookies it sends along."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Page)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}/"
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench, address: str, elsewhere: str) -> None:
+    running(page, bench)
+    page.fill("#setpoint", "12.5")
+    page.keyboard.press("Enter")
+    said(page, "#digits", "12.500")
+    stranger = page.context.new_page()  # with the session's cookie
+    stranger.goto(elsewhere)
+    parts = urlsplit(address)
+    tried = stranger.evaluate(ATTACKS, f"{parts.scheme}://{parts.netloc}")
+    assert tried["json"] == tried["read"] == tried["socket"] == "failed"
+    status = bench.status()
+    assert status["state"] == "running"
+    assert status["mode"] == "closed_loop"
+    assert status["axes"]["x"]["reference_um"] == 12.5
+    stranger.close()
+    page.keyboard.press("Escape")
+    page.keyboard.press("Space")
+    said(page, "#state-word", "stopped")
+    page.click("#release")
+
+
+def test_the_token_leaves_the_address_and_without_it_there_is_a_form(browser: Any, address: str) -> None:
+    page = opened(browser, address)
+    assert "token" not in page.url
+    assert "#" not in page.url
+    page.reload()
+    page.wait_for_selector("body:not(.stale)")
+    bare, token = address.split("#token=")
+    stranger = browser.new_context().new_page()
+    stranger.goto(bare)
+    stranger.wait_for_selector("#token-dialog[open]")
+    stranger.fill("#token", "not-it")
+    stranger.keyboard.press("Enter")
+    said(stranger, "#token-error", "not the token")
+    stranger.fill("#token", token)
+    stranger.keyboard.press("Enter")
+    stranger.wait_for_selector("body:not(.stale)")
+    assert "rtloop" not in stranger.evaluate("document.cookie")
+    stranger.context.close()
+    page.context.close()

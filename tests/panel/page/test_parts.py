@@ -2,80 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import threading
-from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 
-import pytest
-
-from rtloop.panel.web.application import PAGE
-from tests.panel.page.browser import PATIENCE_S
-
-SET_UP = """async () => {
-  const names = ["scope/scope", "views/xy", "palette"];
-  names.push(...["reference", "drive", "events", "configuration"].map((name) => `desk/${name}`));
-  const parts = await Promise.all(names.map((name) => import(`/page/${name}.js`)));
-  const {Scope, Reference, Drive, showEvents, Configuration, Xy, themes} = Object.assign({}, ...parts);
-  const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
-  const units = {x_position_um: "µm", x_reference_um: "µm", x_drive_v: "V", tick: "1", y_drive_v: "V"};
-  const columns = Object.entries(units).map(([name, unit]) => ({name, unit}));
-  const defaults = {limits: {command_um: 30}, interlocks: {}};
-  const panel = {axes: ["x", "y"], longest_s: 60, rate_hz: 1000, columns, defaults};
-  const arrays = {offset: Float32Array.from({length: 200}, (_, tick) => tick - 40)};
-  for (const {name} of columns) {
-    arrays[`${name}:low`] = arrays[`${name}:high`] = arrays.offset.map((tick) => 12 + Math.sin(tick / 9));
-  }
-  themes(document.getElementById("theme"), () => {});
-  window.tell = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
-  window.sweep = (more) => tell("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
-    uncertain_ticks: 0, number: 3, complete: true, rate_hz: 1000, arrays, ...more});
-  window.state = (more) => tell("state", {state: "stopped", mode: "off", tick: 7, unix_s: 1000, axes: {},
-    lock: {name: "ada", until_unix_s: 1042}, ...more});
-  window.asked = [];
-  const answering = {driving: async (_, {value}) => (asked.push(value), {tick: 100})};
-  window.scope = new Scope(live, panel);
-  window.drive = new Drive(live, {tell() {}});
-  window.configuration = new Configuration(panel);
-  window.reference = new Reference(live, panel, configuration, answering, () => {});
-  window.xy = new Xy(live, panel);
-  showEvents(live);
-}"""
-
-Y = {"name": "y", "limits": {"command_um": 25, "drive_min_v": 0}}
-
-
-@pytest.fixture(scope="module")
-def parts(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """The page's elements and its parts, with nobody behind them."""
-    folder: Path = tmp_path_factory.mktemp("parts")
-    (folder / "page").symlink_to(PAGE)
-    (folder / "api").mkdir()
-    (folder / "api" / "configuration").write_text(json.dumps({"values": {"axis": [{"name": "x"}, Y]}}))
-    scriptless = (PAGE / "index.html").read_text(encoding="utf-8").replace('src="/page/main.js"', "")
-    (folder / "index.html").write_text(scriptless, encoding="utf-8")
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(folder)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    page = browser.new_page()
-    page.set_default_timeout(1000 * PATIENCE_S)
-    page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
-    page.evaluate(SET_UP)
-    yield page
-    page.close()
-    server.shutdown()
-    server.server_close()
-
-
-def choose(parts: Any, picker: str, text: str) -> None:
-    parts.click(f"#{picker} button")
-    parts.click(f"#{picker}-list li:text-is('{text}')")
-
-
-def says(parts: Any, selector: str, text: str) -> None:
-    parts.wait_for_function("([at, text]) => document.querySelector(at).textContent === text", arg=[selector, text])
+from tests.panel.page.parts import choose, says
 
 
 def test_whoever_holds_arm_does_not_start_what_somebody_else_armed(parts: Any) -> None:
@@ -101,10 +30,10 @@ def test_jogs_go_on_from_what_was_asked_for_until_it_is_seen(parts: Any) -> None
 
 
 def test_an_event_that_is_told_again_is_shown_once(parts: Any) -> None:
-    event = "{tick: 5, kind: 'set_mode', who: 'ada', axis: null, what: {text: 'off'}}"
+    event = "{tick: 5, kind: 'set_mode', who: 'ada', axis: null, what: {mode: 'off', text: 'closed loop → off'}}"
     for _ in range(2):
         parts.evaluate(f"tell('events', {{events: [{event}]}})")
-    assert parts.locator("#events li").all_inner_texts() == ["5\nada\nset mode · off"]
+    assert parts.locator("#events li").all_inner_texts() == ["5\nada\nstopped · closed loop → off"]
 
 
 def test_late_ticks_are_one_row_that_grows(parts: Any) -> None:
@@ -132,7 +61,7 @@ def test_another_axis_is_not_sent_the_setpoint_of_this_one(parts: Any) -> None:
     parts.evaluate("state({axes: {x: {reference_um: 5}, y: {reference_um: -2}}})")
     parts.fill("#setpoint", "20")
     choose(parts, "desk-axis", "axis y")
-    assert parts.input_value("#setpoint") == "-2.00"
+    assert parts.input_value("#setpoint") == "-2.000"
     choose(parts, "desk-axis", "axis x")
 
 

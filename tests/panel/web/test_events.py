@@ -11,9 +11,10 @@ import numpy as np
 from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.errors import UnavailableError
 from rtloop.panel.views.events import KEPT, Events
+from rtloop.signals import Mode
 
 KINDS = {"m": Kind.PERIODS_MISSED, "o": Kind.LATENESS_OVER, "t": Kind.TRIPPED}
-LOOP: Any = SimpleNamespace(rate_hz=1000.0, axes={"x": {}})
+LOOP: Any = SimpleNamespace(rate_hz=1000.0, axes={"x": {}}, values={})
 
 
 def test_a_silent_service_is_asked_for_one_name_and_for_the_others_when_it_answers() -> None:
@@ -79,3 +80,28 @@ def test_late_ticks_push_off_no_trip() -> None:
         events.take(late("m3 o9,2,6", tick), LOOP, 0)
     assert [event["kind"] for _, event in events.after(0)] == ["tripped", "periods_missed"]
     assert events.after(0)[-1][1]["what"]["late_ticks"] == 2 * KEPT
+
+
+def test_a_stop_says_who_stopped_and_a_change_of_a_law_which_keys() -> None:
+    """As the service answers, at once or after it was silent; a run without a schedule begins with the outputs off."""
+    silent = [False]
+
+    def exchange(_: str, resource: str, *__: object) -> tuple[int, str, bytes]:
+        if silent[0]:
+            raise UnavailableError("no answer")
+        change = '"controller.gain 0.016 → 0.012"' if resource.endswith("=3") else "null"
+        return 200, "application/json", f'{{"name": "bob", "change": {change}}}'.encode()
+
+    messages = np.zeros(3, MESSAGE)
+    messages["kind"] = Kind.SET_MODE, Kind.SET_MODE, Kind.LOAD_LAW
+    messages["origin"], messages["identity"] = Origin.OPERATOR, (1, 2, 3)
+    messages["values"][:, 0] = Mode.CLOSED_LOOP, Mode.OFF, 0.0
+    service: Any = SimpleNamespace(client=SimpleNamespace(exchange=exchange, path=Path("none")))
+    for silent[0] in (False, True):
+        events = Events(service)
+        events.take(messages, LOOP, 0)
+        silent[0] = False
+        events.take(messages[:0], LOOP, 0)
+        told = [(event["who"], event["what"]["text"]) for _, event in events.after(0)]
+        texts = ["off → closed loop", "closed loop → off", "controller.gain 0.016 → 0.012"]
+        assert told == [("bob", text) for text in texts]

@@ -8,21 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtloop.panel.rest import axis_of, is_at_rest
 from rtloop.panel.stretch import DEADLINE_NS, Stretch
 from rtloop.panel.views.spectra import Analyser
 from rtloop.panel.views.wishes import wish_of
 from tests.panel.web.browser import unpacked
 
 RATE_HZ = 1000.0
-LOOP: Any = SimpleNamespace(rate_hz=RATE_HZ, unit=lambda _: "V")
+LOOP: Any = SimpleNamespace(rate_hz=RATE_HZ, unit=lambda _: "V", axes={"x": {}})
+NAMES = (DEADLINE_NS, "x_drive_v", "x_reference_um", "mode")
 
 
-def fed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 0) -> int:
-    """In stretches of some ticks, as they are read; the tick behind them."""
+def fed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 0, reference: Any = 0.0) -> int:
+    """In stretches of some ticks, as they are read, in closed loop; the tick behind them."""
+    rows = np.column_stack([np.zeros(volts.size), volts, np.broadcast_to(reference, volts.size), 3.0 + 0 * volts])
+    rows[:, 0] = (first + np.arange(volts.size)) * 1e9 / RATE_HZ
     for start in range(0, volts.size, 17):
-        part = volts[start : start + 17]
-        deadline_ns = (first + start + np.arange(part.size)) * 1e9 / RATE_HZ
-        analyser.feed(Stretch((DEADLINE_NS, "x_drive_v"), first + start, np.column_stack([deadline_ns, part]), 0, run))
+        analyser.feed(Stretch(NAMES, first + start, rows[start : start + 17], 0, run))
     return first + volts.size
 
 
@@ -38,3 +40,31 @@ def test_what_came_before_is_gone_and_what_came_since_is_there(anew: str) -> Non
     assert header["averages_most"] == 7, "all of the 4096 samples, in halves of 1024 but for the first"
     assert header["rms"] == pytest.approx(1.0, rel=0.01)
     assert arrays["hz"][np.argmax(arrays["amplitude"])] == pytest.approx(100.0, abs=0.5)
+
+
+def test_the_spectrum_of_an_axis_at_rest_is_called_noise_until_its_reference_moves() -> None:
+    analyser = Analyser(wish_of("spectrum", {"signal": "x_drive_v"}), LOOP)
+    said = lambda: unpacked(analyser.frame())[0]["at_rest"]
+    tick = fed(analyser, np.zeros(170), 0, reference=5.0)
+    assert said()
+    tick = fed(analyser, np.zeros(170), tick, reference=5.001)  # the step lies between two stretches
+    assert not said()
+    analyser.reset()
+    tick = fed(analyser, np.zeros(170), tick, reference=5.001)
+    assert said()
+    fed(analyser, np.zeros(170), tick, reference=np.arange(170.0))
+    assert not said()
+
+
+@pytest.mark.parametrize(
+    ("reference", "mode", "at_rest"),
+    [((1.0, 1.0), (3, 3), True), ((1.0, 2.0), (3, 3), False), ((1.0, 2.0), (0, 0), True), ((1.0, 1.0), (0, 3), False),
+     ((1.0, np.nan), (3, 3), True)],
+)  # fmt: skip
+def test_an_axis_is_at_rest_where_nothing_moves_it(reference: Any, mode: Any, at_rest: bool) -> None:
+    assert is_at_rest(np.array(reference), np.array(mode, dtype=float)) == at_rest
+
+
+def test_a_signal_belongs_to_the_axis_with_the_longest_name_that_fits() -> None:
+    assert axis_of("x_fine_drive_v", ["x", "x_fine"]) == "x_fine"
+    assert axis_of("tick", ["x", "x_fine"]) is None

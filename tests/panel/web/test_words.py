@@ -7,7 +7,7 @@ import pytest
 
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.reference import Generator
-from rtloop.panel.views.words import words
+from rtloop.panel.views.words import InForce, words
 from rtloop.recording.file.topics.events import event_of
 from rtloop.signals import Flag, Mode
 
@@ -35,3 +35,47 @@ def test_what_an_event_is_about(kind: Kind, values: tuple[float, ...], said: str
     record["kind"] = kind
     record["values"][: len(values)] = values
     assert words(event_of(record, ["x"], 0)) == said  # type: ignore[arg-type]
+
+
+def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list[str]:
+    """Words of the events of a run that begins with a configured reference of x."""
+    in_force = InForce({"x": {"reference": configured}})
+    records = np.zeros(len(messages), MESSAGE)
+    for record, (kind, values) in zip(records, messages, strict=True):
+        record["kind"] = kind
+        record["values"][: len(values)] = values
+    return [in_force.change(event_of(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
+
+
+def test_a_change_names_its_before_and_its_after() -> None:
+    sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
+    set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
+    mode = lambda mode: (Kind.SET_MODE, (mode,))
+    assert changes(sine, mode(Mode.CLOSED_LOOP), set_to(12.5), set_to(-3.0), mode(Mode.OFF)) == [
+        "closed loop",
+        "sine of 8 at 5 Hz about 20 → 12.5 µm",
+        "12.5 → -3 µm",
+        "closed loop → off",
+    ]
+    trip = (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)))
+    assert changes({}, set_to(1.0), mode(Mode.CLOSED_LOOP), trip, mode(Mode.CLOSED_LOOP))[::3] == [
+        "0 → 1 µm",
+        "off → closed loop",
+    ]
+
+
+def test_a_reference_in_volts_is_told_in_volts_and_none_is_told_that_nobody_knows() -> None:
+    """Into and out of mode raw the loop holds the value in force, which no event says."""
+    set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
+    raw, closed = (Kind.SET_MODE, (Mode.RAW,)), (Kind.SET_MODE, (Mode.CLOSED_LOOP,))
+    assert changes({}, raw, set_to(2.0), set_to(3.0), closed, set_to(1.0)) == [
+        "raw", "2 V", "2 → 3 V", "raw → closed loop", "1 µm",
+    ]  # fmt: skip
+
+
+def test_a_change_of_a_law_is_told_as_the_service_told_it() -> None:
+    record = np.zeros((), MESSAGE)
+    record["kind"] = Kind.LOAD_LAW
+    event = event_of(record, ["x"], 0)  # type: ignore[arg-type]
+    event["what"]["change"] = "controller.gain 0.016 → 0.012"
+    assert words(event) == "controller.gain 0.016 → 0.012"

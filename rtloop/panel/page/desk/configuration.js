@@ -1,6 +1,7 @@
 // What the axes are configured for as they run, with what was tuned since: whoever shows it hears "read".
 
 import { get } from "../api.js";
+import { suitStroke } from "../numbers.js";
 
 export class Configuration extends EventTarget {
   #defaults;
@@ -16,6 +17,7 @@ export class Configuration extends EventTarget {
   async read() {
     const { values } = await get("/api/configuration");
     this.#axes = values.axis;
+    suitStroke(Math.min(...this.#axes.map(({ name }) => this.limits(name).stroke_um)));
     this.dispatchEvent(new Event("read"));
   }
 
@@ -26,10 +28,21 @@ export class Configuration extends EventTarget {
     return { ...this.#defaults[section], ...(own ?? (shared || {})) };
   }
 
-  /** In µm up and down, and in V. */
+  /** In µm up and down, in V, and the stroke in µm between them: that of the feedforward's model where it is shorter. */
   limits(name) {
     const { drive_v = 10, drive_min_v, command_um = 40 } = this.section(name, "limits");
     const { position_um = 40 } = this.section(name, "interlocks");
-    return { most_um: Math.min(command_um, position_um), lowest_v: drive_min_v ?? -drive_v, highest_v: drive_v };
+    const [lowest_v, highest_v] = [drive_min_v ?? -drive_v, drive_v];
+    const ends_um = [lowest_v, highest_v].map((volts) => this.#position(name, volts));
+    const most_um = Math.min(command_um, position_um, Math.max(...ends_um.map(Math.abs)) || Infinity);
+    const stroke_um = Math.min(2 * most_um, Math.abs(ends_um[1] - ends_um[0]) || Infinity);
+    return { most_um, lowest_v, highest_v, stroke_um };
+  }
+
+  /** The position in µm at which the feedforward's plays hold the actuator, from rest, at a drive; 0 without plays. */
+  #position(name, volts) {
+    const { weights_um_per_v = [], thresholds_v = [] } = this.section(name, "feedforward");
+    const pull = (weight, play) => weight * Math.max(Math.abs(volts) - (thresholds_v[play] ?? 0), 0);
+    return Math.sign(volts) * weights_um_per_v.reduce((sum, weight, play) => sum + pull(weight, play), 0);
   }
 }

@@ -1,7 +1,7 @@
 // The axes in large digits, as many times a second as an eye can follow.
 
 import { $, make, reducedMotion, say } from "../dom.js";
-import { fixed } from "../numbers.js";
+import { fixed, quantity } from "../numbers.js";
 
 const EVERY_MS = 150;
 
@@ -34,9 +34,9 @@ export function showDigits(live, panel, configuration) {
     for (const { axis, large, reference, unit, error, drive, fill } of shown) {
       const values = detail.axes[axis] ?? {};
       say(unit, raw ? "V" : "µm");
-      say(large, fixed(values.position_um, 3));
-      say(reference, fixed(values.reference_um, 3));
-      say(error, raw ? "—" : fixed(values.error_um, 3));
+      say(large, quantity(values.position_um, "µm"));
+      say(reference, raw ? fixed(values.reference_um, 3) : quantity(values.reference_um, "µm"));
+      say(error, raw ? "—" : quantity(values.error_um, "µm"));
       say(drive, fixed(values.drive_v, 3));
       const { lowest_v, highest_v } = configuration.limits(axis);
       const place = (volts) => Math.min(Math.max(((volts - lowest_v) / (highest_v - lowest_v)) * 100, 0), 100);

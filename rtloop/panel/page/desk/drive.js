@@ -91,6 +91,7 @@ export class Drive {
     $("reset").disabled = state !== "tripped";
     if (mode) this.#mode.value = mode;
     this.#mode.disabled = !["armed", "running"].includes(state);
+    $("drives").dataset.by = !lock ? "nobody" : lock.name === who.name ? "me" : "other";
     if (!lock) return say($("drives"), "Nobody drives. The first command takes the lock; stop works for everybody.");
     const left_s = Math.max(0, Math.round(lock.until_unix_s - unix_s));
     const mine = lock.name === who.name;

@@ -1,4 +1,4 @@
-// What happened, newest first: commands, changes of mode, trips, each with its tick and who asked for it.
+// Events, newest first: commands, changes of mode, trips, each with its tick, its author, its before and after.
 
 import { $, make } from "../dom.js";
 import { counted } from "../numbers.js";
@@ -6,13 +6,14 @@ import { counted } from "../numbers.js";
 const MOST = 200;
 const LATE = "periods_missed";
 /** Late ticks without anything else between them: one row, told again as it grows. */
-const CALLED = { [LATE]: "", load_law: "tuned" };
+const CALLED = { [LATE]: "", load_law: "tuned", set_reference: "reference", set_mode: "mode", reset_trip: "reset" };
 
 const keyOf = (event) => (event.kind === LATE ? `${event.run} ${event.tick}` : JSON.stringify({ ...event, who: null }));
 
 function rowOf({ tick, kind, who, axis, what }) {
   const tripped = kind === "tripped"; // its words begin with the axis
-  const text = [!tripped && axis, CALLED[kind] ?? String(kind).replaceAll("_", " "), what?.text].filter(Boolean).join(" · ");
+  const called = kind === "set_mode" && what?.mode === "off" ? "stopped" : CALLED[kind] ?? String(kind).replaceAll("_", " ");
+  const text = [!tripped && axis, called, what?.text].filter(Boolean).join(" · ");
   return make("li", { class: tripped && "trip", title: text }, make("span", {}, counted(tick)), make("span", {}, who ?? ""), text);
 }
 

@@ -1,8 +1,9 @@
 // The reference of an axis: a setpoint, a jog, a generator, a waveform from a file.
 
-import { $, complain, make } from "../dom.js";
-import { fixed, fromField, parseNumber } from "../numbers.js";
+import { $, complain, make, say } from "../dom.js";
+import { DECIMALS, fixed, fromField, parseNumber, significant } from "../numbers.js";
 import { Picker } from "../picker.js";
+import { jogSteps } from "./steps.js";
 
 const KINDS = {
   sine: { amplitude: ["amplitude, UNIT", "5"], frequency_hz: ["frequency, Hz", "1"], offset: ["offset, UNIT", "0"], phase_deg: ["phase, °", "0"] },
@@ -10,7 +11,8 @@ const KINDS = {
   steps: { levels: ["levels, UNIT (blanks or ; between)", "10; 0; -10; 0"], dwell_s: ["each held, s", "0.2"] },
   chirp: { amplitude: ["amplitude, UNIT", "1"], start_hz: ["from, Hz", "1"], end_hz: ["to, Hz", "100"], duration_s: ["within, s", "10"], offset: ["offset, UNIT", "0"] },
 };
-const JOGS = [0.01, 0.1, 1, 5, 10];
+const UP = { ArrowUp: 1, ArrowRight: 1, ArrowDown: -1, ArrowLeft: -1 };
+const LEAPS = ["PageUp", "PageDown", "Home", "End"];
 
 /** Numbers with blanks, semicolons or lines between them. */
 const numbers = (text, what) => text.split(/[\s;]+/).filter(Boolean).map((part) => parseNumber(part.replace(/,$/, ""), what));
@@ -53,15 +55,14 @@ export class Reference {
     this.#axis.options = panel.axes.map((value) => ({ value, text: `axis ${value}` }));
     $("desk-axis").hidden = panel.axes.length < 2;
     this.#jog = new Picker($("jog-step"));
-    this.#jog.value = 1;
     this.#kind = new Picker($("generator-kind"), () => {
       this.#typed = {};
       this.#arrange();
     });
     this.#kind.options = Object.keys(KINDS).map((value) => ({ value, text: value }));
     this.#limit();
-    $("setpoint-slider").addEventListener("input", () => ($("setpoint").value = $("setpoint-slider").value));
-    $("setpoint-slider").addEventListener("change", () => this.set(Number($("setpoint-slider").value)));
+    $("setpoint-slider").addEventListener("input", () => this.#stage(Number($("setpoint-slider").value)));
+    $("setpoint-slider").addEventListener("keydown", (event) => this.#slide(event));
     const submitted = (id, action, place) => $(id).addEventListener("submit", (event) => {
       event.preventDefault();
       this.#try(action, $(place));
@@ -88,14 +89,36 @@ export class Reference {
 
   /** Show what the axis is at: what was typed for another one is not to be sent to this one. */
   #start() {
-    $("setpoint").value = $("setpoint-slider").value = (this.#now[this.axis]?.reference_um ?? 0).toFixed(2);
+    $("setpoint").value = $("setpoint-slider").value = (this.#now[this.axis]?.reference_um ?? 0).toFixed(this.#decimals);
+    say($("setpoint-staged"), "");
     complain($("setpoint-error"), null);
+  }
+
+  get #decimals() {
+    return DECIMALS[this.#unit];
+  }
+
+  /** Show a setpoint that Enter, or Set, is to apply. */
+  #stage(value) {
+    $("setpoint").value = $("setpoint-slider").value = value.toFixed(this.#decimals);
+    say($("setpoint-staged"), `${fixed(value, this.#decimals)} ${this.#unit} is not applied yet: Enter or Set applies it.`);
+  }
+
+  /** Keys on the slider: an arrow moves it by one step of the jog, Enter applies, and no key crosses the stroke. */
+  #slide(event) {
+    const { key } = event;
+    const slider = $("setpoint-slider");
+    if (key === "Enter" && !event.repeat) $("setpoint-form").requestSubmit();
+    else if (key in UP) this.#stage(Math.min(Math.max(Number(slider.value) + UP[key] * this.#jog.value, Number(slider.min)), Number(slider.max)));
+    else if (!LEAPS.includes(key)) return;
+    event.preventDefault();
   }
 
   /** Hold a value, in µm, in V in raw mode. */
   async set(value) {
     $("setpoint").value = String(value);
     $("setpoint-slider").value = String(value);
+    say($("setpoint-staged"), "");
     const asked = (this.#asked = { axis: this.axis, value, tick: Infinity });
     asked.tick = (await this.#drive.driving("setpoint", { axis: this.axis, value }, $("setpoint-error")))?.tick ?? -1;
   }
@@ -105,7 +128,7 @@ export class Reference {
     const { axis, value, tick } = this.#asked;
     const from = axis === this.axis && tick > this.#tick ? value : this.#now[this.axis]?.reference_um;
     if (!Number.isFinite(from)) return complain($("setpoint-error"), "jog: there is no reference yet to go on from");
-    return this.set(Number((from + sign * this.#jog.value).toFixed(6)));
+    return this.set(Number((from + sign * this.#jog.value).toFixed(9)));
   }
 
   async #try(action, place) {
@@ -117,12 +140,15 @@ export class Reference {
   }
 
   #limit() {
-    const { most_um, lowest_v, highest_v } = this.#configuration.limits(this.axis);
+    const { most_um, lowest_v, highest_v, stroke_um } = this.#configuration.limits(this.axis);
     const raw = this.#mode === "raw";
-    Object.assign($("setpoint-slider"), raw ? { min: lowest_v, max: highest_v, step: 0.001 } : { min: -most_um, max: most_um, step: 0.01 });
     this.#unit = raw ? "V" : "µm";
+    Object.assign($("setpoint-slider"), { min: raw ? lowest_v : -most_um, max: raw ? highest_v : most_um, step: 10 ** -this.#decimals });
     $("setpoint-form").querySelector(".unit").textContent = this.#unit;
-    this.#jog.options = JOGS.map((value) => ({ value, text: `${value} ${this.#unit}` }));
+    const { sizes, first } = jogSteps(raw ? highest_v - lowest_v : stroke_um);
+    const before = this.#jog.value;
+    this.#jog.options = sizes.map((value) => ({ value, text: `${significant(value, 1)} ${this.#unit}` }));
+    this.#jog.value = sizes.includes(before) ? before : first;
     this.#arrange();
   }
 

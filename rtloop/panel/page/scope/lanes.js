@@ -2,9 +2,9 @@
 
 import { Chart, roundLimits } from "../chart.js";
 import { make } from "../dom.js";
+import { leastSpan } from "../numbers.js";
 import { paintTrace } from "./paint.js";
 
-const LEAST = { "µm": 0.02, V: 0.02, "µs": 2 };
 
 export class Lanes {
   #host;
@@ -80,7 +80,7 @@ export class Lanes {
         if (autoscale || !this.#limits.has(id)) {
           const names = lane.traces.filter((trace) => trace.unit === unit).map(({ name }) => name);
           const [low, high] = extent(sweeps, names);
-          this.#limits.set(id, roundLimits(low, high, this.#limits.get(id), LEAST[unit] ?? 0.5));
+          this.#limits.set(id, roundLimits(low, high, this.#limits.get(id), leastSpan(unit)));
         }
         lane.chart.setRange(unit, ...this.#limits.get(id));
       }

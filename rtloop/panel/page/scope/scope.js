@@ -8,6 +8,7 @@ import { Lanes } from "./lanes.js";
 import { Markers } from "./markers.js";
 import { showScales } from "./scales.js";
 import { remember, remembered } from "./settings.js";
+import { SuitedTrigger } from "./suited.js";
 import { Trigger } from "./trigger.js";
 
 const MOST_TRACES = 8;
@@ -39,6 +40,7 @@ export class Scope {
       this.#armed = true;
       this.#asked();
     });
+    new SuitedTrigger(live, panel, this.#view, this.trigger);
     this.#add = new Picker($("add-trace"), (name) => this.#traces([...this.#view.signals, name]));
     this.#markers = new Markers(this.#lanes, () => this.#later(), (level) => this.trigger.setLevel(level));
     this.#overlays = new Picker($("overlay"), (count) => this.#keep({ overlay: count }));

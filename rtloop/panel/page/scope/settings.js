@@ -8,6 +8,7 @@ const fresh = (axis) => ({
   stacked: false,
   autoscale: true,
   overlay: 0,
+  suited: true,
   trigger: {
     mode: "auto", kind: "step", source: `${axis}_reference_um`, level: 0, slope: "rising", hysteresis: 0,
     low: -1, high: 1, threshold: 0.1, holdoff_s: 0, pre_percent: 20,

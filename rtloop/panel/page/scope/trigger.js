@@ -3,6 +3,7 @@
 import { $, complain } from "../dom.js";
 import { duration, fromField, significant } from "../numbers.js";
 import { Picker } from "../picker.js";
+import { isSuited } from "./suited.js";
 
 const KINDS = [
   { value: "edge", text: "edge" }, { value: "window", text: "window left" }, { value: "step", text: "step" },
@@ -11,6 +12,7 @@ const KINDS = [
 ];
 const SLOPES = ["rising", "falling", "either"].map((value) => ({ value, text: value }));
 const NUMBERS = { level: "level", hysteresis: "hysteresis", low: "low", high: "high", threshold: "threshold", holdoff: "holdoff_s", pre: "pre_percent" };
+const SUITED = ["kind", "source", "slope", "level", "hysteresis", "low", "high", "threshold"];
 const TIMES_S = [];
 for (let power = -3; power <= 1; power++) for (const step of [1, 2, 5]) TIMES_S.push(Number(`${step}e${power}`));
 TIMES_S.push(60);
@@ -42,10 +44,13 @@ export class Trigger {
     this.seconds.value = settings.seconds;
     $("shorter").addEventListener("click", () => this.turn(-1));
     $("longer").addEventListener("click", () => this.turn(1));
-    for (const [id, key] of Object.entries(NUMBERS)) {
-      $(id).value = significant(settings.trigger[key], 6).replace(/\.?0+$/, "").replace("−", "-") || "0";
-      $(id).addEventListener("change", () => this.#read(id, key));
-    }
+    for (const [id, key] of Object.entries(NUMBERS)) $(id).addEventListener("change", () => this.#read(id, key));
+    $("suited").addEventListener("click", () => {
+      this.#settings.suited = !this.#settings.suited;
+      this.#show();
+      this.#changed();
+    });
+    this.#fill();
     for (const form of [$("trigger"), $("condition")]) {
       form.addEventListener("submit", (event) => {
         event.preventDefault();
@@ -56,6 +61,23 @@ export class Trigger {
       button.addEventListener("click", () => this.#set("mode", button.value));
     }
     this.#show();
+  }
+
+  /** Take over the condition that suits the reference; what was set by hand stays. */
+  suit(condition) {
+    if (!this.#settings.suited || isSuited(this.#settings.trigger, condition)) return;
+    Object.assign(this.#settings.trigger, condition);
+    for (const [key, picker] of Object.entries(this.#pickers)) picker.value = this.#settings.trigger[key];
+    this.#fill();
+    this.#show();
+    this.#changed();
+  }
+
+  #fill() {
+    for (const [id, key] of Object.entries(NUMBERS)) {
+      const text = significant(this.#settings.trigger[key], 6).replace("−", "-");
+      $(id).value = text.includes(".") && !text.includes("e") ? text.replace(/\.?0+$/, "") : text;
+    }
   }
 
   /** More or less time a screen. */
@@ -87,6 +109,7 @@ export class Trigger {
 
   #set(key, value) {
     this.#settings.trigger[key] = value;
+    if (SUITED.includes(key)) this.#settings.suited = false;
     this.#show();
     this.#changed();
   }
@@ -96,6 +119,7 @@ export class Trigger {
     for (const button of $("trigger-mode").querySelectorAll("button")) {
       button.setAttribute("aria-pressed", String(button.value === mode));
     }
+    $("suited").setAttribute("aria-pressed", String(this.#settings.suited));
     $("condition").hidden = mode === "roll";
     $("force").hidden = mode === "roll" || mode === "auto";
     $("arm-single").hidden = mode !== "single";

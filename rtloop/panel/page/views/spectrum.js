@@ -115,6 +115,7 @@ export class Spectrum {
       this.#chart.setRange("density", 10 ** Math.floor(low), 10 ** Math.ceil(high + 0.05));
     }
     this.#chart.show();
+    $("spectrum-rest").hidden = !this.#density.at_rest;
     for (const [place, line] of this.#lines.entries()) line.place(this.#band_hz[place], frequency(this.#band_hz[place]));
     const segments = averages_least === averages_most ? `${averages_least ?? "—"}` : `${averages_least} (lowest Hz) … ${averages_most}`;
     showFigures($("spectrum-figures"), {

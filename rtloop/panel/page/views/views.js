@@ -59,7 +59,7 @@ export class Views {
       if (!hidden && (was || part === "recordings")) view.open();
     }
     complain($("recordings-error"), null);
-    if (window.scrollY > $("views").offsetTop) $("views").scrollIntoView();
+    if ($("main").getBoundingClientRect().top < 0) $("main").scrollIntoView();
   }
 
   /** Colours are others. */

@@ -2,7 +2,7 @@
 
 import { Chart, polyline, roundLimits } from "../chart.js";
 import { $ } from "../dom.js";
-import { duration, fixed } from "../numbers.js";
+import { duration, fixed, leastSpan, quantity } from "../numbers.js";
 import { DASHES, palette } from "../palette.js";
 import { Picker } from "../picker.js";
 import { showFigures } from "./figures.js";
@@ -76,12 +76,13 @@ export class Xy {
       this.#limits[key] = roundLimits(low, high, this.#limits[key], least);
       this.#chart.setRange(key, ...this.#limits[key]);
     };
-    limits("x", 0.05, drive_v, model_drive_v);
-    limits("µm", 0.05, position_um, model_position_um);
+    limits("x", leastSpan("V", 50), drive_v, model_drive_v);
+    limits("µm", leastSpan("µm", 50), position_um, model_position_um);
     this.#chart.show();
+    $("xy-rest").hidden = !this.#loop.at_rest;
     showFigures($("xy-figures"), {
       "drive now": `${fixed(drive_v.at(-1), 3)} V`,
-      "position now": `${fixed(position_um.at(-1), 3)} µm`,
+      "position now": `${quantity(position_um.at(-1), "µm")} µm`,
       ...(this.#loop.loop_percent == null ? {} : { "width of the loop": `${fixed(this.#loop.loop_percent, 1)} %` }),
     });
   }

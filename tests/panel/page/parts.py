@@ -1,0 +1,86 @@
+"""Parts of the page in a browser without a panel: files and events stand for the server."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from rtloop.panel.web.application import PAGE
+from tests.panel.page.browser import PATIENCE_S
+
+SET_UP = """async () => {
+  const names = ["scope/scope", "views/xy", "views/spectrum", "palette"];
+  names.push(...["reference", "drive", "events", "configuration", "digits"].map((name) => `desk/${name}`));
+  const parts = await Promise.all(names.map((name) => import(`/page/${name}.js`)));
+  const {Scope, Reference, Drive, showEvents, showDigits, Configuration, Xy, Spectrum, themes} =
+    Object.assign({}, ...parts);
+  const live = Object.assign(new EventTarget(), {wish() {}, once() {}});
+  const units = {x_position_um: "µm", x_reference_um: "µm", x_drive_v: "V", tick: "1", y_drive_v: "V"};
+  const columns = Object.entries(units).map(([name, unit]) => ({name, unit}));
+  const defaults = {limits: {command_um: 30}, interlocks: {}};
+  const panel = {axes: ["x", "y"], longest_s: 60, rate_hz: 1000, columns, defaults};
+  const arrays = {offset: Float32Array.from({length: 200}, (_, tick) => tick - 40)};
+  for (const {name} of columns) {
+    arrays[`${name}:low`] = arrays[`${name}:high`] = arrays.offset.map((tick) => 12 + Math.sin(tick / 9));
+  }
+  themes(document.getElementById("theme"), () => {});
+  window.tell = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
+  window.sweep = (more) => tell("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
+    uncertain_ticks: 0, number: 3, complete: true, rate_hz: 1000, arrays, ...more});
+  window.state = (more) => tell("state", {state: "stopped", mode: "off", tick: 7, unix_s: 1000, axes: {},
+    lock: {name: "ada", until_unix_s: 1042}, ...more});
+  window.asked = [];
+  const answering = {driving: async (_, {value}) => (asked.push(value), {tick: 100})};
+  window.scope = new Scope(live, panel);
+  window.drive = new Drive(live, {tell() {}});
+  window.configuration = new Configuration(panel);
+  window.reference = new Reference(live, panel, configuration, answering, () => {});
+  window.xy = new Xy(live, panel);
+  window.spectrum = new Spectrum(live, panel);
+  showDigits(live, panel, configuration);
+  showEvents(live);
+}"""
+
+Y = {"name": "y", "limits": {"command_um": 25, "drive_min_v": 0}}
+
+
+@contextmanager
+def page_of_parts(browser: Any, folder: Path) -> Iterator[Any]:
+    """The page's elements and its parts, with the files of `folder`, such as `api/configuration`, behind them."""
+    (folder / "page").symlink_to(PAGE)
+    (folder / "api").mkdir()
+    configure(folder, {"name": "x"}, Y)
+    scriptless = (PAGE / "index.html").read_text(encoding="utf-8").replace('src="/page/main.js"', "")
+    (folder / "index.html").write_text(scriptless, encoding="utf-8")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = browser.new_page()
+    page.set_default_timeout(1000 * PATIENCE_S)
+    page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
+    page.evaluate(SET_UP)
+    yield page
+    page.close()
+    server.shutdown()
+    server.server_close()
+
+
+def configure(folder: Path, *axes: dict[str, Any]) -> None:
+    """Have the page read this configuration the next time."""
+    (folder / "api" / "configuration").write_text(json.dumps({"values": {"axis": axes}}))
+
+
+def choose(parts: Any, picker: str, text: str) -> None:
+    """Choose an entry of a list."""
+    parts.click(f"#{picker} button")
+    parts.click(f"#{picker}-list li:text-is('{text}')")
+
+
+def says(parts: Any, selector: str, text: str) -> None:
+    """Wait until an element says a text."""
+    parts.wait_for_function("([at, text]) => document.querySelector(at).textContent === text", arg=[selector, text])

@@ -1,0 +1,158 @@
+"""Bounded steps of the setpoint, digits that suit the stroke, and a trigger that suits the reference, in a browser."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.panel.page.parts import choose, configure, says
+from tests.panel.page.station import Stations
+
+NANO: dict[str, Any] = {
+    "name": "x",
+    "feedforward": {"thresholds_v": [0.0, 2.0], "weights_um_per_v": [0.009, 0.00125]},
+    "limits": {"command_um": 40.0},
+}
+"""A stage that its drive of ±10 V moves by ±(0.009·10 + 0.00125·8) µm = ±0.1 µm."""
+
+
+@pytest.fixture(autouse=True)
+def told(parts: Any, parts_folder: Path) -> None:
+    """Two axes at 12.5 µm and 0 in closed loop, of the shipped defaults; nothing was asked for yet."""
+    configure(parts_folder, {"name": "x"}, {"name": "y"})
+    parts.evaluate("configuration.read()")
+    state = "{tick: 100, mode: 'closed_loop', axes: {x: {position_um: 12.4996, reference_um: 12.5}, y: {}}}"
+    parts.evaluate(f"asked.length = 0, state({state})")
+    choose(parts, "desk-axis", "axis y")
+    choose(parts, "desk-axis", "axis x")
+
+
+@pytest.mark.parametrize("key", ["Home", "End", "PageUp", "PageDown"])
+def test_no_key_on_the_slider_crosses_the_stroke(parts: Any, key: str) -> None:
+    parts.focus("#setpoint-slider")
+    parts.keyboard.press(key)
+    assert float(parts.input_value("#setpoint-slider")) == 12.5
+    assert parts.evaluate("asked") == []
+
+
+def test_an_arrow_moves_the_slider_by_the_step_of_the_jog_and_enter_applies(parts: Any) -> None:
+    choose(parts, "jog-step", "0.2 µm")
+    parts.focus("#setpoint-slider")
+    for key in ("ArrowRight", "ArrowUp", "ArrowLeft", "ArrowRight"):
+        parts.keyboard.press(key)
+    assert parts.input_value("#setpoint") == "12.900"
+    says(parts, "#setpoint-staged", "12.900 µm is not applied yet: Enter or Set applies it.")
+    assert parts.evaluate("asked") == []
+    parts.keyboard.press("Enter")
+    says(parts, "#setpoint-staged", "")
+    assert parts.evaluate("asked") == [12.9]
+    choose(parts, "jog-step", "1 µm")
+
+
+def test_a_slider_that_is_dragged_applies_nothing_before_it_is_told_to(parts: Any) -> None:
+    box = parts.locator("#setpoint-slider").bounding_box()
+    parts.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
+    assert float(parts.input_value("#setpoint")) > 15
+    assert parts.evaluate("asked") == []
+    parts.click("#setpoint-form [type=submit]")
+    assert parts.evaluate("asked") == [float(parts.input_value("#setpoint"))]
+
+
+def test_a_key_that_is_held_on_a_button_jogs_once(parts: Any) -> None:
+    parts.evaluate("import('/page/keys.js').then(({Keys}) => { window.keys ??= new Keys(() => {}) })")
+    parts.wait_for_function("window.keys")
+    parts.focus("[data-jog='1']")
+    for _ in range(5):  # without a release: all but the first are repeated
+        parts.keyboard.down("Enter")
+    parts.keyboard.up("Enter")
+    assert parts.evaluate("asked") == [13.5]
+
+
+@pytest.mark.parametrize("stroke", [80.0, 30.0, 2.0, 0.2, 1e-3])
+def test_a_jog_is_a_tenth_of_the_stroke_at_most(parts: Any, stroke: float) -> None:
+    script = "async (stroke) => (await import('/page/desk/steps.js')).jogSteps(stroke)"
+    steps = parts.evaluate(script, stroke)
+    assert steps["sizes"] == sorted(set(steps["sizes"]))
+    assert stroke / 25 <= steps["sizes"][-1] <= stroke / 10 * (1 + 1e-9)
+    assert steps["sizes"][0] <= stroke / 5000
+    assert steps["first"] in steps["sizes"]
+    assert stroke / 1000 < steps["first"] <= stroke / 50 * (1 + 1e-9)
+
+
+def test_a_stage_of_nanometres_has_digits_and_steps_of_its_own(parts: Any, parts_folder: Path) -> None:
+    configure(parts_folder, NANO, {"name": "y"})
+    parts.evaluate("configuration.read()")
+    parts.wait_for_timeout(200)  # digits change no faster than an eye follows
+    parts.evaluate("state({tick: 101, axes: {x: {position_um: 0.012344, reference_um: 0.0125, error_um: 0.000156}}})")
+    says(parts, "#position-x", "0.01234")
+    ends = [float(parts.get_attribute("#setpoint-slider", end)) for end in ("min", "max")]
+    assert ends == pytest.approx([-0.1, 0.1])
+    sizes = parts.locator("#jog-step-list li").all_text_contents()
+    assert sizes[-1] == "0.02 µm"
+    assert "0.0001 µm" in sizes
+    choose(parts, "jog-step", "0.001 µm")
+    parts.evaluate("(async () => { await reference.jog(1) })()")
+    assert parts.evaluate("asked") == [0.0135]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "condition"),
+    [
+        (12.0, 28.0, {"kind": "edge", "slope": "rising", "level": 20.0, "hysteresis": 1.6}),
+        (-0.001, 0.003, {"kind": "edge", "slope": "rising", "level": 0.001, "hysteresis": 0.0004}),
+        (12.5, 12.5, {"kind": "step", "threshold": 0.0}),
+    ],
+)
+def test_the_trigger_follows_the_reference_that_plays(
+    parts: Any, parts_folder: Path, low: float, high: float, condition: dict[str, Any]
+) -> None:
+    """A run whose ticks the server measures so; a trigger that was set by hand stays as it is."""
+    (parts_folder / "api" / "measure").write_text(json.dumps({"x_reference_um": {"low": low, "high": high}}))
+    run = parts.evaluate("window.run = (window.run ?? 0) + 1")
+    parts.evaluate("scope.trigger.setLevel(7)")
+    assert parts.get_attribute("#suited", "aria-pressed") == "false"
+    parts.evaluate(f"state({{run: {run}, tick: 5000, axes: {{}}}})")
+    parts.wait_for_timeout(500)
+    assert parts.evaluate("scope.view.trigger.level") == 7
+    parts.click("#suited")
+    parts.wait_for_function(
+        "(condition) => Object.entries(condition).every(([key, value]) => scope.view.trigger[key] === value)",
+        arg=condition | {"source": "x_reference_um"},
+    )
+    shown = "hysteresis" if condition["kind"] == "edge" else "threshold"
+    assert float(parts.input_value(f"#{shown}")) == condition[shown]
+
+
+@pytest.mark.parametrize("view", ["xy", "spectrum"])
+def test_a_view_of_an_axis_at_rest_says_that_it_shows_noise(parts: Any, view: str) -> None:
+    parts.evaluate(f"document.getElementById('{view}').hidden = false, {view}.open()")
+    for at_rest in (True, False):
+        header = f"at_rest: {str(at_rest).lower()}, signal: 'x_position_um', unit: 'µm', rms: 1, low_hz: 1, high_hz: 9"
+        one = "new Float32Array([1, 2])"
+        arrays = f"arrays: {{drive_v: {one}, position_um: {one}, hz: {one}, amplitude: {one}}}"
+        parts.evaluate(f"tell('{view}', {{{header}, loop_percent: null, {arrays}}})")
+        parts.wait_for_selector(f"#{view}-rest", state="visible" if at_rest else "hidden")
+    parts.evaluate(f"document.getElementById('{view}').hidden = true")
+
+
+def test_a_failed_test_leaves_no_station_to_the_next() -> None:
+    started: list[Any] = []
+
+    class Stub:
+        """Of a station."""
+
+        def __init__(self) -> None:
+            self.closed = False
+            started.append(self)
+
+        def close(self) -> None:
+            self.closed = True
+
+    stations = Stations(Stub)
+    assert stations.present() is stations.present()
+    stations.discard()
+    stations.present()
+    assert [one.closed for one in started] == [True, False]
