@@ -8,12 +8,12 @@ from typing import Any
 import click
 
 from rtloop.cli.ctl import client_of, ctl, numbers_in
-from rtloop.cli.options import JSON, OUTPUT, fails_clearly
+from rtloop.cli.options import JSON, OUTPUT, InputFile, fails_clearly, require_text
 
 
 @ctl.command()
 @click.argument("axis")
-@click.argument("file", type=click.File())
+@click.argument("file", type=InputFile())
 @click.option("--cycles", default=5, show_default=True, type=click.IntRange(1, 50), help="Of learning.")
 @click.option(
     "--resonance-percent",
@@ -85,6 +85,8 @@ def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> in
     from rtloop.commands.adapt.retune import Asked
     from rtloop.commands.adapt.retune import retune as retune_axis
 
+    if asked["spec"] is not None:
+        require_text(asked["spec"])
     return retune_axis(client_of(context), Asked(axis=axis, **asked), as_json)
 
 

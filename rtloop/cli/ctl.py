@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rtloop.cli.options import OUTPUT, fails_clearly
+from rtloop.cli.options import JSON, OUTPUT, InputFile, fails_clearly
 from rtloop.terminal.machine import echo_json
 
 SECTION = click.Choice(["controller", "limits", "interlocks", "prefilter", "model"])
@@ -149,7 +149,7 @@ def reference(context: click.Context, axis: str, reference: str) -> int:
 
 @ctl.command()
 @click.argument("axis")
-@click.argument("file", type=click.File())
+@click.argument("file", type=InputFile())
 @click.option("--hold-ticks", default=1, show_default=True, type=click.IntRange(1))
 @click.option("--repeat", is_flag=True)
 @click.pass_context
@@ -175,25 +175,35 @@ def tune(context: click.Context, axis: str, section: str, values: str) -> int:
 
     For example 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'.
     """
-    return _change(context, "/tune", axis, section, values)
+    echo_json(_answer(context, "/tune", axis, section, values))
+    return 0
 
 
 @ctl.command()
 @click.argument("axis")
 @click.argument("section", type=SECTION)
 @click.argument("values")
+@JSON
 @click.pass_context
 @fails_clearly
-def preview(context: click.Context, axis: str, section: str, values: str) -> int:
-    """What `tune` would make of AXIS: margins, step, tolerated shift; changes nothing."""
-    return _change(context, "/preview", axis, section, values)
+def preview(context: click.Context, axis: str, section: str, values: str, as_json: bool) -> int:
+    """Show the margins, step and tolerated shift that `tune` would give AXIS; changes nothing.
 
+    A table on a terminal, JSON elsewhere.
+    """
+    from rtloop.terminal.preview import print_preview
 
-def _change(context: click.Context, resource: str, axis: str, section: str, values: str) -> int:
-    """Ask for a change of keys of [axis.SECTION], or what it would do."""
-    body = {"axis": axis, "section": section, "values": _inline_table(values)}
-    echo_json(client_of(context).post(resource, body))
+    figures = _answer(context, "/preview", axis, section, values)
+    if as_json or not sys.stdout.isatty():
+        echo_json(figures)
+    else:
+        print_preview(axis, figures)
     return 0
+
+
+def _answer(context: click.Context, resource: str, axis: str, section: str, values: str) -> Any:
+    """Post keys of [axis.SECTION] to a resource of the service; its answer."""
+    return client_of(context).post(resource, {"axis": axis, "section": section, "values": _inline_table(values)})
 
 
 @ctl.command()

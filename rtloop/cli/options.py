@@ -55,6 +55,23 @@ def _with_lines(error: Any) -> str:
     return listed(error.source, numbered(error.faults, error.source))
 
 
+class UnreadableInput(click.ClickException):
+    """An input file that cannot be read."""
+
+    exit_code = 66
+
+
+class InputFile(click.File):
+    """A text file to read, or `-`; one that cannot be read ends the command as every missing input does."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Open the file."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter as error:
+            raise UnreadableInput(error.message) from None
+
+
 class Seconds(click.ParamType):
     """A finite number of seconds above 0, or from 0 on."""
 

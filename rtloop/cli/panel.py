@@ -26,7 +26,7 @@ def with_panel(command: Any) -> Any:
     )
 
 
-def beside(config: Path, wanted: bool, port: int) -> AbstractContextManager[None]:
+def beside(config: Path, wanted: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
     """The panel of the service of a configuration, where it is wanted. Raises ConfigError."""
     if not wanted:
         return nullcontext()
@@ -34,7 +34,7 @@ def beside(config: Path, wanted: bool, port: int) -> AbstractContextManager[None
     from rtloop.panel.beside import panel_beside
     from rtloop.supervision.paths import socket_path
 
-    return panel_beside(socket_path(load(config)), port)
+    return panel_beside(socket_path(load(config, name)), port)
 
 
 @click.command()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,19 +12,32 @@ from rtloop.cli.options import CONFIG, fails_clearly
 from rtloop.cli.panel import beside, with_panel
 
 
+class ServiceName(click.ParamType):
+    """A plain file name: socket and shared block of a service are files of its name."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        """The name; a usage error where it is none."""
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", value):
+            self.fail(f"{value!r}: letters, digits, '.', '_' and '-' are allowed, at most 64", param, ctx)
+        return value
+
+
 @click.command()
 @CONFIG
+@click.option("--name", type=ServiceName(), help="Name of the service, for `ctl --name` [that of CONFIG's file].")
 @with_panel
 @fails_clearly
-def serve(config: Path, panel: bool, panel_port: int) -> int:
+def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
     """Run the loop of CONFIG as a daemon with a control API.
 
     It tells systemd how it is, and ends when it is told to.
     """
     from rtloop.service.daemon import serve as serve_configuration
 
-    with beside(config, panel, panel_port):
-        return serve_configuration(config)
+    with beside(config, panel, panel_port, name):
+        return serve_configuration(config, name=name)
 
 
 @click.command()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import click
 import numpy as np
 
 from rtloop.configuration.file import load as load_configuration
@@ -36,7 +37,7 @@ from rtloop.design.identification.identified import (
     with_gain,
     write_new,
 )
-from rtloop.design.identification.measured import Measured, UnsuitableData, measured
+from rtloop.design.identification.measured import Measured, UnsuitableData, distinct, measured
 from rtloop.errors import ConfigError
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.compensation import compensated, residual_operator
@@ -63,7 +64,8 @@ def hysteresis_report(
     plot: Path | None = None,
 ) -> dict[str, Any]:
     """Identify, write what was asked for, and report. Raises RtloopError."""
-    runs, others = ([measured(path, axis) for path in group] for group in (paths, validate))
+    runs = _distinct_runs(paths, axis)
+    others = _distinct_runs(validate, axis, runs)
     known = memory == "rest" or (memory == "auto" and all(begins_at_rest(run) for run in runs))
     try:
         if known:
@@ -88,6 +90,14 @@ def hysteresis_report(
         | more
         | {"held_out": rows, "held_out_all": _all(judged[0]), "output": out, "plot": plot}
     )
+
+
+def _distinct_runs(paths: Sequence[Path], axis: str | None, others: Sequence[Measured] = ()) -> list[Measured]:
+    """Read the recordings; copies are left out, and named on stderr. Raises RtloopError."""
+    runs, sentences = distinct([measured(path, axis) for path in paths], others)
+    for sentence in sentences:
+        click.echo(f"warning: {sentence}", err=True)
+    return runs
 
 
 def _hysteresis(runs: Sequence[Measured], fit: HysteresisFit) -> dict[str, Any]:
@@ -190,8 +200,8 @@ def dynamics_report(
     plot: Path | None = None,
 ) -> dict[str, Any]:
     """Identify from the first recording, judge with the others, write what was asked for. Raises RtloopError."""
-    runs = [measured(path, axis) for path in paths]
-    loops = [recorded_loop(path, axis, state, outside) for path in paths]
+    runs = _distinct_runs(paths, axis)
+    loops = [recorded_loop(Path(run.name), axis, state, outside) for run in runs]
     actuator = _actuator(runs[0], hysteresis, axis) if how == "hysteresis" else None
     inputs = [excitation(run, how, actuator, loop) for run, loop in zip(runs, loops, strict=True)]
     try:

@@ -41,7 +41,7 @@ def replay_on_the_rig(
     recording = _opened(files)
     if other is None:
         path = recording.paths[0]
-        library = Library(path.parent, recorded_laws(recording, trust))
+        library = _recorded_library(recording, trust)
         source = f"configuration in {path}"
         configuration = config.parse(recording.configuration, path.stem, path.parent, source, library)
     else:
@@ -70,6 +70,14 @@ def _opened(files: Sequence[Path]) -> Recording:
     recording = load(files)
     require_law(recording)
     return recording
+
+
+def _recorded_library(recording: Recording, trust: Trust) -> Library:
+    """The recorded laws under the file names that the recorded configuration has. Raises RecordingError."""
+    laws = recorded_laws(recording, trust)
+    files = {law["name"]: str(law["file"]) for law in recording.header["law"].get("laws", ()) if "file" in law}
+    folder = Path(str(recording.header.get("folder", "")))
+    return Library(folder, tuple(changed(law, file=files.get(law.kind, law.file)) for law in laws))
 
 
 def _about(recording: Recording, other: Path | None) -> dict[str, Any]:

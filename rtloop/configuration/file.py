@@ -180,10 +180,13 @@ class Configuration:
         }
 
 
-def load(path: str | Path) -> Configuration:
-    """Read and check a file. Raises InputFileError, or ConfigError with all faults."""
+def load(path: str | Path, name: str | None = None) -> Configuration:
+    """Read and check a file. `name` replaces the one that the file gives the configuration.
+
+    Raises InputFileError, or ConfigError with all faults.
+    """
     path = Path(path)
-    return parse(read_text(path), path.stem, path.parent, str(path))
+    return parse(read_text(path), name or path.stem, path.parent, str(path))
 
 
 def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:

@@ -39,7 +39,9 @@ from rtloop.laws.shipped.play_model import PlayModel
 LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
 all that the actuator moved, which the model of the hysteresis may leave."""
-AT_REST = {"kind": "hold", "value": 0.0}
+STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
+"""Of the reference that is written: its step as a part of limits.command_um, and how long each level is held, in s and
+in swings of the slowest mode."""
 SWINGS = 8
 """Swings of a light mode, each within one and a half times its own time, that trip the loop which is written."""
 
@@ -120,7 +122,7 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 
 
 def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str) -> str:
-    """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), at rest."""
+    """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), stepping."""
     raw = tomllib.loads(stage.fast.configuration)
     raw["loop"] = {key: value for key, value in raw["loop"].items() if key != "mode"}
     raw.pop("schedule", None)
@@ -128,10 +130,10 @@ def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis:
         "feedforward": _section(feedforward_section(stage.actuator, ()), "feedforward"),
         "model": model_values(stage.dynamics),
         "specification": spec_name,
-        "reference": AT_REST,
         **parts,
     }
     chosen = next(one for one in raw["axis"] if axis in (None, one["name"]))
+    found["reference"] = _steps(chosen["limits"]["command_um"], stage)
     found["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
     raw["axis"] = [{**one, **found} if one is chosen else one for one in raw["axis"]]
     heading = [
@@ -140,6 +142,14 @@ def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis:
         *comments,
     ]
     return edited(stage.fast.configuration, raw, heading)
+
+
+def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
+    """A square wave from 0 to a part of the command's range, so that a run shows steps."""
+    slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
+    dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
+    dwell_s = math.ceil(dwell_s / stage.fast.period_s) * stage.fast.period_s
+    return {"kind": "steps", "levels": [float(f"{STEP_PART * command_um:.1g}"), 0.0], "dwell_s": round(dwell_s, 9)}
 
 
 def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:

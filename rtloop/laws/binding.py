@@ -20,10 +20,12 @@ from rtloop.hil.native.pointers import carray
 from rtloop.law.layout import FUNCTIONS, told_by
 from rtloop.law.memory import LawRecords
 from rtloop.laws.contract import Law
-from rtloop.laws.purity import foreign_calls
+from rtloop.laws.purity import MEMORY, foreign_calls
 from rtloop.laws.registry import LawReference, law_class
 
 MAX_CHARACTERS = 300
+RETURNS_NOTHING = "No conversion from none to float64"
+"""The compiler's words for a function that ends without a value."""
 
 
 def functions_of(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
@@ -77,9 +79,13 @@ def _address(law: type[Law], keeps: LawRecords, name: str) -> int:
     except Exception as error:  # whatever the compiler comes upon
         file = function.__code__.co_filename
         where = f"law {law.kind!r}{_line(error, file)}: {name}"
+        if RETURNS_NOTHING in str(error):
+            raise ValueError(f"{where} returns nothing on one of its paths; each needs a `return`") from error
         raise ValueError(f"{where} cannot be compiled: {_short(error)}") from error
     for called, reason in foreign_calls(kernel, signature, law.libm).items():
-        raise ValueError(f"law {law.kind!r}: {name} calls {called}, which {reason}")
+        code = function.__code__
+        where = f"law {law.kind!r} ({Path(code.co_filename).name}), line {code.co_firstlineno}: {name}"
+        raise ValueError(f"{where} {reason if reason == MEMORY else f'calls {called}, which {reason}'}")
     return address
 
 
@@ -98,7 +104,9 @@ def _short(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines()]
     kept = [line for line in lines if line and not line.startswith(("During:", "- Resolution", "Failed in", "[", "<<"))]
     end = next((i for i, line in enumerate(kept) if line.startswith(("File ", "There are", "def "))), len(kept))
-    return " ".join(kept[: max(end, 1)])[:MAX_CHARACTERS]
+    text = " ".join(kept[: max(end, 1)])
+    operation = re.search(r"Function\(<built-in function (\w+)>\) found for signature: >>> \w+(\(.*\))", text)
+    return (f"no {operation[1]} for {operation[2]}" if operation else text)[:MAX_CHARACTERS]
 
 
 def _line(error: Exception, file: str) -> str:

@@ -90,7 +90,7 @@ class Law(ABC):
     def records(cls, axes: int = 0) -> LawRecords:
         """What it keeps, as types; `axes` where its class does not say how many."""
         return LawRecords(
-            cls.kind, axes or cls.axes, _record(cls.coefficients), _record(cls.state), cls.allowed_coefficients,
+            cls.kind, axes or cls.axes, record_type(cls.coefficients), record_type(cls.state), cls.allowed_coefficients,
             cls.allowed_state,
         )  # fmt: skip
 
@@ -152,15 +152,17 @@ class Feedforward(Law):
         """Advance the memory by the drive that was applied; the command in µm that it was."""
 
 
-def _record(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
-    """A record that fills whole cache lines. Raises TypeError for a type that is not allowed."""
+def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of a record that fills whole cache lines. Raises TypeError for a type that is not allowed."""
     if isinstance(fields, np.dtype):
         return fields
+    if not isinstance(fields, Mapping):
+        raise TypeError(f"{fields!r}; a dict of names and types is needed, such as {{'sum_um': float}}")
     found = []
     for name, what in fields.items():
         kind, *shape = what if isinstance(what, tuple) else (what,)
         if kind not in _TYPES:
-            raise TypeError(f"{name}: {kind!r}; float and int are allowed")
+            raise TypeError(f"{name} is {kind!r}; allowed: float, int, or (float, length) for an array")
         lengths = shape[0] if shape and isinstance(shape[0], tuple) else tuple(shape)
         found.append((name, _TYPES[kind], lengths))
     return whole_lines(sorted(found, key=lambda field: -int(np.prod(field[2]))))
@@ -180,23 +182,28 @@ def record_of(law: Law) -> Any:
     found = np.zeros(1, dtype)
     known = [name for name in dtype.names or () if name not in ("reserved", "scratch")]
     built = law.build()
+    if not isinstance(built, Mapping):
+        raise ValueError(f"{_place(law)} returns {built!r}; a dict with a value for each coefficient is needed")
     if other := [name for name in built if name not in known]:
-        raise ValueError(f"{_place(law)}gives {', '.join(other)}; the coefficients are {', '.join(known)}")
+        raise ValueError(f"{_place(law)} gives {', '.join(other)}; the coefficients are {', '.join(known)}")
     if not law.shipped and (absent := [name for name in known if name not in built]):
-        raise ValueError(f"{_place(law)}gives no {', '.join(absent)}; the coefficients are {', '.join(known)}")
+        raise ValueError(f"{_place(law)} gives no {', '.join(absent)}; the coefficients are {', '.join(known)}")
     for name, value in built.items():
         numbers, target = np.asarray(value), found[name]
         if numbers.dtype.kind not in "biuf":
-            raise ValueError(f"{_place(law)}gives {name} = {value!r}, which is no number")
+            raise ValueError(f"{_place(law)} gives {name} = {value!r}, which is no number")
         room = target.shape[1:]
         if numbers.ndim != len(room) or any(n > most for n, most in zip(numbers.shape, room, strict=True)):
-            raise ValueError(f"{_place(law)}gives {name} {numbers.shape} numbers; at most {room} fit")
+            needed = f"an array of at most {room}" if room else "one number"
+            raise ValueError(f"{_place(law)} gives {name} as an array of {numbers.shape}; {needed} is needed")
+        if np.isnan(numbers).any():
+            raise ValueError(f"{_place(law)} gives {name} = {value!r}; NaN is not allowed")
         target[(0, *(slice(0, length) for length in numbers.shape))] = numbers
     return found
 
 
 def _place(law: Law) -> str:
-    """Where a law's `build` begins, for a message."""
+    """Return file, line and name of a law's `build`, for a message."""
     code = type(law).build.__code__
     part = "feedforward" if isinstance(law, Feedforward) else "controller"
-    return f"{part}: {Path(code.co_filename).name}, build in line {code.co_firstlineno}: it "
+    return f"{part}: {Path(code.co_filename).name}, line {code.co_firstlineno}: build"

@@ -41,6 +41,8 @@ def linearised(law: Controller) -> Sampled | SampledTogether:
     try:
         with np.errstate(all="ignore"):
             wide, narrow = _derivatives(tick, STEP), _derivatives(tick, STEP / 2)
+        if not (np.isfinite(wide).all() and np.isfinite(narrow).all()):
+            raise ValueError("its numbers are not finite")
     except (ArithmeticError, IndexError, ValueError) as error:
         raise ValueError(f"at rest it fails: {type(error).__name__}: {error}") from error
     n = tick.size

@@ -1,98 +1,86 @@
 """Mistakes in the text of somebody's own law, found before anything of it is compiled: one sentence, with its line.
 
-Looked at are `output`, `update` and `enter` where a class defines them: their parameters, what they ask of their
-records, names that nobody defined, a missing `return`, calls that would wait. The compiler finds the same, and more,
-in words of its own.
+A class is searched for its records, its options and its functions. `rtloop.laws.function_mistakes` reads the functions
+that are compiled. The compiler finds the same, and more, in words of its own.
 """
 
 from __future__ import annotations
 
 import ast
-import builtins
-from collections.abc import Collection, Iterator, Mapping
+import inspect
+from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import Any
 
-from rtloop.law.layout import told_by
-from rtloop.laws.contract import Feedforward, Law
+from rtloop.laws.contract import Law, record_type
+from rtloop.laws.function_mistakes import PER_TICK, Mistake, mistakes_in_function
+from rtloop.laws.options import LawOptions
 
-WAITING = {"print", "open", "input", "exec", "eval", "__import__", "breakpoint"}
-"""Builtin functions that a tick has no time for."""
-USUAL = {"np": "import numpy as np", "numpy": "import numpy", "math": "import math"}
-HIDDEN = {"reserved", "scratch"}
-"""Fields of records that are not the law's."""
-
-
-class Mistake(NamedTuple):
-    """A line of the text, and what is wrong there."""
-
-    line: int
-    what: str
+BASES = ("Controller", "CoupledController", "Feedforward")
 
 
 def mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """In the laws of a text, in the order of their lines; `names` are those that it defines when it is run."""
-    for node in ast.parse(text).body:
-        law = names.get(node.name) if isinstance(node, ast.ClassDef) else None
-        if isinstance(node, ast.ClassDef) and isinstance(law, type) and issubclass(law, Law):
-            for function in node.body:
-                if isinstance(function, ast.FunctionDef) and function.name in ("output", "update", "enter"):
-                    yield from sorted(_in_function(function, law, names))
+    """Yield the mistakes in the laws of a text, in the order of their lines.
 
-
-def _in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
-    feedforward = issubclass(law, Feedforward)
-    wanted = ["c", "s", "command_um" if function.name == "output" else "drive_v"] if feedforward else ["c", "s", "told"]
-    given = [one.arg for one in function.args.args]
-    if len(given) != len(wanted):
-        extra = ", without `self`: it has only what it is given" if given[:1] == ["self"] else ""
-        yield Mistake(function.lineno, f"{function.name}({', '.join(given)}): {function.name}({', '.join(wanted)}) is "
-                      f"needed{extra}")  # fmt: skip
-        return
-    records = law.records(max(law.axes, 1)) if not feedforward else law.records()
-    fields = {given[0]: ("coefficients", records.coefficients.names), given[1]: ("state", records.state.names)}
-    if not feedforward:
-        fields[given[2]] = ("what it is told", told_by(max(law.axes, 1)).names)
-    yield from _unknown_fields(function, fields)
-    yield from _unknown_names(function, given, names)
-    if _must_return(function, law) and not any(isinstance(one, ast.Return) and one.value for one in ast.walk(function)):
-        yield Mistake(function.lineno, f"{function.name} returns nothing: a `return` is missing")
-
-
-def _must_return(function: ast.FunctionDef, law: type[Law]) -> bool:
-    """A coupled controller sets commands in place of returning one."""
-    if issubclass(law, Feedforward):
-        return function.name in ("output", "update")
-    raises = any(isinstance(one, ast.Raise) for one in ast.walk(function))
-    return function.name == "output" and law.axes == 1 and not raises
-
-
-def _unknown_fields(
-    function: ast.FunctionDef, fields: Mapping[str, tuple[str, tuple[str, ...] | None]]
-) -> Iterator[Mistake]:
-    for node in ast.walk(function):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in fields:
-            which, known = fields[node.value.id]
-            there = [name for name in known or () if name not in HIDDEN]
-            if node.attr not in (known or ()):
-                said = f"{node.value.id}.{node.attr}: not among {'its ' if which != 'what it is told' else ''}{which}"
-                yield Mistake(node.lineno, f"{said}{_meant(node.attr, there)}")
-
-
-def _unknown_names(function: ast.FunctionDef, given: Collection[str], names: Mapping[str, Any]) -> Iterator[Mistake]:
-    nodes = [node for node in ast.walk(function) if isinstance(node, ast.Name)]
-    own = {*given, *(node.id for node in nodes if not isinstance(node.ctx, ast.Load))}
-    for node in nodes:
-        if node.id in own or node.id in names:
+    `names` are those that the text defines when it is run.
+    """
+    for node, law in _classes(text, names):
+        if not _is_law(law):
             continue
-        if node.id in WAITING:
-            yield Mistake(node.lineno, f"{node.id}: it may wait, and a tick cannot")
-        elif not hasattr(builtins, node.id):
-            usual = f"; `{USUAL[node.id]}` at the top of the file?" if node.id in USUAL else ""
-            yield Mistake(node.lineno, f"{node.id}: nothing has this name{usual or _meant(node.id, [*own, *names])}")
+        wrong = list(_wrong_records(node, law))
+        yield from wrong or _wrong_options(node, law, names)
+        if wrong or not isinstance(getattr(law, "coefficients", None), Mapping):
+            continue
+        for function in node.body:
+            if isinstance(function, ast.FunctionDef) and function.name in PER_TICK:
+                yield from sorted(mistakes_in_function(function, law, names))
 
 
-def _meant(name: str, known: Collection[str]) -> str:
-    """What was meant, as far as a name like it is known; else all that is known, where that is little."""
-    near = get_close_matches(name, [one for one in known if not one.startswith("_")], 1)
-    return f"; {near[0]} is meant?" if near else f"; there are {', '.join(known)}" if 0 < len(known) <= 12 else ""
+def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
+    """Return the reason why the first class that looks like a law is none; None where no class looks like one."""
+    for node, law in _classes(text, names):
+        functions = {one.name: one.lineno for one in node.body if isinstance(one, ast.FunctionDef)}
+        if _is_law(law):
+            for absent in sorted(law.__abstractmethods__):
+                near = get_close_matches(absent, functions.keys() - {*PER_TICK, "build"}, 1)
+                meant = f"; is `{near[0]}` in line {functions[near[0]]} meant?" if near else ""
+                return Mistake(node.lineno, f"class {node.name} has no function `{absent}`{meant}")
+        elif functions.keys() >= {"build", "output"}:
+            return Mistake(node.lineno, f"class {node.name} is no law; its base must be one of {', '.join(BASES)}")
+    return None
+
+
+def _classes(text: str, names: Mapping[str, Any]) -> Iterator[tuple[ast.ClassDef, Any]]:
+    """Yield each class of a text with the object that its name stands for."""
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.ClassDef):
+            yield node, names.get(node.name)
+
+
+def _is_law(candidate: Any) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, Law)
+
+
+def _wrong_records(node: ast.ClassDef, law: type[Law]) -> Iterator[Mistake]:
+    """Yield a mistake for `coefficients` or `state` where it is missing or describes no record."""
+    lines = {target.id: one.lineno for one in node.body if isinstance(one, ast.Assign)
+             for target in one.targets if isinstance(target, ast.Name)}  # fmt: skip
+    for name in ("coefficients", "state"):
+        if not hasattr(law, name):
+            near = get_close_matches(name, lines, 1)
+            meant = f"; is `{near[0]}` in line {lines[near[0]]} meant?" if near else ""
+            if not inspect.isabstract(law):
+                yield Mistake(node.lineno, f"class {node.name} has no `{name}`{meant}")
+            continue
+        try:
+            record_type(getattr(law, name))
+        except TypeError as error:
+            yield Mistake(lines.get(name, node.lineno), f"{name}: {error}")
+
+
+def _wrong_options(node: ast.ClassDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
+    """Yield a mistake where a text defines the options of its law and the law does not name them."""
+    own = [one for one in names.values() if isinstance(one, type) and one.__module__ == law.__module__]
+    options = [one.__name__ for one in own if issubclass(one, LawOptions)]
+    if options and law.options_model.__module__ != law.__module__:
+        yield Mistake(node.lineno, f"class {node.name} names no options; add `options_model = {options[-1]}` to it")

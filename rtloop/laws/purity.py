@@ -10,6 +10,7 @@ _CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
 _CALLED_BY_ADDRESS = re.compile(r'\b(?:call|invoke)\b[^@"\n]*?(?:%"?[\w.$-]+"?\(|inttoptr \()')
 ADDRESS = "an address"
 LIBM = "differs between processors in its last bits, so that a replay might"
+MEMORY = "takes memory for a list, an array or a text, which may wait"
 UNKNOWN = "is outside of the law, and may wait"
 _MATHEMATICS = {
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "sincos"),
@@ -52,7 +53,7 @@ def _reason(name: str) -> str:
         function = name.split(".")[1]
         return LIBM if function in _MATHEMATICS else ""
     if name.startswith(("NRT_", "numba_runtime")):
-        return "takes memory, which may wait"
+        return MEMORY
     if name.startswith(("Py", "numba_")):
         return "needs the interpreter, which may wait"
     return LIBM if name in _LIBRARY or name.removesuffix("f") in _LIBRARY else UNKNOWN

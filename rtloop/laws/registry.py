@@ -9,9 +9,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import inspect
+import re
 import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -21,7 +24,7 @@ from types import ModuleType
 from rtloop.law.memory import Layout
 from rtloop.laws.contract import Law
 from rtloop.laws.limited.announced import announce, is_limited
-from rtloop.laws.mistakes import mistakes
+from rtloop.laws.mistakes import missing_law, mistakes
 
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
@@ -92,8 +95,10 @@ def from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     if kind is None and len(found) == 1:
         return next(iter(found.values()))
     if kind not in found:
-        there = f"defines {', '.join(found)}; kind says which is meant" if found else "defines no law"
-        raise ValueError(f"{file}: {there}")
+        if found:
+            raise ValueError(f"{file}: defines {', '.join(found)}; kind says which is meant")
+        reason = missing_law(text, vars(_module(text, file)))
+        raise ValueError(f"{file}: defines no law" if reason is None else f"{file}, line {reason.line}: {reason.what}")
     return found[kind]
 
 
@@ -121,10 +126,10 @@ def _module(text: str, file: str) -> ModuleType:
     try:
         # stdout belongs to the command, or to the supervisor; a limited process has none of its own
         with contextlib.nullcontext() if is_limited() else contextlib.redirect_stdout(sys.stderr):
-            exec(compile(text, file, "exec"), module.__dict__)
+            exec(compile(text, file, "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         del sys.modules[name]
-        raise ValueError(f"{file}: cannot be run: {_said(error)}") from error
+        raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error
     for mistake in mistakes(text, vars(module)):
         del sys.modules[name]
         raise ValueError(f"{file}, line {mistake.line}: {mistake.what}")
@@ -137,6 +142,19 @@ def _classes(module: ModuleType) -> dict[str, type[Law]]:
     return {one.kind: one for one in own if issubclass(one, Law) and not inspect.isabstract(one)}
 
 
-def _said(error: Exception) -> str:
-    line = f" in line {error.lineno}" if isinstance(error, SyntaxError) else ""
-    return f"{type(error).__name__}{line}: {' '.join(str(error).split())}"
+def _line(error: Exception, file: str) -> str:
+    """Return the line of a law's file in which an exception was raised, as words; nothing where none is known."""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+    return "" if line is None else f", line {line}"
+
+
+def _message(error: Exception) -> str:
+    """Return type and words of an exception; for an import that fails without the path of the other file."""
+    words = error.msg if isinstance(error, SyntaxError | ImportError) else str(error)
+    text = f"{type(error).__name__}: {' '.join(str(words).split())}"
+    absent = re.search(r"cannot import name '(\w+)' from '([\w.]+)'", text)
+    if absent is None:
+        return text
+    near = get_close_matches(absent[1], vars(sys.modules[absent[2]]), 1)
+    return f"{type(error).__name__}: {absent[0]}" + (f"; did you mean {near[0]}?" if near else "")

@@ -32,19 +32,21 @@ NO_THREAD = "can't start new thread"
 """What Python says of it; it has no class of its own."""
 
 
-def serve(config: Path, duration_s: float | None = None) -> int:
+def serve(config: Path, duration_s: float | None = None, name: str | None = None) -> int:
     """Serve a configuration until SIGTERM or SIGINT, or until a loop has run so long; SIGHUP reloads. The exit code.
+
+    `name` names the service, in place of its file.
 
     Raises RtloopError.
     """
     with _refused_in_words():
         _log_to_stderr()
-        return _serve(config, duration_s)
+        return _serve(config, duration_s, name)
 
 
-def _serve(config: Path, duration_s: float | None) -> int:
+def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
     """As `serve`, with the journal there; raises OSError and RuntimeError too, where the system refuses something."""
-    service = Service(config, duration_s)
+    service = Service(config, duration_s, name)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.end())
     signal.signal(signal.SIGHUP, lambda *_: service.reload())

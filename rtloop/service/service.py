@@ -72,9 +72,9 @@ class Service:
     come from any thread.
     """
 
-    def __init__(self, config: Path, duration_s: float | None = None) -> None:
-        self.config = config
-        self.configuration: Configuration = load(config)
+    def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
+        self.config, self._name = config, name
+        self.configuration: Configuration = load(config, name)
         options = self.configuration.service
         if self.configuration.schedule and (options.tare_s > 0 or options.depolarise is not None):
             fault = "schedule: not allowed with service.tare_s or service.depolarise, which take the first ticks"
@@ -362,7 +362,7 @@ class Service:
     def reload_now(self) -> dict[str, Any]:
         """Read the file again and apply what changed; what was done. Raises ConfigError, Refused."""
         with self._reloading:  # one after the other: the file that was read last is the one that stays
-            configuration = self._with_loaded_laws(load(self.config))
+            configuration = self._with_loaded_laws(load(self.config, self._name))
             prepared: Prepared = prepare_limited(configuration)
             live = self.live
             changed = [] if live is None else live.replace_all(prepared)

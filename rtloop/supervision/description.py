@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.around import around_of
@@ -35,6 +36,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "ticks_expected": plan.ticks,
         "mode": plan.mode.name.lower(),
         "configuration": configuration.text,
+        "folder": str(configuration.folder.absolute()),
         "configuration_sha256": hashlib.sha256(configuration.text.encode()).hexdigest(),
         "law": _laws(plan),
         "extras": {
@@ -57,11 +59,11 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
 
 
 def _laws(plan: Plan) -> dict[str, Any]:
-    """The layout of the law, with the text of each that is not shipped: whoever has no such file can replay it."""
+    """The layout of the law. A law that is not shipped has its text, for a replay without its file, and its file."""
     described = plan.layout.description()
     for entry, law in zip(described["laws"], plan.laws, strict=True):
         if law.text:
-            entry |= {"sha256": law.sha256, "text": law.text}
+            entry |= {"sha256": law.sha256, "text": law.text, "file": str(Path(law.file).absolute())}
     return described
 
 

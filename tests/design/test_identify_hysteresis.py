@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +14,7 @@ from rtloop.design.identification.hysteresis.identify_from_parts import identify
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
 from rtloop.design.identification.hysteresis.thresholds import placed_thresholds
 from rtloop.design.identification.identified import feedforward_of, feedforward_section
-from rtloop.design.identification.measured import Measured, UnsuitableData, require_usable
+from rtloop.design.identification.measured import Measured, UnsuitableData, distinct, require_usable
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
@@ -212,3 +214,14 @@ def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(trut
     run = Measured("made", 15 * SLOW_S, drive, np.append(0.0, position[:-1]), position, True, "", "")
     assert unexplained_um([run], identify_hysteresis([run])) > 0
     assert creep_explains(run) == creeps
+
+
+def test_a_copy_of_a_recording_is_no_independent_evidence() -> None:
+    """By its ticks: other names and headers do not make it another measurement."""
+    drive_v = slow_sine()
+    run = run_of(drive_v, 2.0 * drive_v)
+    other = replace(run, name="other", position_um=run.position_um + 1.0)
+    runs, sentences = distinct([run, replace(run, name="copy", digest="another"), other])
+    assert [one.name for one in runs] == [run.name, "other"]
+    assert sentences == [f"copy: holds the same ticks as {run.name}, and is left out"]
+    assert distinct([replace(run, name="copy")], [run])[0] == []

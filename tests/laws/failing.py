@@ -64,8 +64,8 @@ REFUSED = {
     "sleeps with libm": (USLEEP + text("usleep(1000)").replace(CLASS, f"{CLASS}    libm = True\n"), "calls usleep"),
     "sleeps by an address": (BY_ADDRESS + text("usleep(1000)"), "calls an address, which is outside of the law"),
     "opens a file": ("opened = open\n" + text("opened('x')"), "cannot be compiled"),
-    "names what is not there": (text("return s.nothing"), "s.nothing: not among its state"),
-    "is no Python": ("def f(:\n", "SyntaxError in line 1"),
+    "names what is not there": (text("return s.nothing"), "s.nothing: unknown state"),
+    "is no Python": ("def f(:\n", "line 1: SyntaxError"),
     "defines no law": ("x = 1\n", "defines no law"),
     "raises when it is read": ("1 / 0\n", "ZeroDivisionError"),
 }

@@ -32,28 +32,93 @@ class Mine(Controller):
         s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um
 """
 CONTROLLER = '[axis.controller]\nfile = "mine.py"\nki_per_s = 150.0\n'
-BUILD, GIVES, OUTPUT, RETURN = (LAW[: LAW.index(text)].count("\n") + 1 for text in
-                                ("def build", 'return {"kp"', "def output", "return c.kp"))  # fmt: skip
+CLASS, COEFFICIENTS, BUILD, GIVES, OUTPUT, RETURN, UPDATE, ADDS = (
+    LAW[: LAW.index(text)].count("\n") + 1
+    for text in ("class Mine(", "    coefficients", "def build", 'return {"kp"', "def output", "return c.kp",
+                 "def update", "        s.integral_um +=")
+)  # fmt: skip
 TYPOS = {
-    "a signal": ("c.kp * told.error_um +", "c.kp * told.eror_um +", RETURN, "told.eror_um: .*; error_um is meant"),
-    "a coefficient": ("c.kp * told", "c.kpp * told", RETURN, "c.kpp: not among its coefficients; kp is meant"),
-    "an undeclared state": ("+ s.integral_um", "+ s.sum_um", RETURN, "s.sum_um: not among its state; .* integral_um"),
-    "a module": ("return c.kp", "return np.sign(c.kp)", RETURN, "np: nothing has this name; `import numpy as np`"),
-    "a name": ("return c.kp", "return tld.error_um + c.kp", RETURN, "tld: nothing has this name; told is meant"),
-    "no return": ("return c.kp", "c.kp", OUTPUT, "output returns nothing: a `return` is missing"),
-    "self": (
-        "output(c, s, told)",
-        "output(self, c, s, told)",
-        OUTPUT,
-        r"output\(c, s, told\) is needed, without `self`",
+    "a signal": ("c.kp * told.error_um +", "c.kp * told.eror_um +", RETURN, "unknown signal; did you mean told.error_"),
+    "a coefficient": ("c.kp * told", "c.kpp * told", RETURN, r"c\.kpp: unknown coefficient; did you mean c\.kp\?"),
+    "an undeclared state": (
+        "+ s.integral_um",
+        "+ s.sum_um",
+        RETURN,
+        r"s\.sum_um: unknown state; known: s\.integral_um",
     ),
+    "a module": ("return c.kp", "return np.sign(c.kp)", RETURN, "np: is not defined; add `import numpy as np`"),
+    "a name": ("return c.kp", "return tld.error_um + c.kp", RETURN, r"tld: is not defined; did you mean told\?"),
+    "an option in a tick": (
+        "return c.kp",
+        "return self.options.kp",
+        RETURN,
+        "self: is not defined; output, .* `build`",
+    ),
+    "no return": ("return c.kp", "c.kp", OUTPUT, "output returns nothing; a `return` with a number is missing"),
+    "a path without return": (
+        "return c.kp",
+        "if c.kp > 0:\n            return c.kp",
+        RETURN,
+        "nothing on one of its pa",
+    ),
+    "a return too many": (
+        "s.integral_um +=",
+        "return s.integral_um +",
+        ADDS,
+        "update returns a value; it must return no",
+    ),
+    "self": ("output(c, s, told)", "output(self, c, s, told)", OUTPUT, r"output\(c, s, told\) is needed, without self"),
     "a missing parameter": ("output(c, s, told)", "output(c, told)", OUTPUT, r"output\(c, s, told\) is needed$"),
-    "print": ("return c.kp", "print(s); return c.kp", RETURN, "print: it may wait, and a tick cannot"),
-    "an option": ("self.options.ki_per_s", "self.options.ki", GIVES, "raised AttributeError: .* no attribute 'ki'"),
-    "what build gives": ('{"kp": 0.1', '{"kd": 0.1', BUILD, "it gives kd; the coefficients are kp, ki"),
-    "what build leaves out": ('"kp": 0.1, ', "", BUILD, "it gives no kp; the coefficients are kp, ki"),
-    "a text": ('"kp": 0.1', '"kp": "much"', BUILD, "it gives kp = 'much', which is no number"),
-    "a list": ("return c.kp * told.error_um", "return [c.kp]", RETURN, "output cannot be compiled: No implementation"),
+    "parameters in another order": ("update(c, s", "update(s, c", UPDATE, r"update\(c, s, told\) is needed$"),
+    "print": ("return c.kp", "print(s); return c.kp", RETURN, "print: may wait, and a tick must not wait"),
+    "a coefficient that is set": (
+        "        s.integral_um +=",
+        "        c.ki = 2.0; s.integral_um +=",
+        ADDS,
+        "cannot be set",
+    ),
+    "an option": (
+        "self.options.ki_per_s",
+        "self.options.ki",
+        GIVES,
+        r"raised AttributeError: .* attribute .ki.; did you mean \w+\?, in line",
+    ),
+    "the options": (
+        "    options_model = MineOptions\n",
+        "",
+        CLASS,
+        "names no options; add `options_model = MineOptions`",
+    ),
+    "a type": ("ki_per_s: float", "ki_per_s: flot", 5, "NameError: name 'flot' is not defined"),
+    "an import": (
+        "import Controller,",
+        "import Controler,",
+        1,
+        r"'Controler' from 'rtloop.laws'; did you mean Controller\?",
+    ),
+    "syntax": ("def output(c, s, told):", "def output(c, s, told)", OUTPUT, "SyntaxError: expected ':'$"),
+    "a function": ("def output", "def outptu", CLASS, f"no function `output`; is `outptu` in line {OUTPUT} meant"),
+    "a base": ("class Mine(Controller)", "class Mine", CLASS, "is no law; its base must be one of Controller, "),
+    "an attribute": ("coefficients =", "coeficients =", CLASS, f"`coeficients` in line {COEFFICIENTS} meant"),
+    "a record": (
+        'state = {"integral_um": float}',
+        'state = ["a"]',
+        COEFFICIENTS + 1,
+        r"state: \['a'\]; a dict of names",
+    ),
+    "build without return": (
+        'return {"kp": 0.1, "ki": ',
+        '{"ki": ',
+        BUILD,
+        "build returns None; a dict with a value for",
+    ),
+    "what build gives": ('{"kp": 0.1', '{"kd": 0.1', BUILD, "build gives kd; the coefficients are kp, ki"),
+    "what build leaves out": ('"kp": 0.1, ', "", BUILD, "build gives no kp; the coefficients are kp, ki"),
+    "a text": ('"kp": 0.1', '"kp": "much"', BUILD, "build gives kp = 'much', which is no number"),
+    "NaN": ('"kp": 0.1', '"kp": float("nan")', BUILD, "build gives kp = nan; NaN is not allowed"),
+    "an array": ('"kp": 0.1', '"kp": [0.1, 0.2]', BUILD, r"build gives kp as an array of \(2,\); one number is needed"),
+    "a list": ("return c.kp * told.error_um", "return [c.kp]", RETURN, "output cannot be compiled: no add for"),
+    "memory": ("return c.kp", "return max([c.kp, 0.0] * 2) + c.kp", OUTPUT, "output takes memory for a list"),
 }
 """What is replaced, by what, the line where, and what is said."""
 
@@ -64,7 +129,7 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
     assert LAW.count(right) == 1
     (tmp_path / "mine.py").write_text(LAW.replace(right, wrong))
     config = tmp_path / "lab.toml"
-    config.write_text(configuration(CONTROLLER, [], model=True))
+    config.write_text(configuration(CONTROLLER, [], model=False))
     result = run("check", config)
     assert result.exit_code == 78
     first, *faults = result.stderr.splitlines()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -100,13 +102,60 @@ def test_a_law_that_is_not_here_is_said_and_not_run(made: Path):
     assert not (made.parent / "was-run").exists()
 
 
-def test_a_file_beside_the_recording_is_not_run_either(made: Path):
-    (made.parent / "mine.py").write_text(marker(made.parent).replace("was-run", "was-run-too"))
+@pytest.fixture
+def in_place(made: Path) -> Iterator[Path]:
+    """The file that the law ran from, as it was."""
+    file = made.parent / "mine.py"
+    file.write_text(marker(made.parent))
+    yield file
+    file.unlink()
+    (made.parent / "was-run").unlink(missing_ok=True)
+
+
+def test_the_law_is_taken_from_the_file_that_it_ran_from(made: Path, in_place: Path, monkeypatch: pytest.MonkeyPatch):
+    """Whatever the working folder is; with --resimulate the configuration's `file` means the same law."""
+    monkeypatch.chdir("/")
+    report = json.loads(run("replay", made, "--json").stdout)
+    assert (report["identical"], report["ticks"]) == (True, TICKS)
+    result = run("replay", made, "--resimulate")
+    assert result.exit_code == 0, result.output
+
+
+def test_a_file_that_has_changed_is_not_run(made: Path, in_place: Path):
+    in_place.write_text(marker(made.parent).replace("was-run", "was-run-too"))
+    for arguments in ((), ("--resimulate",)):
+        result = run("replay", made, *arguments)
+        assert result.exit_code == 66
+        assert "mine.py has changed since" in result.output
+    assert not (made.parent / "was-run-too").exists()
+
+
+@pytest.mark.parametrize("of_folder", [True, False])
+def test_a_file_that_others_may_write_is_not_run(made: Path, in_place: Path, of_folder: bool):
+    place = made.parent if of_folder else in_place
+    mode = place.stat().st_mode
+    place.chmod(mode | 0o020)
     try:
-        assert run("replay", made, "--resimulate").exit_code == 66
-        assert not (made.parent / "was-run-too").exists()
+        result = run("replay", made)
     finally:
-        (made.parent / "mine.py").unlink()
+        place.chmod(mode)
+    assert result.exit_code == 66
+    assert "others may write" in result.output
+    assert not (made.parent / "was-run").exists()
+
+
+def test_a_recording_makes_no_script_run_that_is_no_law(tmp_path: Path):
+    script = tmp_path / "script.py"
+    script.write_text(f"import pathlib\npathlib.Path({str(tmp_path / 'was-run')!r}).write_text('run')\n")
+
+    def naming(header: dict) -> None:
+        law = next(law for law in header["law"]["laws"] if law["name"] == "mine")
+        law |= {"file": str(script), "sha256": hashlib.sha256(script.read_bytes()).hexdigest()}
+
+    result = run("replay", recorded(tmp_path, law_text(), naming))
+    assert result.exit_code == 66
+    assert "script.py is no law" in result.output
+    assert not (tmp_path / "was-run").exists()
 
 
 def test_the_recorded_text_is_identical_where_it_is_trusted(made: Path):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtloop.configuration.file import parse
+from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.changes import Change, Changes
 from rtloop.service.changing.preview import figures, step_end_ms, with_longer_step
+from rtloop.terminal.preview import print_preview
+from tests.asked import run
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT, built
 from tests.service.http import answer
@@ -133,3 +135,24 @@ def test_a_longer_step_is_the_same_step():
     again = np.interp(short["step"]["t_ms"], longer["t_ms"], longer["y"])
     assert np.allclose(again, short["step"]["y"], atol=0.02)
     assert with_longer_step(short, prepared.checks[0], 0.5) is short
+
+
+def test_a_terminal_shows_both_loops_in_a_table_and_every_problem(capsys: pytest.CaptureFixture[str]) -> None:
+    keys = ("crossover_hz", "phase_margin_deg", "gain_margin_db", "modulus_margin", "static_error_percent",
+            "settling_ms", "overshoot_percent")  # fmt: skip
+    before = {key: float(number) for number, key in enumerate(keys, start=1)}
+    before |= {"tolerated_shift_percent": [-12.5, 50.0], "problems": []}
+    after = dict.fromkeys(keys) | {"tolerated_shift_percent": None, "problems": ["axis.x.controller: wrong sign"]}
+    print_preview("x", {"before": before, "after": after})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["axis", "x,", "on", "the", "model", "now", "after", "the", "change"]
+    assert [line.split()[-3:-1] for line in lines[6:8]] == [["6", "–"], ["7", "–"]]
+    assert "-12.5 … +50.0" in lines[8]
+    assert lines[9] == "problem: axis.x.controller: wrong sign"
+
+
+def test_a_service_has_the_name_that_it_is_given() -> None:
+    assert load(PAPER, "bench").name == "bench"
+    result = run("serve", PAPER, "--name", "../bench")
+    assert result.exit_code == 2
+    assert "letters, digits" in result.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,6 +85,28 @@ def measured(path: Path, axis: str | None = None) -> Measured:
         str(path), period_ns * 1e-9, drive, position, given, even, recording.configuration, _digest(recording.paths),
         deadlines * 1e-9,
     )  # fmt: skip
+
+
+def distinct(runs: Sequence[Measured], others: Sequence[Measured] = ()) -> tuple[list[Measured], list[str]]:
+    """Return the runs whose ticks are in no earlier run and in none of `others`, and a sentence for each run left out.
+
+    A copy of a recording is no independent evidence.
+    """
+    seen = {_ticks_of(run): run.name for run in others}
+    retained, sentences = list[Measured](), list[str]()
+    for run in runs:
+        ticks = _ticks_of(run)
+        if ticks in seen:
+            sentences.append(f"{run.name}: holds the same ticks as {seen[ticks]}, and is left out")
+        else:
+            seen[ticks] = run.name
+            retained.append(run)
+    return retained, sentences
+
+
+def _ticks_of(run: Measured) -> str:
+    """SHA-256 of the drive and the position of every tick."""
+    return hashlib.sha256(run.drive_v.tobytes() + run.position_um.tobytes()).hexdigest()
 
 
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:

@@ -15,6 +15,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
+from difflib import get_close_matches
 from typing import IO, Any, NamedTuple
 
 from rtloop.drivers.errors import DriverError
@@ -133,10 +134,19 @@ def _line(error: BaseException, file: str) -> str:
 def _words(error: BaseException) -> str:
     """Type and message of an error on one line, whatever it raises when it is asked for them."""
     try:
-        message = " ".join(str(error).split())
+        message = " ".join(str(error).split()) + _suggestion(error)
     except BaseException:
         message = "its message cannot be shown"
     return f"{type(error).__name__}: {message}" if message else type(error).__name__
+
+
+def _suggestion(error: BaseException) -> str:
+    """Suggest the attribute that is like a missing one."""
+    if not isinstance(error, AttributeError) or not error.name:
+        return ""
+    names = [name for name in dir(error.obj) if not name.startswith("_")]
+    near = [*get_close_matches(error.name, names, 1), *(name for name in names if name.startswith(error.name))]
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _streams() -> list[tuple[int, Any]]:

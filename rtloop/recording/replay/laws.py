@@ -1,15 +1,21 @@
 """The laws of a recording, as they may be run here.
 
-A recording never makes code run by itself. A law that is not shipped is taken from what is installed, or from a file
-that the user names, if it is the recorded one to the letter; from the recording's own text only if the user trusts it.
+A recording never makes code run by itself. A law that is not shipped is taken from what is installed, from a file that
+the user names, or from the file that it ran from, if it is the recorded one to the letter; from the recording's own
+text only if the user trusts it. The file that it ran from counts only where nobody but the user and root can have
+written it, and only if it imports rtloop: a recording by somebody else may name any script.
 """
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from rtloop.hil.trusted import open_file
 from rtloop.law.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER
 from rtloop.laws.limited.first import try_first
@@ -27,6 +33,9 @@ class Trust:
 
 
 NOTHING = Trust()
+MAX_TEXT_BYTES = 1 << 20
+IMPORT = re.compile(r"^(from|import) rtloop\b", re.MULTILINE)
+"""In the text of every law."""
 
 
 def recorded_laws(recording: Recording, trust: Trust = NOTHING) -> tuple[LawReference, ...]:
@@ -75,12 +84,15 @@ def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawR
     for law in (*trust.files, *_installed(name)):
         if law.kind == name and law.sha256 == digest:
             return law
-    if not trust.recorded:
-        raise RecordingError(
-            f"{where}: is not installed here as it ran there (sha256 {str(digest)[:12]}…); --law FILE names the file, "
-            "and --trust-recorded-law runs the text that the recording holds"
-        )
     law = LawReference(name, str(text), str(recording.paths[0]))
+    try:
+        law = _in_place(name, str(digest), entry.get("file"))
+    except ValueError as error:
+        if not trust.recorded:
+            raise RecordingError(
+                f"{where}: is not installed here as it ran there (sha256 {str(digest)[:12]}…), and {error}; --law FILE "
+                "names the file, and --trust-recorded-law runs the text that the recording holds"
+            ) from None
     if law.sha256 != digest:
         raise RecordingError(f"{where}: its recorded text is not the one that ran: the sha256 differs")
     try_first(law.file, law_class, law)
@@ -88,6 +100,22 @@ def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawR
         layout_of([law])
     except (ValueError, KeyError) as error:
         raise RecordingError(f"{where}: {error}") from None
+    return law
+
+
+def _in_place(name: str, digest: str, file: Any) -> LawReference:
+    """The law in the file that it ran from. Raises ValueError with the reason where that file cannot serve."""
+    if not isinstance(file, str) or not file.isprintable():
+        raise ValueError("its file is not recorded")
+    try:
+        with os.fdopen(open_file(Path(file), os.O_RDONLY), "rb") as opened:
+            law = LawReference(name, opened.read(MAX_TEXT_BYTES).decode(), file)
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror}") from None
+    if law.sha256 != digest:
+        raise ValueError(f"{file} has changed since")
+    if not IMPORT.search(law.text):
+        raise ValueError(f"{file} is no law")
     return law
 
 

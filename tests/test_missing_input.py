@@ -1,0 +1,92 @@
+"""A missing input file ends every command that takes one with exit code 66 and one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import pytest
+
+from rtloop.cli import main
+from tests.asked import run
+
+DEPLOY = Path(__file__).resolve().parents[1] / "deploy"
+STAGE, SPEC = DEPLOY / "own-stage.toml", DEPLOY / "own-stage-spec.toml"
+COMMANDS = {
+    "check": ["NONE"],
+    "run": ["NONE"],
+    "serve": ["NONE"],
+    "park": ["NONE"],
+    "doctor": ["NONE"],
+    "drivers": ["--selftest", "NONE"],
+    "info": ["NONE"],
+    "replay": ["NONE"],
+    "cut": ["NONE"],
+    "export": ["NONE", "--to", "npz"],
+    "plot": ["NONE"],
+    "recover": ["NONE"],
+    "import": ["NONE"],
+    "identify hysteresis": ["NONE"],
+    "identify dynamics": ["NONE"],
+    "identify response": ["NONE"],
+    "identify resonance": ["NONE"],
+    "design auto": ["NONE", "NONE", "--specs", SPEC, "--out", "out.toml"],
+    "design compensation": ["NONE", "--actuator", "NONE"],
+    "design robust": ["NONE"],
+    "design shape": ["NONE"],
+    "design synthesise": ["NONE"],
+    "design verify": ["NONE"],
+    "experiment all": ["NONE"],
+    "experiment paper": ["NONE"],
+    "experiment run": ["steps", "NONE"],
+    "experiment report": ["NONE"],
+    "hil serve": ["NONE"],
+    "ctl controller": ["x", "NONE"],
+    "ctl learn": ["x", "NONE"],
+    "ctl waveform": ["x", "NONE"],
+}
+"""Arguments of each command that takes a file; NONE stands for one that is missing."""
+OPTIONS = {
+    "design auto": ["NONE", "NONE", "--specs", "NONE", "--out", "out.toml"],
+    "design compensation": [STAGE, "--actuator", "NONE"],
+    "design shape": [STAGE, "--spec", "NONE"],
+    "design robust": [SPEC, "--config", "NONE"],
+    "design verify": [DEPLOY / "paper.toml", "--spec", "NONE"],
+    "experiment run": ["steps", STAGE, "--beside", "NONE"],
+    "ctl retune": ["x", "--spec", "NONE"],
+}
+"""The same for files that an option names."""
+
+
+def commands(group: click.Group, prefix: str = "") -> dict[str, click.Command]:
+    """All commands below a group by their names."""
+    found: dict[str, click.Command] = {}
+    for name, command in group.commands.items():
+        below = commands(command, f"{prefix}{name} ") if isinstance(command, click.Group) else {prefix + name: command}
+        found |= below
+    return found
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [*COMMANDS.items(), *OPTIONS.items()],
+    ids=[*COMMANDS, *(f"{one}, option" for one in OPTIONS)],
+)
+def test_a_missing_file_ends_a_command_with_66(
+    command: str, arguments: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run(*command.split(), *(tmp_path / "none" if one == "NONE" else one for one in arguments))
+    assert result.exit_code == 66, result.output
+    assert "none" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+
+
+def test_every_command_that_takes_a_file_is_tried() -> None:
+    taking = {
+        name
+        for name, command in commands(main).items()
+        for one in command.params
+        if isinstance(one, click.Argument) and isinstance(one.type, click.Path | click.File)
+    }
+    assert taking <= COMMANDS.keys()
