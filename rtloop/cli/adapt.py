@@ -66,19 +66,24 @@ def learn(
 )
 @click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
 @click.option("--yes", is_flag=True, help="Swap without asking.")
+@click.option(
+    "--swap", "proposal", type=click.File(), help="Measure nothing: swap in the taps of this output of --json."
+)
 @JSON
 @click.pass_context
 @fails_clearly
-def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
+def retune(context: click.Context, axis: str, proposal: Any, as_json: bool, **asked: Any) -> int:
     """Make the taps of AXIS anew for its resonance as it is now.
 
     It is measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in at
-    a tick, after a look at a step before and after. With --json and without --yes nothing is swapped. Exit 1 where the
-    taps stayed.
+    a tick, after a look at a step before and after. With --json and without --yes nothing is swapped, and the output is
+    a proposal for --swap. Exit 1 where the taps stayed.
     """
-    from rtloop.commands.adapt.retune import Asked
+    from rtloop.commands.adapt.retune import Asked, swap
     from rtloop.commands.adapt.retune import retune as retune_axis
 
+    if proposal is not None:
+        return swap(client_of(context), axis, proposal.read(), as_json)
     return retune_axis(client_of(context), Asked(axis=axis, **asked), as_json)
 
 
