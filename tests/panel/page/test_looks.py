@@ -10,7 +10,7 @@ from tests.faults.bench import Bench
 from tests.panel.page.browser import AXE, running, said, stopped
 
 MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
-VIEWS = ("scope", "xy", "spectrum", "timing", "recordings")
+VIEWS = ("scope", "xy", "spectrum", "timing", "recordings", "measure")
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
 
 
