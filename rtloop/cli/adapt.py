@@ -72,19 +72,25 @@ def learn(
 )
 @click.option("--spec", type=OUTPUT, help="The specification [the axis's].")
 @click.option("--yes", is_flag=True, help="Swap without asking.")
+@click.option(
+    "--swap", "proposal", type=click.File(), help="Measure nothing: swap in the taps of this output of --json."
+)
 @JSON
 @click.pass_context
 @fails_clearly
-def retune(context: click.Context, axis: str, as_json: bool, **asked: Any) -> int:
+def retune(context: click.Context, axis: str, proposal: Any, as_json: bool, **asked: Any) -> int:
     """Make the taps of AXIS anew for its resonance and gain as they are now.
 
     Both are measured in closed loop about the reference that is held; the taps are made beside the loop and swapped in
     at a tick, after a look at a step before and after. Taps that are no better than those in force are not swapped in,
-    --yes or not; with --json and without --yes none are. Exit 1 where the taps stayed.
+    --yes or not; with --json and without --yes none are, and the output is a proposal for --swap. Exit 1 where the taps
+    stayed.
     """
-    from rtloop.commands.adapt.retune import Asked
+    from rtloop.commands.adapt.retune import Asked, swap
     from rtloop.commands.adapt.retune import retune as retune_axis
 
+    if proposal is not None:
+        return swap(client_of(context), axis, proposal.read(), as_json)
     if asked["spec"] is not None:
         require_text(asked["spec"])
     return retune_axis(client_of(context), Asked(axis=axis, **asked), as_json)

@@ -37,6 +37,7 @@ from rtloop.service.desk import Desk, Refused
 from rtloop.service.lock import Lock
 from rtloop.service.measuring.measurement import Results
 from rtloop.service.measuring.quality import Quality
+from rtloop.service.measuring.underway import Underway
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
 from rtloop.signals import Flag, Mode
@@ -88,6 +89,7 @@ class Service:
         self.supervisor: Supervisor | None = None
         self.live: LiveLaw | None = None
         self.measured: dict[str, Results] = {}
+        self.underway = Underway()
         self.quality = Quality()
         self._desk: Desk | None = None
         self._ending, self._reload = threading.Event(), threading.Event()

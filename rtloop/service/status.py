@@ -20,7 +20,9 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """State, who drives, timing over the last ticks, faults, whether ticks are recorded, and the newest signals."""
+    """State, lock holder, measurement under way, timing over the last ticks, faults, state of the recording, and the
+    newest signals.
+    """
     supervisor = service.supervisor
     report: dict[str, Any] = {
         "name": service.configuration.name,
@@ -28,6 +30,7 @@ def status(service: Service) -> dict[str, Any]:
         "armed": service.armed,
         "faults": list(service.faults),
         "lock": service.lock.held,
+        "measuring": service.underway.for_json(),
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
         "recording": {} if supervisor is None else recording_state(supervisor.block) | supervisor.recorder.written,

@@ -65,7 +65,7 @@ def test_a_name_that_is_no_utf_8_hides_no_recording(served: Served, folder: Path
 
 
 def test_figures_of_such_a_name(served: Served, monkeypatch: pytest.MonkeyPatch):
-    async def said(command: list[str]) -> dict[str, Any]:
+    async def said(command: list[str], *_: Any) -> dict[str, Any]:
         if os.fsencode(command[-2]).endswith(LATIN):
             return {"recording": command[-2]}
         raise aside.Failed(f"{command[-2]}: damaged")

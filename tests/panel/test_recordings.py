@@ -223,11 +223,9 @@ def test_sweeps(panel: Panel, captured: dict[str, Any]):
         assert (answer.code, bool(answer.json["error"])) == (422, True), wrong
 
 
-def test_few_at_a_time(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rtloop.panel.shelf.aside.MOST_WAITING", 2)
-
+def test_few_at_a_time():
     async def many() -> list[Any]:
-        aside = Aside()
+        aside = Aside(most_waiting=2)
         asked = [aside.run("rtloop.nowhere") for _ in range(5)]
         return await asyncio.gather(*asked, return_exceptions=True)
 

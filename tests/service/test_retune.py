@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from rtloop.commands.adapt.retune import Asked, retune
+from rtloop.commands.adapt.retune import Asked, retune, swap
 from rtloop.design.robust.shape import Subject
-from rtloop.errors import LoopFault, NoDesign
+from rtloop.errors import ConfigError, LoopFault, NoDesign
 
 HZ, DAMPING, PERIOD_S = 600.0, 0.02, 1e-4
 LOW_GAIN = 0.95, 0.001
@@ -195,3 +195,27 @@ def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path
     with pytest.raises(LoopFault, match=said):
         retune(service, asked(), as_json=False)  # type: ignore[arg-type]
     assert not service.tuned
+
+
+def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    service = Service(tmp_path, 1.06 * HZ)
+    retune(service, asked(yes=False), as_json=True)  # type: ignore[arg-type]
+    proposal = json.loads(capsys.readouterr().out)
+    assert swap(service, "x", json.dumps(proposal), as_json=True) == 0  # type: ignore[arg-type]
+    assert json.loads(capsys.readouterr().out) == {"tick": 1234}
+    np.testing.assert_allclose(service.tuned["command_taps"], proposal["prefilter"]["command_taps"], rtol=1e-12)
+    assert overshoot(1.06 * HZ, service.tuned) < 0.011
+
+    stale = proposal | {"replaces": proposal["prefilter"]}
+    for axis, text, error, said in (
+        ("x", json.dumps(stale), LoopFault, "changed since the proposal"),
+        ("z", json.dumps(proposal), ConfigError, "axis: 'z' is not there"),
+        ("x", "{}", ConfigError, "is no output of"),
+        ("x", json.dumps(proposal | {"prefilter": {"taps": [1.0], "command_taps": [[0.0]]}}), ConfigError, "no output"),
+    ):
+        service.tuned = {}
+        with pytest.raises(error, match=said):
+            swap(service, axis, text, as_json=True)  # type: ignore[arg-type]
+        assert not service.tuned

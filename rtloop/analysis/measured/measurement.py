@@ -63,8 +63,10 @@ class Measurement:
         found, loop = self.response, self.loop.loop
         curves = fields_of(found) | {"loop": loop, "loop_spread": self.loop.spread}
         curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
+        curves["sensitivity_spread"] = np.abs(curves["tracking"]) * self.loop.spread
         if self.model is not None:
             curves["model_loop"] = self.model.open(found.hz)
+            curves["model_sensitivity"] = 1 / (1 + curves["model_loop"])
         return plain(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:

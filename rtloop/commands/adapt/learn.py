@@ -10,16 +10,14 @@ import click
 
 from rtloop.design.identification.identified import write_new
 from rtloop.service.client import Client
+from rtloop.service.client.client import LONGEST_MEASUREMENT_S
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console, table
-
-LONGEST_S = 360.0
-"""How long an answer may take."""
 
 
 def learn(client: Client, body: Mapping[str, Any], out: Path | None, as_json: bool) -> int:
     """Have a running service learn; at Ctrl-C what was held is held again. Raises RtloopError."""
-    content = client.move("/learn", body, LONGEST_S)
+    content = client.move("/learn", body, LONGEST_MEASUREMENT_S)
     if out is not None:
         rows = zip(content["reference_um"], content["command_um"], strict=True)
         write_new(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))

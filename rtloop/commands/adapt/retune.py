@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 
 from rtloop.analysis.perturbation import resonance_hz, with_gain_changed, with_resonance_shifted
 from rtloop.configuration.axis import AxisOptions
-from rtloop.configuration.file import parse
+from rtloop.configuration.file import Configuration, parse
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.section import taps_values
 from rtloop.design.robust.shape import EXCESS, PROOF_POINTS, Judged, Subject, judged_of, shaped
@@ -60,9 +61,7 @@ class Stage(NamedTuple):
 
 def retune(client: Client, asked: Asked, as_json: bool) -> int:
     """Measure, redesign, show, swap; 0 where the taps in force are the new ones. Raises RtloopError."""
-    running = client.get("/configuration")
-    text, folder = section("", running["values"]), Path(running["folder"])
-    configuration = parse(text, "running", folder, "the running configuration")
+    configuration = _running(client)
     axis, subject, _ = subject_in(configuration, asked.axis, asked.spec)
     stage = _measured(client, asked, subject)
     shifted = with_gain_changed(with_resonance_shifted(subject.plant, stage.percent), stage.gain_percent or 0.0)
@@ -77,13 +76,13 @@ def retune(client: Client, asked: Asked, as_json: bool) -> int:
         swapped = asked.yes or (not as_json and click.confirm("swap the taps in?", err=True))
     tick = None
     if swapped:
-        for part in np.arange(1, STAGES + 1) / STAGES:
-            tick = _swapped(client, asked.axis, _between(in_force, found.taps, part))
+        tick = _swap_in(client, asked.axis, in_force, found.taps)
     if as_json:
         measured = {"resonance": stage.mode, "percent_from_model": stage.percent, "gain": stage.gain,
                     "gain_percent_from_model": stage.gain_percent}  # fmt: skip
         steps = {"before": before._asdict(), "after": after._asdict(), "better": better}
-        echo_json({**measured, **steps, "settling_ms": found.settling_ms, "tick": tick})
+        taps = {"replaces": taps_values(in_force), "prefilter": taps_values(found.taps)}
+        echo_json({**measured, **steps, "settling_ms": found.settling_ms, "tick": tick, **taps})
     elif tick is not None:
         click.echo(f"swapped at tick {tick}")
     elif not better:
@@ -131,6 +130,51 @@ def _is_better(subject: Subject, before: Judged, after: Judged) -> bool:
         or before.overshoot > max(subject.overshoot, after.overshoot)
         or before.excess > max(EXCESS, after.excess)
     )
+
+
+def swap(client: Client, name: str, proposal: str, as_json: bool) -> int:
+    """Swap in the taps of an earlier `retune --json`, whose text `proposal` is, on the axis `name`; 0 when it is done.
+
+    Raises ConfigError for another text, LoopFault where the taps in force are no longer those that were compared.
+    """
+    axis = next((one for one in _running(client).axes if one.name == name), None)
+    if axis is None:
+        raise ConfigError("retune", [f"axis: {name!r} is not there"])
+    try:
+        parts = json.loads(proposal)
+        replaced, new = (_taps_from(parts[key]) for key in ("replaces", "prefilter"))
+    except (ValueError, KeyError, TypeError, RecursionError):
+        fault = "proposal: is no output of `rtloop ctl retune AXIS --json`, which is needed"
+        raise ConfigError("retune", [fault]) from None
+    if taps_values(replaced) != taps_values(_taps_of(axis)):
+        raise LoopFault(f"retune: the taps of axis {name} were changed since the proposal was made; retune again")
+    tick = _swap_in(client, name, replaced, new)
+    if as_json:
+        echo_json({"tick": tick})
+    else:
+        click.echo(f"swapped at tick {tick}")
+    return 0
+
+
+def _running(client: Client) -> Configuration:
+    """The configuration as it runs."""
+    running = client.get("/configuration")
+    text, folder = section("", running["values"]), Path(running["folder"])
+    return parse(text, "running", folder, "the running configuration")
+
+
+def _taps_from(values: dict[str, list[float]]) -> Taps:
+    """Taps from the values that `taps_values` made of them. Raises KeyError, TypeError, ValueError for others."""
+    reference, command = (np.array(values[key], float) for key in ("taps", "command_taps"))
+    if reference.ndim != 1 or command.shape != reference.shape:
+        raise ValueError("two rows of as many taps are needed")
+    return Taps(reference, command, 0.0)
+
+
+def _swap_in(client: Client, axis: str, old: Taps, new: Taps) -> int:
+    """Change from the old taps to the new ones in STAGES; the tick of the last one."""
+    ticks = [_swapped(client, axis, _between(old, new, part)) for part in np.arange(1, STAGES + 1) / STAGES]
+    return ticks[-1]
 
 
 def _swapped(client: Client, axis: str, taps: Taps) -> int:

@@ -24,12 +24,14 @@ def plot_response(content: Mapping[str, Any], output: Path) -> None:
     figure, ((magnitude, plane), (phase, sensitivity)) = figure_of(2, 2, (12, 8))
     margins = content["margins"]
     _with_spread(magnitude, hz, np.abs(loop), np.abs(loop) * spread)
-    _with_spread(sensitivity, hz, 1 / np.abs(1 + loop), np.abs(loop) * spread / np.abs(1 + loop) ** 2)
+    size = np.abs(_complex(curves["sensitivity"]))
+    _with_spread(sensitivity, hz, size, size * np.array(curves["sensitivity_spread"], float))
     phase.semilogx(hz, np.degrees(np.unwrap(np.angle(loop))), ".-", color=MEASURED, markersize=3, linewidth=0.8)
     plane.plot(loop.real, loop.imag, ".-", color=MEASURED, markersize=3, linewidth=0.8, label="measured")
     if model is not None:
         magnitude.loglog(hz, np.abs(model), color=PROMISED, linewidth=0.8, label="model")
-        sensitivity.loglog(hz, 1 / np.abs(1 + model), color=PROMISED, linewidth=0.8, label="model")
+        promised = np.abs(_complex(curves["model_sensitivity"]))
+        sensitivity.loglog(hz, promised, color=PROMISED, linewidth=0.8, label="model")
         phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=PROMISED, linewidth=0.8)
         plane.plot(model.real, model.imag, color=PROMISED, linewidth=0.8, label="model")
     plane.plot([-1], [0], "+", color="tab:red", markersize=10)

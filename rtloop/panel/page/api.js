@@ -50,8 +50,8 @@ const named = (path) => (who.name ? `${path}?as=${encodeURIComponent(who.name)}`
 
 export const get = async (path) => (await ask(path)).json();
 
-export const post = async (path, body = {}) => {
-  const response = await ask(path, posted(body));
+export const post = async (path, body = {}, options = {}) => {
+  const response = await ask(path, { ...posted(body), ...options });
   return response.status === 204 ? {} : response.json();
 };
 
@@ -59,7 +59,7 @@ export const post = async (path, body = {}) => {
 export const getArrays = async (path) => decode(await (await ask(path)).arrayBuffer());
 
 /** A command under the name of who drives; returns what the service answers. Raises Refusal. */
-export const command = (name, body) => post(named(`/api/${name}`), body);
+export const command = (name, body, options) => post(named(`/api/${name}`), body, options);
 
 export const releaseLock = async () => (await ask(named("/api/lock"), { method: "DELETE" })).json();
 

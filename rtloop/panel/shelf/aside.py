@@ -22,37 +22,48 @@ class Crowded(Exception):
 
 
 class Failed(RtloopError):
-    """What a process says that could not do what it was to."""
+    """What a process says that could not do what it was to; `code` is its exit code, where it says that."""
+
+    def __init__(self, error: str, code: int | None = None) -> None:
+        super().__init__(error)
+        self.code = code
 
 
 class Aside:
     """Runs Python modules as processes."""
 
-    def __init__(self) -> None:
-        self._turn = asyncio.Semaphore(AT_A_TIME)
+    def __init__(
+        self, at_a_time: int = AT_A_TIME, most_waiting: int = MOST_WAITING, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        self._turn = asyncio.Semaphore(at_a_time)
+        self._most_waiting, self._timeout_s = most_waiting, timeout_s
         self._there = 0
 
-    async def run(self, module: str, *arguments: object) -> dict[str, Any]:
-        """The JSON object that `python -m module arguments` prints. Raises Crowded, or Failed with its `error`."""
-        if self._there >= MOST_WAITING:
-            raise Crowded(f"{counted(MOST_WAITING, 'request')} of this kind wait already; try again")
+    async def run(self, module: str, *arguments: object, stdin: str = "") -> dict[str, Any]:
+        """The JSON object that `python -m module arguments` prints; it reads `stdin`, and ends where this is cancelled.
+
+        Raises Crowded, or Failed with its `error`.
+        """
+        if self._there >= self._most_waiting:
+            raise Crowded(f"{counted(self._most_waiting, 'request')} of this kind wait already; try again")
         self._there += 1
         try:
             async with self._turn:
-                return await _said([sys.executable, "-m", module, *map(str, arguments)])
+                command = [sys.executable, "-m", module, *map(str, arguments)]
+                return await _said(command, stdin.encode(), self._timeout_s)
         finally:
             self._there -= 1
 
 
-async def _said(command: list[str]) -> dict[str, Any]:
+async def _said(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, Any]:
     pipe, nothing = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
-        *command, stdin=nothing, stdout=pipe, stderr=nothing, env=os.environ | CALM
+        *command, stdin=pipe, stdout=pipe, stderr=nothing, env=os.environ | CALM
     )
     try:
-        out, _ = await asyncio.wait_for(process.communicate(), TIMEOUT_S)
+        out, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
     except TimeoutError:
-        raise Failed(f"not done within {TIMEOUT_S:g} s: the recording is too long for the page") from None
+        raise Failed(f"not done within {timeout_s:g} s: it takes too long for the page; use the command line") from None
     finally:
         if process.returncode is None:
             with suppress(ProcessLookupError):
@@ -63,5 +74,5 @@ async def _said(command: list[str]) -> dict[str, Any]:
     except ValueError:
         raise Failed(f"{command[2]} ended with {process.returncode}") from None
     if "error" in said:
-        raise Failed(said["error"])
+        raise Failed(said["error"], said.get("exit_code"))
     return said

@@ -28,6 +28,7 @@ from rtloop.panel.web.loop import loop_for_pages
 from rtloop.panel.web.measure import measure
 from rtloop.panel.web.proxy import Proxy, decoded, limited_body
 from rtloop.panel.web.rates import Rates, client_of
+from rtloop.panel.web.retuning import Retuning
 from rtloop.panel.web.security import Guard, Sessions, session_cookie
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
@@ -90,6 +91,7 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         Route("/api/panel", panel),
         Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
+        *Retuning(service).routes(),
         *recordings.routes(service, lambda: feed.run),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -13,25 +14,29 @@ from rtloop.errors import HostRefused, UnavailableError
 from rtloop.panel.views.link import Service
 from rtloop.panel.views.state import NO_ANSWER
 from rtloop.panel.web.rates import Rate
+from rtloop.service.api.asking import at_disconnect
 from rtloop.service.api.bodies import MAX_BODY_BYTES
 from rtloop.service.api.lanes import Busy, Lane, Lanes
-from rtloop.service.client.client import Unanswered
+from rtloop.service.client.client import LONGEST_MEASUREMENT_S, HangUp, Unanswered
 
 READ = ("status", "configuration", "metrics", "openapi.json")
 COMMANDS = {
     **dict.fromkeys(("arm", "start", "mode", "reference", "setpoint", "waveform", "lock"), Lane.ORDINARY),
     **dict.fromkeys(("tune", "controller", "preview", "undo"), Lane.BUILD),
     **dict.fromkeys(("stop", "reset"), Lane.SAFETY),
-    "response": Lane.MEASUREMENT,
+    **dict.fromkeys(("response", "learn"), Lane.MEASUREMENT),
 }
 SMALL_BYTES = 1 << 16
-LARGE = {"waveform": MAX_BODY_BYTES}
+LARGE = {"waveform": MAX_BODY_BYTES, "learn": MAX_BODY_BYTES}
 """Bodies that may have more than SMALL_BYTES."""
-TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: 150.0}
+TIMEOUT_S = {Lane.ORDINARY: 20.0, Lane.SAFETY: 20.0, Lane.BUILD: 150.0, Lane.MEASUREMENT: LONGEST_MEASUREMENT_S}
 
 
 class Proxy:
-    """Hands requests on, each kind in threads of its own: a stop waits for no other request."""
+    """Hands requests on, each kind in threads of its own: a stop waits for no other request.
+
+    What moves a loop to measure it ends with the page that asked for it; other requests are finished without it.
+    """
 
     def __init__(self, service: Service) -> None:
         self._service, self._lanes = service, Lanes()
@@ -66,9 +71,12 @@ class Proxy:
         resource = request.url.path.removeprefix("/api")
         if request.url.query:
             resource += f"?{request.url.query}"
-        exchange = self._service.client.exchange
+        exchange, hang_up = self._service.client.exchange, HangUp()
+        arguments = request.method, resource, body, TIMEOUT_S[lane], hang_up
+        ends_with_page = lane is Lane.MEASUREMENT
         try:
-            code, kind, data = await self._lanes.run(lane, exchange, request.method, resource, body, TIMEOUT_S[lane])
+            async with at_disconnect(request, hang_up.end) if ends_with_page else nullcontext():
+                code, kind, data = await self._lanes.run(lane, exchange, *arguments)
         except Unanswered as error:
             return JSONResponse({"error": f"{NO_ANSWER}: {error.reason}"}, status_code=503)
         except (UnavailableError, HostRefused, Busy) as error:

@@ -89,7 +89,7 @@ ACTIONS: dict[str, tuple[type[Body] | None, str, Action]] = {
                       body.axis, body.columns, body.hold_ticks, body.repeat))),
     "/response": (ResponseBody, "Measure the response of the closed loop about the reference that is held.",
                   lambda service, body: _response(service, body)),
-    "/learn": (LearnBody, "Play a period and learn it; it goes on playing.",
+    "/learn": (LearnBody, "Play a period and learn it; it goes on playing unless `keep` is false.",
                lambda service, body: _learn(service, body)),
     "/tune": (TuneBody, "Change keys of controller, limits, interlocks, prefilter or model.",
               lambda service, body: _tick(_live(service).tune(body.axis, body.section, body.values))),
@@ -122,7 +122,8 @@ def _reference(service: Service, body: ReferenceBody) -> int:
 
 def _response(service: Service, body: ResponseBody) -> dict[str, Any]:
     """Figures and lines; the figures stay with the service."""
-    found = measure(*_running(service, "response"), body.axis, Asked(**body.model_dump(exclude={"axis"})))
+    with service.underway.begin("response", body.axis):
+        found = measure(*_running(service, "response"), body.axis, Asked(**body.model_dump(exclude={"axis"})))
     service.measured.setdefault(body.axis, Results()).note(found)
     return found.for_json()
 
@@ -134,8 +135,10 @@ def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
-    """Every cycle, and the table that is played now."""
-    return learn(*_running(service, "learn"), body.axis, body.asked).for_json()
+    """Every cycle, and the best table, which is played now if it is to be kept."""
+    running, underway = _running(service, "learn"), service.underway
+    with underway.begin("learn", body.axis, body.cycles):
+        return learn(*running, body.axis, body.asked, underway.add_cycle).for_json()
 
 
 def _running(service: Service, doing: str) -> tuple[Supervisor, LiveLaw]:
@@ -197,6 +200,7 @@ def application(service: Service) -> Starlette:
         async with stream(socket) as accepted:
             while accepted:
                 said = {"state": service.state, "faults": list(service.faults), "lock": service.lock.held}
+                said["measuring"] = service.underway.for_json()
                 await socket.send_text(json.dumps(said | newest_signals(service)))
                 await asyncio.sleep(1 / WATCH_HZ)
 

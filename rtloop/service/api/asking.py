@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from typing import Any
 from urllib.parse import parse_qs
@@ -21,8 +21,8 @@ from rtloop.service.measuring.client_presence import on_behalf_of
 from rtloop.service.service import Service
 
 
-def _name(connection: HTTPConnection) -> str:
-    """Who asks: `?as=NAME`. Raises ConfigError for what is no name."""
+def asker_name(connection: HTTPConnection) -> str:
+    """Return the name in `?as=NAME`, OPERATOR where there is none. Raises ConfigError for what is no name."""
     try:
         text = connection.scope.get("query_string", b"").decode("ascii")
         query = parse_qs(text, keep_blank_values=True, errors="strict")
@@ -44,9 +44,9 @@ def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -
     if path == "/preview":
         return nullcontext()
     if path != "/stop" and not (path == "/mode" and body.mode == "off"):
-        return service.lock.driving(_name(connection))
+        return service.lock.driving(asker_name(connection))
     try:
-        return asked_by(Asker(_name(connection)))
+        return asked_by(Asker(asker_name(connection)))
     except ConfigError:
         return asked_by(NOBODY)
 
@@ -55,16 +55,23 @@ def asking(service: Service, connection: HTTPConnection, path: str, body: Any) -
 async def watching_client(request: Request) -> AsyncIterator[None]:
     """Work on a request whose body was read; the work in between can ask whether the client's connection stands."""
     gone = threading.Event()
+    async with at_disconnect(request, gone.set):
+        with on_behalf_of(lambda: not gone.is_set()):
+            yield
+
+
+@asynccontextmanager
+async def at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
+    """Call `action` where the connection of a request, whose body was read, ends before the work in between."""
 
     async def watch() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass
-        gone.set()
+        action()
 
     watcher = asyncio.create_task(watch())
     try:
-        with on_behalf_of(lambda: not gone.is_set()):
-            yield
+        yield
     finally:
         watcher.cancel()
 
@@ -72,7 +79,7 @@ async def watching_client(request: Request) -> AsyncIterator[None]:
 def lock(service: Service, connection: HTTPConnection, data: bytes | None) -> Response:
     """Take the lock, break it open where there is a key, or release it where there is no body."""
     try:
-        name = _name(connection)
+        name = asker_name(connection)
         if data is None:
             service.lock.release(name)
             return JSONResponse({})

@@ -126,11 +126,12 @@ class LearnBody(Body):
     samples: Annotated[list[float], FailFast(), Field(min_length=4)]
     cycles: int = Field(default=Taught.cycles, ge=1, le=50)
     resonance_percent: float = Field(default=Taught.resonance_percent, ge=0, lt=50)
+    keep: bool = Taught.keep
 
     @property
     def asked(self) -> Taught:
         """As it is learned."""
-        return Taught(np.array(self.samples), self.cycles, self.resonance_percent)
+        return Taught(np.array(self.samples), self.cycles, self.resonance_percent, self.keep)
 
 
 class TuneBody(Body):

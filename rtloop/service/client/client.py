@@ -6,7 +6,9 @@ import http.client
 import json
 import socket
 import struct
+import threading
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,6 +18,8 @@ from rtloop.hil.trusted import Untrusted, owners
 from rtloop.supervision.paths import refusal
 
 TIMEOUT_S = 20.0
+LONGEST_MEASUREMENT_S = 360.0
+"""How long the answer to a measurement may take: a learning may last 300 s."""
 _TIMEVAL, _CREDENTIALS = struct.Struct("@ll"), struct.Struct("3i")
 """Process, user and group of a peer (unix(7))."""
 
@@ -71,6 +75,34 @@ class Unanswered(UnavailableError):
         super().__init__(f"{path}: no service answers there ({self.reason})")
 
 
+class HangUp:
+    """Ends one exchange from another thread: what moves an axis for a client ends with the client's connection."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._connection: socket.socket | None = None
+        self._ended = False
+
+    def take(self, connection: socket.socket) -> None:
+        """Hold the connection of the exchange; it is cut at once where the exchange was ended before."""
+        with self._lock:
+            self._connection = connection
+            if self._ended:
+                _cut(connection)
+
+    def end(self) -> None:
+        """Cut the connection, now or as soon as it stands; whoever waits for the answer gets Unanswered."""
+        with self._lock:
+            self._ended = True
+            if self._connection is not None:
+                _cut(self._connection)
+
+
+def _cut(connection: socket.socket) -> None:
+    with suppress(OSError):  # closed already
+        connection.shutdown(socket.SHUT_RDWR)
+
+
 class Client:
     """Talks to the service at `path`, under a name where one is given."""
 
@@ -121,11 +153,22 @@ class Client:
             raise Unanswered(self.path, error) from None
 
     def exchange(
-        self, method: str, resource: str, body: str | bytes | None, timeout_s: float = TIMEOUT_S
+        self,
+        method: str,
+        resource: str,
+        body: str | bytes | None,
+        timeout_s: float = TIMEOUT_S,
+        hang_up: HangUp | None = None,
     ) -> tuple[int, str, bytes]:
-        """Status, type and body of an answer, whatever they are. Raises UnavailableError, HostRefused."""
+        """Status, type and body of an answer, whatever they are; `hang_up` lets another thread break it off.
+
+        Raises UnavailableError, HostRefused.
+        """
         connection = _UnixConnection(self.path, timeout_s)
         try:
+            if hang_up is not None:
+                connection.connect()
+                hang_up.take(connection.sock)
             connection.request(method, resource, body, {"Content-Type": "application/json"})
             response = connection.getresponse()
             return response.status, response.getheader("Content-Type") or "", response.read()

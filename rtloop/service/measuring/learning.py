@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -33,6 +34,8 @@ class Asked:
     cycles: int = 5
     resonance_percent: float = 2.0
     """Nothing is played unless the error shrinks with the resonance anywhere within so much of the model's."""
+    keep: bool = True
+    """Whether the best table goes on playing at the end; else what was held is held again."""
 
 
 class Cycle(NamedTuple):
@@ -43,7 +46,7 @@ class Cycle(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Every cycle, the first one with nothing learned; the best table (n, 2), which goes on playing; why it ended."""
+    """Every cycle, the first one with nothing learned; the best table (n, 2); why it ended."""
 
     cycles: list[Cycle]
     table: Real
@@ -56,13 +59,17 @@ class Learned(NamedTuple):
         return {"cycles": cycles, "ended": self.ended, "reference_um": reference, "command_um": command}
 
 
-def learn(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Learned:
+def learn(
+    supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked, add_cycle: Callable[[float], None] = lambda _: None
+) -> Learned:
     """Play a period again and again on an axis that holds a reference, and learn it.
 
+    `add_cycle` receives the rms error of each cycle, µm, as soon as it is judged.
+
     Raises ConfigError for what can be granted in no state, and for a loop in which learning would not converge; Refused
-    for what this state does not allow, and where it was given up: the loop then plays the best table, or holds what it
-    held, unless it tripped or somebody else has set a reference. Raises ClientGone where the client went away before
-    the end: the loop then holds what it held, for nobody has seen what a table does.
+    for what this state does not allow, and where it was given up: the loop then plays the best table, where that is to
+    be kept, or holds what it held, unless it tripped or somebody else has set a reference. Raises ClientGone where the
+    client went away before the end: the loop then holds what it held, for nobody has seen what a table does.
     """
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
@@ -72,24 +79,26 @@ def learn(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Lea
         raise _unsuitable(f"{asked.cycles} cycles take {took_s:.0f} s; at most {LONGEST_S:g} s are allowed")
     teacher = _teacher(live, number, asked)
     player = Player(supervisor, live, number, "learn")
-    tried = _Tried()
+    tried = _Tried(add_cycle)
     try:
         glide = _glide(player.hold_um, float(asked.wanted_um[0]), round(GLIDE_S * rate_hz))
         player.read(player.play(glide), len(glide))
         ended = _taught(player, teacher, asked, settle, judged, tried)
-        player.play(tried.best, repeat=True)
+        _leave(player, tried, asked.keep)
         require_client("learn")
     except Exception:
         if player.ours:
             with suppress(RtloopError):
-                _leave(player, tried)
+                _leave(player, tried, asked.keep)
         raise
     return Learned(tried.cycles, tried.best, ended)
 
 
-def _leave(player: Player, tried: _Tried) -> None:
-    """Play the best table that was judged, for a client that still waits; else hold what was held. Raises Refused."""
-    if tried.tables and client_waits():
+def _leave(player: Player, tried: _Tried, keep: bool) -> None:
+    """Play the best table that was judged, where it is to be kept, for a client that still waits; else hold what was
+    held. Raises Refused.
+    """
+    if keep and tried.tables and client_waits():
         player.play(tried.best, repeat=True)
     else:
         player.hold(player.hold_um)
@@ -98,7 +107,8 @@ def _leave(player: Player, tried: _Tried) -> None:
 class _Tried:
     """Tables and what became of each."""
 
-    def __init__(self) -> None:
+    def __init__(self, add_cycle: Callable[[float], None]) -> None:
+        self._add_cycle = add_cycle
         self.cycles: list[Cycle] = []
         self.tables: list[Real] = []
 
@@ -106,6 +116,7 @@ class _Tried:
         """Another one."""
         self.tables.append(table)
         self.cycles.append(Cycle(rms(error_um), float(np.abs(error_um).max())))
+        self._add_cycle(self.cycles[-1].rms_um)
 
     @property
     def number(self) -> int:

@@ -17,7 +17,7 @@ from tests.faults.bench import Bench
 from tests.panel.page.browser import AXE, opened, running, said, stopped
 
 MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
-VIEWS = ("scope", "xy", "spectrum", "timing", "recordings")
+VIEWS = ("scope", "xy", "spectrum", "timing", "recordings", "measure")
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
 
 ATTACKS = """async (panel) => {

@@ -94,6 +94,19 @@ def test_no_origin_at_all(browser: Browser):
         assert browser.request("DELETE", "/api/lock", headers=headers)[0] == REFUSED
 
 
+def test_measurements_and_swaps_are_for_pages_with_a_session_alone(browser: Browser):
+    row = {"taps": [1.0], "command_taps": [0.0]}
+    bodies = {"swap": {"axis": "x", "replaces": row, "prefilter": row}}
+    for name in ("response", "learn", "retune", "swap"):
+        body = bodies.get(name, {"axis": "x"})
+        path = f"/api/{name}?as=ada"
+        assert browser.request("POST", path, body, {"Origin": "http://evil.example"})[0] == REFUSED
+        assert browser.request("POST", path, body, {"Origin": None})[0] == REFUSED
+        assert browser.request("POST", path, body, {"Cookie": None})[0] == UNKNOWN
+        assert browser.request("GET", path)[0] == 405
+        assert browser.request("POST", path, body)[0] == HANDED_ON
+
+
 def test_no_session_and_a_stale_one(browser: Browser):
     name, _, session = browser.cookie.partition("=")
     for cookie in (None, "", f"{name}=", f"{name}=x", f"other={session}", f"{name}={session}x", f"{name}={'x' * 9000}",
@@ -195,7 +208,8 @@ def test_what_pages_may_do(browser: Browser):
 
 
 def test_bodies_that_are_too_large(browser: Browser):
-    for path, size, code in (("setpoint", 1 << 17, 413), ("waveform", 1 << 17, 503), ("waveform", 5 << 20, 413)):
+    for path, size, code in (("setpoint", 1 << 17, 413), ("waveform", 1 << 17, 503), ("waveform", 5 << 20, 413),
+                             ("learn", 1 << 17, 503), ("learn", 5 << 20, 413), ("retune", 1 << 17, 413)):  # fmt: skip
         try:
             assert browser.request("POST", f"/api/{path}", b"x" * size)[0] == code
         except (BrokenPipeError, ConnectionResetError):

@@ -41,8 +41,8 @@ export class Drive {
     live.addEventListener("state", ({ detail }) => this.#show(detail));
   }
 
-  /** Send a command under the name of who drives; its answer, or null with the refusal shown in `place`. */
-  async driving(name, body, place) {
+  /** Send a command under the name of who drives; its answer, or null with the refusal shown in `place`; `options` of fetch. */
+  async driving(name, body, place, options) {
     who.name = $("who").value;
     if (!who.name) {
       complain($("lock-error"), "Say who drives: your name is recorded with what you do.");
@@ -50,7 +50,7 @@ export class Drive {
       return null;
     }
     try {
-      const answer = await command(name, body);
+      const answer = await command(name, body, options);
       complain(place, null);
       complain($("lock-error"), null);
       return answer;

@@ -17,9 +17,10 @@ export class Views {
   #beside = "xy";
   #scope;
 
-  constructor(live, panel, scope, strip) {
+  /** `measure` is the view that measures the loop. */
+  constructor(live, panel, scope, strip, measure) {
     this.#scope = scope;
-    this.#parts = { xy: new Xy(live, panel), spectrum: new Spectrum(live, panel), timing: new Timing(live), recordings: new Recordings(scope) };
+    this.#parts = { xy: new Xy(live, panel), spectrum: new Spectrum(live, panel), timing: new Timing(live), recordings: new Recordings(scope), measure };
     for (const button of document.querySelectorAll("#views [data-view]")) {
       button.addEventListener("click", () => this.choose(button.dataset.view));
     }

@@ -1,0 +1,197 @@
+// The loop as it is: its response, its light mode, taps for it, a scan that is learned. The service does it; here it is
+// started, watched, cancelled, shown, and agreed to.
+
+import { $, complain, say } from "../dom.js";
+import { columns } from "../desk/reference.js";
+import { fixed, fromField, significant } from "../numbers.js";
+import { Picker } from "../picker.js";
+import { Curves } from "./curves.js";
+import { showLearned, showMargins, showRetuned } from "./tables.js";
+
+/** Each activity: its name, the resource that does it, and its explanation. */
+const ACTIVITIES = {
+  response: ["Response", "response", "Measures L and S: a multisine moves the position about the held reference, by no more than the amplitude."],
+  resonance: ["Resonance", "response", "Measures the light mode alone: a multisine about its frequency moves the position by no more than the amplitude."],
+  retune: ["Retune", "retune", "Measures the resonance and works out new taps for it. Nothing changes before you agree."],
+  learn: ["Learn", "learn", "Plays the scan in a file, one period, a number to a line and tick, and corrects it from cycle to cycle. No table stays before you agree."],
+};
+const PROPOSALS = ["retuned", "learned"];
+
+export class Measure {
+  #drive;
+  #configuration;
+  #tuned;
+  #axis;
+  #activity;
+  #curves = new Curves();
+  #axes = {};
+  #progress = null;
+  #begun_ms = 0;
+  #under_way = null; // AbortController of the request
+  #proposal = null; // {name, body, done} of the command that an agreement sends
+
+  /** `tuned` is called after taps were swapped in. */
+  constructor(live, panel, configuration, drive, tuned) {
+    this.#drive = drive;
+    this.#configuration = configuration;
+    this.#tuned = tuned;
+    this.#axis = new Picker($("measure-axis"), () => this.#arrange());
+    this.#axis.options = panel.axes.map((value) => ({ value, text: value }));
+    this.#activity = new Picker($("measure-activity"), () => this.#arrange());
+    this.#activity.options = Object.entries(ACTIVITIES).map(([value, [text]]) => ({ value, text }));
+    $("measure-form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#start();
+    });
+    $("measure-cancel").addEventListener("click", () => this.#under_way?.abort());
+    $("measure-agree").addEventListener("click", () => this.#agree());
+    $("measure-decline").addEventListener("click", () => this.#withdraw("Nothing was changed."));
+    configuration.addEventListener("read", () => this.#arrange());
+    live.addEventListener("state", ({ detail }) => {
+      this.#axes = detail.axes ?? {};
+      this.#progress = detail.measuring ?? null;
+      this.#tell();
+      this.#bound();
+    });
+    this.#arrange();
+  }
+
+  get canvases() {
+    return this.#curves.canvases;
+  }
+
+  open() {
+    this.#curves.arrange();
+  }
+
+  close() {}
+
+  /** Lay the plots out anew, as after a change of the theme. */
+  arrange() {
+    this.#curves.arrange();
+  }
+
+  /** The largest amplitude, µm, that keeps the position within the axis's limits. */
+  get #most_um() {
+    const held = this.#axes[this.#axis.value]?.reference_um ?? 0;
+    return Math.max(0, this.#configuration.limits(this.#axis.value).most_um - Math.abs(held));
+  }
+
+  #arrange() {
+    const activity = this.#activity.value;
+    for (const field of document.querySelectorAll("#measure-form [data-for]")) field.hidden = !field.dataset.for.split(" ").includes(activity);
+    say($("measure-note"), ACTIVITIES[activity][2]);
+    this.#bound();
+  }
+
+  #bound() {
+    say($("measure-most"), `µm, at most ${significant(this.#most_um, 3)}`);
+  }
+
+  /** The body of the request. Raises Error for what was typed and is out of bounds. */
+  async #body() {
+    const [activity, axis] = [this.#activity.value, this.#axis.value];
+    if (activity === "learn") {
+      const [file] = $("measure-file").files;
+      if (!file) throw new Error("scan: choose a file with one period of it first");
+      const { samples } = columns(await file.text());
+      return { axis, samples, cycles: fromField($("measure-cycles")), resonance_percent: fromField($("measure-shift")), keep: false };
+    }
+    const amplitude_um = fromField($("measure-amplitude"));
+    if (!(amplitude_um > 0 && amplitude_um <= this.#most_um)) {
+      throw new Error(`amplitude: ${amplitude_um} µm; above 0 and at most ${significant(this.#most_um, 3)} µm is allowed about the held reference`);
+    }
+    if (activity === "retune") return { axis, amplitude_um, bound_percent: fromField($("measure-bound")), within_percent: fromField($("measure-within")) };
+    return { axis, amplitude_um, duration_s: fromField($("measure-duration")), ...(activity === "resonance" ? { resonance_only: true } : {}) };
+  }
+
+  async #start() {
+    if (this.#under_way) return;
+    this.#withdraw("");
+    const [activity, request] = [this.#activity.value, new AbortController()];
+    this.#under_way = request;
+    this.#begun_ms = performance.now();
+    this.#show();
+    try {
+      const body = await this.#body();
+      const found = await this.#drive.driving(ACTIVITIES[activity][1], body, $("measure-error"), { signal: request.signal });
+      if (request.signal.aborted) this.#withdraw(`Cancelled: axis ${body.axis} goes back to what it held.`);
+      else if (found) this.#take(activity, body.axis, found);
+    } catch (error) {
+      complain($("measure-error"), error);
+    } finally {
+      this.#under_way = null;
+      this.#show();
+    }
+  }
+
+  #take(activity, axis, found) {
+    say($("measure-done"), `Done: axis ${axis} holds what it held.`);
+    if (activity === "retune") {
+      showRetuned(found);
+      const { replaces, prefilter } = found;
+      return this.#propose("retuned", "Swap the new taps in", "Keep the taps in force", {
+        name: "swap", body: { axis, replaces, prefilter }, done: ({ tick }) => `Swapped in at tick ${tick}.`,
+      });
+    }
+    if (activity === "learn") {
+      showLearned(found);
+      const { reference_um: samples, command_um } = found;
+      return this.#propose("learned", "Play the learned scan", "Discard it", {
+        name: "waveform", body: { axis, samples, command_um, repeat: true }, done: ({ tick }) => `The learned scan plays from tick ${tick} on, until another reference comes.`,
+      });
+    }
+    const nothing = activity === "resonance" && !found.resonance;
+    complain($("measure-error"), nothing ? "no light mode stands out in the band about the model's" : null);
+    showMargins(found, activity === "response");
+    $("measured-response").hidden = false;
+    this.#curves.show(found);
+  }
+
+  #propose(part, agree, decline, proposal) {
+    this.#proposal = proposal;
+    $(`measure-${part}`).hidden = $("measure-consent").hidden = false;
+    say($("measure-agree"), agree);
+    say($("measure-decline"), decline);
+    $("measure-consent").scrollIntoView({ block: "nearest" });
+  }
+
+  async #agree() {
+    const proposal = this.#proposal;
+    if (!proposal) return;
+    $("measure-agree").disabled = true;
+    const answer = await this.#drive.driving(proposal.name, proposal.body, $("measure-error"));
+    $("measure-agree").disabled = false;
+    if (!answer) return;
+    this.#proposal = null;
+    $("measure-consent").hidden = true;
+    say($("measure-done"), proposal.done(answer));
+    if (proposal.name === "swap") this.#tuned();
+  }
+
+  /** Drop the proposal and the results, and say so. */
+  #withdraw(text) {
+    this.#proposal = null;
+    $("measure-consent").hidden = $("measured-response").hidden = true;
+    for (const part of PROPOSALS) $(`measure-${part}`).hidden = true;
+    complain($("measure-error"), null);
+    say($("measure-done"), text);
+  }
+
+  #show() {
+    $("measure-start").disabled = !!this.#under_way;
+    $("measure-cancel").disabled = !this.#under_way;
+    this.#tell();
+  }
+
+  /** Say what is being done, here or for somebody else. */
+  #tell() {
+    const { activity, axis, rms_um = [], cycles } = this.#progress ?? {};
+    const learned = rms_um.length ? `, cycle ${rms_um.length} of ${cycles + 1} judged: rms error ${fixed(1e3 * rms_um.at(-1), 1)} nm` : "";
+    const moves = activity && `axis ${axis} ${activity === "learn" ? "learns" : "is measured"}${learned}`;
+    $("measure-lamp").classList.toggle("lit", !!moves);
+    if (!this.#under_way) return say($("measure-lamp"), moves ? `${moves}, for another client` : "ready");
+    const seconds = fixed((performance.now() - this.#begun_ms) / 1000, 0);
+    say($("measure-lamp"), `${moves ?? (this.#activity.value === "retune" ? "taps are worked out" : "waiting")}, ${seconds} s`);
+  }
+}

@@ -1,0 +1,111 @@
+"""`/api/retune` and `/api/swap`: `rtloop ctl retune` for pages, in a process beside the panel.
+
+A page first gets a proposal: the resonance was measured, and nothing is changed. Its consent is a second request, with
+the proposal. The measurement ends with the page that asked for it; a swap, once begun, is finished without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import anyio
+from pydantic import Field
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from rtloop.errors import ConfigError, LoopFault, UnavailableError
+from rtloop.panel.shelf.aside import Aside, Crowded, Failed
+from rtloop.panel.views.link import Service
+from rtloop.panel.web.asked import checked
+from rtloop.panel.web.proxy import SMALL_BYTES, limited_body
+from rtloop.service.api.asking import asker_name, at_disconnect
+from rtloop.service.api.bodies import Body, Name
+
+LONGEST_S = 600.0
+"""The search for new taps may take minutes."""
+CODES: dict[int | None, int] = {LoopFault.exit_code: 409, UnavailableError.exit_code: 503}
+"""Status of an answer by the exit code of the command; 422 for the rest."""
+Row = Annotated[list[float], Field(min_length=1, max_length=1000)]
+
+
+class RetuneBody(Body):
+    """The axis, and options of `rtloop ctl retune`; the command has its defaults for those that are missing."""
+
+    axis: Name
+    amplitude_um: float | None = Field(default=None, gt=0)
+    bound_percent: float | None = Field(default=None, gt=0, le=50)
+    within_percent: float | None = Field(default=None, ge=0, le=50)
+
+
+class TapsBody(Body):
+    """Both rows of taps."""
+
+    taps: Row
+    command_taps: Row
+
+
+class SwapBody(Body):
+    """The part of a proposal that is swapped in, and that which was compared with it."""
+
+    axis: Name
+    replaces: TapsBody
+    prefilter: TapsBody
+
+
+class Retuning:
+    """Runs one `rtloop ctl retune` at a time."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._aside = Aside(at_a_time=1, most_waiting=1, timeout_s=LONGEST_S)
+
+    def routes(self) -> Sequence[BaseRoute]:
+        """The two routes."""
+        return [
+            Route("/api/retune", self._retune, methods=["POST"]),
+            Route("/api/swap", self._swap, methods=["POST"]),
+        ]
+
+    async def _retune(self, request: Request) -> Response:
+        return await self._answer(request, RetuneBody, ends_with_page=True)
+
+    async def _swap(self, request: Request) -> Response:
+        return await self._answer(request, SwapBody, ends_with_page=False)
+
+    async def _answer(self, request: Request, model: type[RetuneBody | SwapBody], ends_with_page: bool) -> Response:
+        """The command's JSON, or its error with the status that suits it."""
+        try:
+            data = await limited_body(request, SMALL_BYTES)
+            if data is None:
+                return _refused(413, f"request body: more than {SMALL_BYTES} bytes")
+            body, name = checked(model, data), asker_name(request)
+            if not ends_with_page:
+                return JSONResponse(await self._run(name, body))
+            with anyio.CancelScope() as scope:
+                async with at_disconnect(request, scope.cancel):
+                    return JSONResponse(await self._run(name, body))
+            return Response()
+        except ClientDisconnect:
+            return Response()
+        except ConfigError as error:
+            return _refused(422, "; ".join(error.faults))
+        except ValueError as error:
+            return _refused(422, str(error))
+        except Crowded as error:
+            return _refused(503, str(error))
+        except Failed as error:
+            return _refused(CODES.get(error.code, 422), str(error))
+
+    async def _run(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
+        ctl = ["ctl", f"--socket={self._service.client.path}", f"--as={name}", "retune", "--json"]
+        if isinstance(body, SwapBody):
+            return await self._aside.run("rtloop", *ctl, "--swap=-", "--", body.axis, stdin=body.model_dump_json())
+        options = body.model_dump(exclude={"axis"}, exclude_none=True)
+        words = [f"--{key.replace('_', '-')}={value!r}" for key, value in options.items()]
+        return await self._aside.run("rtloop", *ctl, *words, "--", body.axis)
+
+
+def _refused(code: int, error: str) -> Response:
+    return JSONResponse({"error": error}, status_code=code)

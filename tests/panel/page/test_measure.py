@@ -1,0 +1,154 @@
+"""The loop measured, retuned and taught from the page; on a rig whose resonance lies beside its model's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.design.measured_loops import margins_of
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.panel.measured import MODEL_HZ, WANTED_UM, configuration
+from tests.panel.page.browser import PATIENCE_S, chromium, opened, panel_of, said
+from tests.service.test_response import HELD_UM, LOOP
+
+COLOURS = """(at) => {
+  const canvas = document.querySelector(at);
+  const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  return new Set(new Uint32Array(data.buffer)).size}"""
+"""How many colours a canvas shows: an empty plot has few."""
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    chromium()
+    folder = tmp_path_factory.mktemp("measure")
+    with Bench(folder, board=False, text=configuration(folder)) as rig:
+        rig.await_state("running")
+        yield rig
+
+
+@pytest.fixture(scope="module")
+def shown(browser: Any, rig: Bench) -> Iterator[Any]:
+    """The view, under a name."""
+    page = opened(browser, panel_of(rig)[0])
+    page.fill("#who", "ada")
+    page.keyboard.press("Escape")
+    page.keyboard.press("6")
+    yield page
+    page.context.close()
+
+
+@pytest.fixture
+def view(shown: Any) -> Iterator[Any]:
+    yield shown
+    faults, shown.faults = shown.faults, []
+    assert not faults
+
+
+def reference_um(rig: Bench) -> float:
+    return rig.status()["axes"]["x"]["reference_um"]
+
+
+def prefilter(rig: Bench) -> dict[str, list[float]]:
+    return rig.client.get("/configuration")["values"]["axis"][0].get("prefilter", {})
+
+
+def begin(view: Any, activity: str, **fields: str) -> None:
+    """Choose an activity, fill its fields and start it."""
+    view.click("#measure-activity button")
+    view.click(f"#measure-activity-list li:text-is('{activity}')")
+    for name, text in fields.items():
+        view.fill(f"#measure-{name}", text)
+    view.click("#measure-start")
+
+
+def finished(view: Any, selector: str) -> None:
+    view.wait_for_selector(
+        f"#measure-start:enabled >> xpath=/.. >> xpath=/.. >> css={selector}", timeout=1e3 * PATIENCE_S
+    )
+
+
+def cells(view: Any, row: str) -> list[str]:
+    """What a row of a table says, without its name."""
+    return view.locator(f"#measure tr:has(th:text-is('{row}')) td").all_inner_texts()
+
+
+def number(text: str) -> float:
+    return float(text.replace("−", "-").replace("±", "").split()[0])
+
+
+def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, rig: Bench) -> None:
+    begin(view, "Response", duration="1")
+    said(view, "#measure-lamp", "axis x is measured")
+    finished(view, "#measured-margins:visible")
+    said(view, "#measure-done", "axis x holds what it held")
+    true = margins_of(LOOP.open, 4.0, 4500.0)
+    measured, spread, model = cells(view, "gain margin")
+    true_db = 20 * np.log10(true["gain_margin"])
+    assert abs(number(measured) - true_db) < 5 * number(spread) + 0.005
+    assert abs(number(model) - true_db) > 0.3, "the model's resonance is another one"
+    measured, spread, _ = cells(view, "phase margin")
+    assert abs(number(measured) - true["phase_margin_deg"]) < 5 * number(spread) + 0.005
+    assert number(view.inner_text("#measured-figures dd")) == pytest.approx(LOOP.hz, rel=0.002)
+    for plot in ("#measured-loop", "#measured-sensitivity"):
+        assert view.evaluate(COLOURS, f"{plot} canvas") > 10
+    assert reference_um(rig) == HELD_UM
+
+
+def test_taps_are_swapped_after_consent_alone(view: Any, rig: Bench) -> None:
+    begin(view, "Retune", within="0")
+    finished(view, "#measure-consent:visible")
+    said(view, "#retuned-figures", rf"\+{100 * (LOOP.hz / MODEL_HZ - 1):.0f}\.0|\+4\.9")
+    before, after = map(number, cells(view, "settles in"))
+    assert after < before
+    assert not prefilter(rig).get("taps")
+    view.click("#measure-agree")
+    said(view, "#measure-done", r"Swapped in at tick \d+")
+    assert len(prefilter(rig)["taps"]) == 20
+
+
+def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, tmp_path: Path) -> None:
+    (tmp_path / "scan.txt").write_text("\n".join(map(repr, WANTED_UM.tolist())))
+    view.set_input_files("#measure-file", str(tmp_path / "scan.txt"))
+    begin(view, "Learn", cycles="1")
+    finished(view, "#measure-consent:visible")
+    view.click("#measure-decline")
+    said(view, "#measure-done", "Nothing was changed")
+    assert view.is_hidden("#measure-consent")
+    assert reference_um(rig) == HELD_UM
+    begin(view, "Learn", cycles="3")
+    said(view, "#measure-lamp", r"cycle \d of 4 judged: rms error")
+    finished(view, "#measure-consent:visible")
+    assert reference_um(rig) == HELD_UM
+    errors = [number(text) for text in view.locator("#learned-cycles td:nth-of-type(1)").all_inner_texts()]
+    assert min(errors) < errors[0] / 5
+    view.click("#measure-agree")
+    said(view, "#measure-done", "plays from tick")
+    wait_for(lambda: abs(reference_um(rig) - HELD_UM) > 1.0, "the table that plays")
+    begin(view, "Response")
+    said(view, "#measure-error", "a table; a hold is needed")
+    rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
+
+
+def test_refusals_are_words_and_cancelling_and_leaving_end_it(view: Any, rig: Bench) -> None:
+    for amplitude, words in (("0", "above 0 and at most"), ("26", "at most 25.0 µm is allowed"), ("much", "no number")):
+        begin(view, "Response", amplitude=amplitude)
+        said(view, "#measure-error", words)
+    begin(view, "Response", amplitude="0.5", duration="30")
+    said(view, "#measure-lamp", "axis x is measured")
+    view.click("#measure-cancel")
+    said(view, "#measure-done", "Cancelled: axis x goes back to what it held")
+    said(view, "#measure-lamp", "ready")
+    wait_for(lambda: rig.status()["measuring"] is None, "an end")
+    assert reference_um(rig) == HELD_UM
+
+    begin(view, "Response", duration="30")
+    said(view, "#measure-lamp", "axis x is measured")
+    view.reload()
+    wait_for(lambda: rig.status()["measuring"] is None, "an end")
+    assert reference_um(rig) == HELD_UM

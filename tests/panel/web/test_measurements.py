@@ -1,0 +1,170 @@
+"""Measurements from the panel: the answers are those of the rig, and each measurement ends with the page."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtloop.service.client import Client
+from tests.design.measured_loops import margins_of
+from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
+from tests.panel.measured import MODEL_HZ, TICKS, WANTED_UM, configuration
+from tests.panel.web.browser import Browser
+from tests.service.test_response import HELD_UM, LOOP, QUICK
+
+BACK_S = 10.0
+LEARN = {"axis": "x", "samples": WANTED_UM.tolist(), "cycles": 3, "keep": False}
+RETUNE = {"axis": "x", "within_percent": 0.0}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    folder = tmp_path_factory.mktemp("measurements")
+    with Bench(folder, board=False, text=configuration(folder)) as bench:
+        bench.await_state("running")
+        yield bench
+
+
+@pytest.fixture(scope="module")
+def browser(bench: Bench) -> Browser:
+    """Logged in; its process ends with the bench."""
+    browser = Browser(bench)
+    browser.log_in()
+    return browser
+
+
+@pytest.fixture(scope="module")
+def proposal(browser: Browser) -> dict[str, Any]:
+    """Of a retuning."""
+    status, proposal = browser.json("POST", "/api/retune?as=ada", RETUNE)
+    assert status == 200, proposal
+    return proposal
+
+
+def reference_um(bench: Bench) -> float:
+    return bench.client.get("/status")["axes"]["x"]["reference_um"]
+
+
+def taps(bench: Bench) -> list[float]:
+    return bench.client.get("/configuration")["values"]["axis"][0].get("prefilter", {}).get("taps", [])
+
+
+def swap_of(proposal: dict[str, Any]) -> dict[str, Any]:
+    return {"axis": "x", **{key: proposal[key] for key in ("replaces", "prefilter")}}
+
+
+def test_margins_are_those_of_the_rig(browser: Browser, bench: Bench):
+    status, found = browser.json("POST", "/api/response?as=ada", QUICK)
+    assert status == 200, found
+    true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
+    for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
+        margin = found["margins"][name]
+        assert abs(margin["value"] - true[name]) < 5.0 * margin["std"], margin
+    curves = found["response"]
+    sensitivity = np.array(curves["sensitivity"]) @ (1, 1j)
+    true_loop = LOOP.open(np.array(curves["hz"]))
+    far = np.abs(sensitivity * (1 + true_loop) - 1) > 6 * np.array(curves["sensitivity_spread"])
+    assert np.mean(far) < 0.01
+    model = np.array(curves["model_loop"]) @ (1, 1j)
+    np.testing.assert_allclose(np.array(curves["model_sensitivity"]) @ (1, 1j), 1 / (1 + model), rtol=1e-9)
+    assert reference_um(bench) == HELD_UM
+
+
+def test_the_progress_of_learning_is_told_and_without_consent_no_table_stays(browser: Browser, bench: Bench):
+    answers: list[tuple[int, Any]] = []
+    asking = threading.Thread(target=lambda: answers.append(browser.json("POST", "/api/learn?as=ada", LEARN)))
+    asking.start()
+    seen: list[dict[str, Any]] = []
+    while asking.is_alive():
+        seen += [measuring] if (measuring := bench.status()["measuring"]) else []
+    asking.join()
+    ((status, found),) = answers
+    assert status == 200, found
+    assert {(one["activity"], one["axis"], one["cycles"]) for one in seen} == {("learn", "x", 3)}
+    errors = [cycle["rms_um"] for cycle in found["cycles"]]
+    assert errors[: len(seen[-1]["rms_um"])] == seen[-1]["rms_um"]
+    assert len(seen[-1]["rms_um"]) >= 2
+    assert min(errors) < errors[0] / 20
+    assert bench.status()["measuring"] is None
+    assert reference_um(bench) == HELD_UM
+    table = {"axis": "x", "samples": found["reference_um"], "command_um": found["command_um"], "repeat": True}
+    assert browser.json("POST", "/api/waveform?as=ada", table)[0] == 200
+    wait_for(lambda: abs(reference_um(bench) - HELD_UM) > 1.0, "the table that plays")
+    assert browser.json("POST", "/api/setpoint?as=ada", {"axis": "x", "value": HELD_UM})[0] == 200
+
+
+def test_nothing_changes_before_consent_and_then_the_taps_are_the_proposed_ones(
+    browser: Browser, bench: Bench, proposal: dict[str, Any]
+):
+    assert proposal["percent_from_model"] == pytest.approx(100 * (LOOP.hz / MODEL_HZ - 1), abs=0.1)
+    assert proposal["after"]["settling_ms"] < proposal["before"]["settling_ms"]
+    assert proposal["tick"] is None
+    assert taps(bench) == []
+    status, swapped = browser.json("POST", "/api/swap?as=ada", swap_of(proposal))
+    assert (status, swapped["tick"] > 0) == (200, True), swapped
+    assert taps(bench) == proposal["prefilter"]["taps"]
+    status, said = browser.json("POST", "/api/swap?as=ada", swap_of(proposal))
+    assert (status, "changed since the proposal" in said["error"]) == (409, True), said
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [("response", QUICK | {"duration_s": 30.0}), ("learn", LEARN | {"cycles": 50, "keep": True}), ("retune", RETUNE)],
+)
+def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: str, body: dict[str, Any]):
+    before = taps(bench)
+    data = json.dumps(body).encode()
+    head = f"POST /api/{path}?as=ada HTTP/1.1\r\nHost: 127.0.0.1:{browser.port}\r\nOrigin: {browser.origin}\r\n"
+    with socket.create_connection(("127.0.0.1", browser.port)) as page:
+        page.sendall(f"{head}Cookie: {browser.cookie}\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data)
+        wait_for(lambda: reference_um(bench) != HELD_UM, "a motion")
+    wait_for(lambda: bench.status()["measuring"] is None, "the end of the measurement", BACK_S)
+    assert reference_um(bench) == HELD_UM
+    tick = bench.ticks
+    wait_for(lambda: bench.ticks > tick + 4 * TICKS, "ticks")
+    assert reference_um(bench) == HELD_UM
+    assert taps(bench) == before
+    status, said = browser.json("POST", f"/api/{path}?as=ada", body | {"axis": "z"})
+    assert (status, "z" in said["error"]) in ((422, True), (409, True)), said
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "code", "said"),
+    [
+        ("response", {"axis": "x", "amplitude_um": 0.0}, 422, "amplitude_um"),
+        ("retune", {"axis": "x", "amplitude_um": -1.0}, 422, "amplitude_um"),
+        ("retune", {"axis": "x", "spec": "/etc/passwd"}, 422, "spec"),
+        ("retune", {"axis": "--help"}, 422, "axis: '--help' is not there"),
+        ("retune", {"axis": "\0"}, 422, "null byte"),
+        ("swap", {"axis": "x", "replaces": {"taps": [1.0], "command_taps": []}}, 422, "command_taps"),
+        ("learn", {"axis": "x", "samples": [99.0] * 8}, 422, "reaches 99, beyond"),
+    ],
+)
+def test_a_refusal_says_why(browser: Browser, bench: Bench, path: str, body: dict[str, Any], code: int, said: str):
+    status, answer = browser.json("POST", f"/api/{path}?as=ada", body)
+    assert (status, said in answer["error"]) == (code, True), answer
+    assert reference_um(bench) == HELD_UM
+
+
+def test_somebody_else_drives(browser: Browser, bench: Bench, proposal: dict[str, Any]):
+    before = taps(bench)
+    bob = Client(bench.client.path, "bob")
+    browser.request("DELETE", "/api/lock?as=ada")
+    bob.lock()
+    for path, body in (("response", QUICK), ("learn", LEARN), ("retune", RETUNE)):
+        status, said = browser.json("POST", f"/api/{path}?as=ada", body)
+        assert (status, "bob has driven since" in said["error"]) == (409, True), said
+    unchanged = swap_of(proposal) | {"replaces": proposal["prefilter"]}
+    status, said = browser.json("POST", "/api/swap?as=ada", unchanged)
+    assert (status, "bob has driven since" in said["error"]) == (409, True), said
+    status, said = browser.json("POST", "/api/retune?as=-rf", RETUNE)
+    assert (status, "as: " in said["error"]) == (422, True), said
+    assert taps(bench) == before
+    bob.delete("/lock")
