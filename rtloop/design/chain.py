@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.comparison import LIGHT_DAMPING
-from rtloop.configuration.axis import ModelOptions
+from rtloop.configuration.axis import LimitsOptions, ModelOptions
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
 from rtloop.design.identification.identified import (
@@ -133,7 +133,7 @@ def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis:
         **parts,
     }
     chosen = next(one for one in raw["axis"] if axis in (None, one["name"]))
-    found["reference"] = _steps(chosen["limits"]["command_um"], stage)
+    found["reference"] = _steps(LimitsOptions.model_validate(chosen.get("limits", {})).command_um, stage)
     found["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
     raw["axis"] = [{**one, **found} if one is chosen else one for one in raw["axis"]]
     heading = [

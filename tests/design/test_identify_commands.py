@@ -255,8 +255,10 @@ def test_one_command_makes_a_configuration_that_runs_as_promised(folder: Path, s
     assert running is not None
     assert running.stable
     stepping = out.with_name("stepping.toml")
-    levels = 'kind = "steps"\nlevels = [20.0, 0.0]\ndwell_s = 0.5'
-    stepping.write_text(text.replace('kind = "hold"\nvalue = 0.0', levels))
+    reference = tomllib.loads(text)["axis"][0]["reference"]
+    assert (reference["kind"], reference["levels"]) == ("steps", [10.0, 0.0])
+    stepping.write_text(text.replace("levels = [10.0, 0.0]", "levels = [20.0, 0.0]"))
+    stepping.write_text(re.sub(r"dwell_s = [0-9.]+", "dwell_s = 0.5", stepping.read_text()))
     code, summary, _ = run(stepping, "--duration", "1", "--unpaced", "--out", folder)
     assert code == 0
     assert summary["trips"] == []
