@@ -38,7 +38,7 @@ def plays(drive: np.ndarray) -> np.ndarray:
 def shown_of(drive: np.ndarray, position: np.ndarray, reference: np.ndarray) -> Any:
     """The last second of an axis in closed loop: the frame's header and arrays."""
     tick, past = np.arange(drive.size), Past(NAMES, 8 * RATE_HZ)
-    rows = np.column_stack([tick, tick * 1e6, drive, position, reference, 3.0 + 0 * drive])
+    rows = np.column_stack([tick, tick * 1e6, drive, position, reference, 3.0 + 0 * drive]).astype(np.float64)
     past.take(Stretch(NAMES, 0, rows))
     frame = Drawn(wish_of("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(past)
     assert frame is not None
