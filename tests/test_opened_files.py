@@ -35,7 +35,6 @@ OF_THE_KERNEL = "a fixed path, which the kernel serves"
 OF_THE_PACKAGE = "a file of the installed package"
 ALLOWED = {
     ("cli/adapt.py", "click.File"): "named on the command line, or standard input",
-    ("cli/ctl.py", "click.File"): "named on the command line, or standard input",
     ("configuration/text_files.py", "os.open"): "below a folder that is held open, through no link; kind looked at",
     ("doctor/host.py", "(self.root / path.lstrip('/')).read_text"): OF_THE_KERNEL,
     ("doctor/host.py", "(self.root / 'proc/config.gz').read_bytes"): OF_THE_KERNEL,

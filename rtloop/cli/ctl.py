@@ -202,8 +202,9 @@ def preview(context: click.Context, axis: str, section: str, values: str, as_jso
 
 
 def _answer(context: click.Context, resource: str, axis: str, section: str, values: str) -> Any:
-    """Post keys of [axis.SECTION] to a resource of the service; its answer."""
-    return client_of(context).post(resource, {"axis": axis, "section": section, "values": _inline_table(values)})
+    """Post keys of [axis.SECTION] to a resource of the service. Returns its answer. Raises click.UsageError."""
+    body = {"axis": axis, "section": section, "values": _inline_table(values)}
+    return client_of(context).post(resource, body)
 
 
 @ctl.command()

@@ -259,7 +259,7 @@ class RunningDesk:
     def __init__(self, loop: RealLoop, session: Session) -> None:
         self.loop, self.session = loop, session
 
-    def submit(self, kind: Kind, *, axis: int = -1, values: Sequence[float] = ()) -> int:
+    def submit(self, kind: Kind, *, axis: int = -1, values: Sequence[float] = (), change: str | None = None) -> int:
         send(self.loop.block, message(kind, axis=axis, values=values))
         tick = self.loop.tick
         self.run(500)

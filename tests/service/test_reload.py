@@ -26,7 +26,7 @@ class FakeDesk:
         self.refuses: set[tuple[Kind, int]] = set()
         self.taken: list[tuple[Kind, int]] = []
 
-    def submit(self, kind: Kind, *, axis: int, values=()) -> int:
+    def submit(self, kind: Kind, *, axis: int, values=(), change: str | None = None) -> int:
         if (kind, axis) in self.refuses:
             raise Refused(f"{kind.name.lower()}: refused at tick 7: tripped or stopping")
         self.taken.append((kind, axis))

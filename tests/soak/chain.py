@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import tomlkit
 
 import rtloop
 from rtloop.analysis.closed_loop import discrete_loop
@@ -89,10 +90,16 @@ def verdict(chain: Chain) -> str:
     return "misses " + ", ".join(missed) if missed else "meets it"
 
 
+def with_steps(text: str, levels: list[float], dwell_s: float) -> str:
+    """A configuration's text whose first axis follows steps between `levels` in µm, each held for `dwell_s`."""
+    configuration = tomlkit.parse(text).unwrap()
+    configuration["axis"][0]["reference"] = {"kind": "steps", "levels": levels, "dwell_s": dwell_s}
+    return tomlkit.dumps(configuration)
+
+
 def run(written: Path, promised: LoopAnalysis) -> tuple[list[str], dict[str, float]]:
     """Trips, and how far the first step of 10 µm up is from what was promised."""
-    levels = f'kind = "steps"\nlevels = [0.0, {STEP_UM}, 0.0]\ndwell_s = {DWELL_S}'
-    text = written.read_text(encoding="utf-8").replace('kind = "hold"\nvalue = 0.0', levels)
+    text = with_steps(written.read_text(encoding="utf-8"), [0.0, STEP_UM, 0.0], DWELL_S)
     path = record(written.with_name("run.mcap"), text, round(3 * DWELL_S * RATE_HZ))[0]
     recording = rtloop.load(path)
     flags = np.unique(recording["flags"])

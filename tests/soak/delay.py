@@ -20,6 +20,7 @@ import numpy as np
 
 import rtloop
 from rtloop.recording.views.steps import every_step
+from tests.soak.chain import with_steps
 from tests.soak.delay_coverage import coverage
 from tests.soak.lagged_rig import DEPLOY, NOISE_UM, RIGS, Rig, with_value
 
@@ -73,11 +74,8 @@ def run_steps(config: Path) -> Steps:
     """Steps of STEP_UM up and down of a configuration in closed loop, seen without the sensor's noise."""
     text = config.read_text(encoding="utf-8")
     levels = [0.0, *CYCLES * [STEP_UM, 0.0]]
-    steps = f'kind = "steps"\nlevels = {levels}\ndwell_s = {DWELL_S}\nrepeat = false'
-    held = 'kind = "hold"\nvalue = 0.0'
-    assert text.count(held) == 1
     running = config.with_name(f"{config.stem}-steps.toml")
-    running.write_text(text.replace(held, steps), encoding="utf-8")
+    running.write_text(with_steps(text, levels, DWELL_S), encoding="utf-8")
     run = rtloop.load(recorded(running, len(levels) * DWELL_S))
     table = every_step(run["x_reference_um"], run["x_true_position_um"], 1e4)
     return Steps(*(np.median(table, axis=0) if table is not None else [np.nan] * 3))

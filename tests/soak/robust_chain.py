@@ -32,6 +32,7 @@ from rtloop.hil.options import RigOptions
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, noisy_rig
 from tests.recording.real_loop import record
+from tests.soak.chain import with_steps
 from tests.soak.draws import every_draw
 
 HEIGHTS_UM = (1.0, 5.0, 20.0, 40.0)
@@ -154,8 +155,7 @@ def both(written: Path) -> Iterator[tuple[Steps, Steps]]:
 
 def ran(written: Path, levels: Sequence[float], dwell_s: float, draw: int) -> rtloop.Recording:
     """The true rig going through levels."""
-    steps = f'kind = "steps"\nlevels = {[*levels]}\ndwell_s = {dwell_s}'
-    text = written.read_text(encoding="utf-8").replace('kind = "hold"\nvalue = 0.0', steps)
+    text = with_steps(written.read_text(encoding="utf-8"), [*levels], dwell_s)
     rig = load(written).driver_options
     assert isinstance(rig, RigOptions)
     text = text.replace(f"seed = {rig.seed}", f"seed = {rig.seed + 1000 + draw}")
