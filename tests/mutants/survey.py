@@ -116,6 +116,7 @@ class Survey(Steady):
         return {
             "seconds": passed,
             "failed": self.failed,
+            "starting": sorted(self.starting),
             "lines": {name: lines[name] for name in sorted(lines) if name},
         }
 

@@ -131,3 +131,15 @@ def test_loop_and_drivers_can_be_imported_without_the_compiler():
     script = f"from tests.mutants.uncompiled import install; install(); import {modules}"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     subprocess.run([sys.executable, "-c", script], cwd=ROOT, env=environment, check=True)
+
+
+def test_a_survey_knows_lines_seconds_and_the_tests_that_start_processes(scratch, tmp_path, monkeypatch):
+    test = scratch.tree.root / "tests" / "test_limits.py"
+    test.write_text(TEST + "\n\ndef test_of_a_process():\n    import subprocess\n    subprocess.run(['true'])\n")
+    monkeypatch.setattr(choice, "room_tests", lambda room: ["tests/test_limits.py"])
+    monkeypatch.setattr(choice.Choice, "_path", lambda self, file, compiled: tmp_path / "survey.json")
+    surveyed = choice.Choice(tmp_path)
+    surveyed.survey({"analysis"}, [scratch.tree])
+    line = mutant("analysis")._replace(file="rtloop/limits.py", line=2)
+    assert list(surveyed.tests(line)) == ["tests/test_limits.py::test_a_value_beyond_the_limit_is_the_limit"]
+    assert list(surveyed.second_look(line)) == ["tests/test_limits.py::test_of_a_process"]
