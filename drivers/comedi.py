@@ -103,8 +103,8 @@ def comedi_read(context, values):
     out[card.input_count] = 0.0
     for i in range(card.input_count):
         line = lines[i]
-        where = line.subdevice, line.channel, line.range, line.aref
-        if _call(card.data_read, card.board, where, card.code) < 0:
+        address = line.subdevice, line.channel, line.range, line.aref
+        if _call(card.data_read, card.board, address, card.code) < 0:
             card.failed_input = i
             return FAILED
         out[i] = line.lowest_v + code[0] * line.lsb_v
@@ -124,8 +124,8 @@ def comedi_write(context, values):
         line = lines[i]
         code = np.rint((volts[i] - line.lowest_v) / line.lsb_v)
         code = 0.0 if code < 0.0 else (line.highest_code if code > line.highest_code else code)
-        where = line.subdevice, line.channel, line.range, line.aref
-        if _call(card.data_write, card.board, where, np.uint32(code)) < 0:
+        address = line.subdevice, line.channel, line.range, line.aref
+        if _call(card.data_write, card.board, address, np.uint32(code)) < 0:
             card.failed_output = i
             return FAILED
     return 0
@@ -148,9 +148,9 @@ class ComediDriver(Driver):
         for axis, wire in wiring.items():
             _require_name(f"channels.{axis}.input", wire.input, Kind.INPUT)
             _require_name(f"channels.{axis}.output", wire.output, Kind.OUTPUT)
-            first = next(name for name, other in wiring.items() if other.output == wire.output)
-            if first != axis:
-                raise ValueError(f"channels.{axis}.output: {wire.output!r} is taken by axis {first}")
+            owner = next(name for name, candidate in wiring.items() if candidate.output == wire.output)
+            if owner != axis:
+                raise ValueError(f"channels.{axis}.output: {wire.output!r} is taken by axis {owner}")
         for name in options.more_inputs:
             _require_name("more_inputs", name, Kind.INPUT)
         self._inputs = tuple(dict.fromkeys([*(wire.input for wire in wiring.values()), *options.more_inputs]))
@@ -172,8 +172,8 @@ class ComediDriver(Driver):
         if self._board is None or max(card["failed_input"], card["failed_output"]) < 0:
             return None
         names = self._inputs, card["failed_input"], self._outputs, card["failed_output"]
-        where = ", ".join(group[i] for group, i in (names[:2], names[2:]) if i >= 0)
-        return DriverError(f"{self._options.device}: {where}: {self._board.last_error()}")
+        channels = ", ".join(group[i] for group, i in (names[:2], names[2:]) if i >= 0)
+        return DriverError(f"{self._options.device}: {channels}: {self._board.last_error()}")
 
     def open(self) -> Pointers:
         """Take the board's subdevices; outputs to `safe_v`, unless all can be read back. Raises DriverError."""
@@ -207,11 +207,11 @@ class ComediDriver(Driver):
     def _lines(self, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
         """The address and scale of each channel, on a subdevice that is reserved."""
         assert self._board is not None
-        taken, options = self._board.take(kind, subdevice), self._options
+        reserved, options = self._board.take(kind, subdevice), self._options
         range_v, aref = (
             (options.input_range_v, options.aref) if kind is Kind.INPUT else (options.output_range_v, "ground")
         )
-        return np.array([self._board.line(kind, taken, int(name[2:]), range_v, aref) for name in names], LINE)
+        return np.array([self._board.line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE)
 
     def _fill(self, inputs: np.ndarray, outputs: np.ndarray, code: np.ndarray) -> None:
         """The context of the compiled functions."""

@@ -91,11 +91,11 @@ class Board:
         if wanted is None and subdevice < 0:
             raise DriverError(f"{self._device}: the board has no analogue {kind.name.lower()}s")
         if wanted is not None and self._library.comedi_get_subdevice_type(self._handle, wanted) != kind:
-            there = range(self._library.comedi_get_n_subdevices(self._handle))
-            fitting = [n for n in there if self._library.comedi_get_subdevice_type(self._handle, n) == kind]
+            numbers = range(self._library.comedi_get_n_subdevices(self._handle))
+            suitable = [n for n in numbers if self._library.comedi_get_subdevice_type(self._handle, n) == kind]
             raise DriverError(
                 f"{self._device}: {kind.name.lower()}_subdevice: {wanted} has no analogue {kind.name.lower()}s; "
-                f"there are {', '.join(map(str, fitting)) or 'none'}"
+                f"there are {', '.join(map(str, suitable)) or 'none'}"
             )
         if self._library.comedi_lock(self._handle, subdevice) < 0:
             busy = self._library.comedi_errno() == errno.EBUSY
@@ -107,12 +107,14 @@ class Board:
         """A channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code."""
         name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
         if channel >= count:
-            has = f"{kind.prefix}0 … {kind.prefix}{count - 1}" if count > 0 else "none"
-            raise DriverError(f"{self._device}: {name} is not a channel of this board; it has {has}")
+            available = f"{kind.prefix}0 … {kind.prefix}{count - 1}" if count > 0 else "none"
+            raise DriverError(f"{self._device}: {name} is not a channel of this board; it has {available}")
         ranges = self._ranges_v(subdevice, channel)
         if range_v not in ranges.values():
-            has = ", ".join(f"[{lowest:g}, {highest:g}]" for lowest, highest in ranges.values()) or "none in volts"
-            raise DriverError(f"{self._device}: {name} has no range {list(range_v)} V; it has {has}")
+            available = (
+                ", ".join(f"[{lowest:g}, {highest:g}]" for lowest, highest in ranges.values()) or "none in volts"
+            )
+            raise DriverError(f"{self._device}: {name} has no range {list(range_v)} V; it has {available}")
         index = next(i for i, ends in ranges.items() if ends == range_v)
         highest_code = self._library.comedi_get_maxdata(self._handle, subdevice, channel)
         lsb_v = (range_v[1] - range_v[0]) / highest_code
@@ -137,9 +139,9 @@ class Board:
 
     def _ranges_v(self, subdevice: int, channel: int) -> dict[int, tuple[float, float]]:
         """The channel's ranges in volts by their number, as a person would write them: the table has six decimals."""
-        found = {}
+        ranges_v = {}
         for index in range(max(0, self._library.comedi_get_n_ranges(self._handle, subdevice, channel))):
             pointer = self._library.comedi_get_range(self._handle, subdevice, channel, index)
             if pointer and pointer.contents.unit == UNIT_VOLT:
-                found[index] = (round(pointer.contents.lowest, 6), round(pointer.contents.highest, 6))
-        return found
+                ranges_v[index] = (round(pointer.contents.lowest, 6), round(pointer.contents.highest, 6))
+        return ranges_v

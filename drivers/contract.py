@@ -39,15 +39,15 @@ class Calls:
         values = (ctypes.c_double * (count + _GUARD))(*[_UNTOUCHED] * (count + _GUARD))
         status = self._read(self._pointers.context, values)
         assert values[count:] == [_UNTOUCHED] * _GUARD, f"read wrote more than {count} values: inputs, age, observed"
-        left_out = status >= 0 and _UNTOUCHED in values[:count]
-        assert not left_out, f"read left values out: {count} are needed, got {values[:count]}"
+        is_incomplete = status >= 0 and _UNTOUCHED in values[:count]
+        assert not is_incomplete, f"read left values out: {count} are needed, got {values[:count]}"
         return status, values[:count]
 
     def write(self, volts: Sequence[float]) -> int:
         """Status of a write of all outputs."""
-        given = (ctypes.c_double * len(volts))(*volts)
-        status = self._write(self._pointers.context, given)
-        assert list(map(str, given)) == list(map(str, map(float, volts))), "write changed the loop's values"
+        buffer = (ctypes.c_double * len(volts))(*volts)
+        status = self._write(self._pointers.context, buffer)
+        assert list(map(str, buffer)) == list(map(str, map(float, volts))), "write changed the loop's values"
         return status
 
 
@@ -94,12 +94,12 @@ class DriverContract:
         """By `kind`, which its entry point says as well; with options that are of its `options_model`."""
         driver = self.driver()
         place = f"{type(driver).__module__}:{type(driver).__qualname__}"
-        names = [kind for kind, where in kinds().items() if where == place]
+        names = [kind for kind, location in kinds().items() if location == place]
         kind, model = getattr(driver, "kind", None), driver.options_model
         assert isinstance(kind, str), f"kind is {kind!r}; the name that a configuration gives is needed"
         assert not names or kind in names, f"kind is {kind!r}; its entry point calls it {', '.join(names)}"
-        given = type(driver.options)
-        assert given is model, f"its options are of {given.__name__}; options_model is {model.__name__}"
+        actual_model = type(driver.options)
+        assert actual_model is model, f"its options are of {actual_model.__name__}; options_model is {model.__name__}"
 
     def test_wiring_names_channels(self) -> None:
         """Every axis has an input and an output that are there."""
@@ -134,16 +134,20 @@ class DriverContract:
         Parking ramps from there: a card that says otherwise is stepped. One that parks itself may be on its way.
         """
         driver = self.driver()
-        found = self.outputs(driver)
+        before_v = self.outputs(driver)
         driver.open()
         try:
-            told, now, channels = driver.outputs_v(), self.outputs(driver), driver.facts.outputs
-            if told is not None:
-                assert len(told) == len(channels), f"outputs_v() is {told}; {len(channels)} values are needed"
-                assert all(map(math.isfinite, told)), f"outputs_v() is {told}; finite numbers are needed"
-            if found is not None and now is not None and not driver.facts.hardware_watchdog:
-                self._require_outputs(driver, found if told is None else told, f"open, with outputs_v() {told},")
-                for channel, before, after in zip(channels, found, now, strict=True):
+            reported_v, after_v, channels = driver.outputs_v(), self.outputs(driver), driver.facts.outputs
+            if reported_v is not None:
+                assert len(reported_v) == len(channels), (
+                    f"outputs_v() is {reported_v}; {len(channels)} values are needed"
+                )
+                assert all(map(math.isfinite, reported_v)), f"outputs_v() is {reported_v}; finite numbers are needed"
+            if before_v is not None and after_v is not None and not driver.facts.hardware_watchdog:
+                self._require_outputs(
+                    driver, before_v if reported_v is None else reported_v, f"open, with outputs_v() {reported_v},"
+                )
+                for channel, before, after in zip(channels, before_v, after_v, strict=True):
                     stayed = min(abs(after - before), abs(after - channel.safe_v)) <= self.tolerance_v
                     assert stayed, f"{channel}: open moved it from {before} V to {after} V, which is not safe_v"
         finally:
@@ -206,10 +210,12 @@ class DriverContract:
             assert status >= 0, f"write failed after close and open{_raised(driver)}"
 
     def _require_outputs(self, driver: Driver, wanted: Sequence[float], after: str) -> None:
-        found = self.outputs(driver)
-        if found is not None:
-            far = max(abs(a - b) for a, b in zip(found, wanted, strict=True))
-            assert far <= self.tolerance_v, f"after {after} the outputs are {list(found)}; {list(wanted)} is needed"
+        outputs_v = self.outputs(driver)
+        if outputs_v is not None:
+            deviation = max(abs(a - b) for a, b in zip(outputs_v, wanted, strict=True))
+            assert deviation <= self.tolerance_v, (
+                f"after {after} the outputs are {list(outputs_v)}; {list(wanted)} is needed"
+            )
 
 
 def _raised(driver: Driver) -> str:

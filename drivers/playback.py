@@ -48,8 +48,8 @@ def playback_write(context, values):
     tape = carray(context, 1, CONTEXT)[0]
     if tape.refusals == 0:
         return 0
-    refused = carray(address_pointer(tape.refusals), tape.rows, np.bool_)
-    return -1 if refused[tape.row - 1] else 0
+    refused_writes = carray(address_pointer(tape.refusals), tape.rows, np.bool_)
+    return -1 if refused_writes[tape.row - 1] else 0
 
 
 class Playback:

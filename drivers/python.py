@@ -52,14 +52,14 @@ class PythonDriver(Driver):
         """Start the hardware and wrap `read` and `write`."""
         self.start()
         facts: Facts = self.facts
-        given = len(facts.inputs) + 1 + len(facts.observed)
-        outputs, ranges = len(facts.outputs), [(channel.minimum_v, channel.maximum_v) for channel in facts.outputs]
+        value_count = len(facts.inputs) + 1 + len(facts.observed)
+        output_count, ranges = len(facts.outputs), [(channel.minimum_v, channel.maximum_v) for channel in facts.outputs]
 
         def read(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
             try:
                 row = (*self.read(), self.sample_age_us, *self.observe())
-                if len(row) != given:
-                    raise ValueError(f"driver {self.kind!r}: read gave {len(row)} numbers; its facts say {given}")
+                if len(row) != value_count:
+                    raise ValueError(f"driver {self.kind!r}: read gave {len(row)} numbers; its facts say {value_count}")
                 for i, value in enumerate(row):
                     values[i] = value
                 return self.status
@@ -69,7 +69,7 @@ class PythonDriver(Driver):
 
         def write(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
             try:
-                volts = values[0:outputs]
+                volts = values[0:output_count]
                 for value, (minimum_v, maximum_v) in zip(volts, ranges, strict=True):
                     if not minimum_v <= value <= maximum_v:
                         raise ValueError(f"driver {self.kind!r}: {value} V is outside {minimum_v} … {maximum_v} V")

@@ -19,8 +19,8 @@ BUILT_IN = {
 
 def kinds() -> dict[str, str]:
     """Every known kind and where it is defined; a third party cannot replace a built-in kind."""
-    found = {point.name: point.value for point in entry_points(group=GROUP)}
-    return dict(sorted({**found, **BUILT_IN}.items()))
+    installed = {point.name: point.value for point in entry_points(group=GROUP)}
+    return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
 def driver_class(kind: str) -> type[Driver]:
@@ -28,11 +28,11 @@ def driver_class(kind: str) -> type[Driver]:
 
     Raises ValueError for an unknown kind, MissingLibrary for a module, or a package that it needs, that is not there.
     """
-    place = BUILT_IN.get(kind) or kinds().get(kind)  # what is installed is looked through where it has to be
-    if place is None:
+    location = BUILT_IN.get(kind) or kinds().get(kind)  # what is installed is looked through where it has to be
+    if location is None:
         raise ValueError(f"{kind!r} is not a known driver; there are {', '.join(kinds())}")
-    module, _, name = place.partition(":")
+    module, _, name = location.partition(":")
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise MissingLibrary(f"driver {kind!r}, {place}: cannot be imported: {error}") from error
+        raise MissingLibrary(f"driver {kind!r}, {location}: cannot be imported: {error}") from error

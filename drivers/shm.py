@@ -49,19 +49,19 @@ def shm_read(context, values):
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
     sample_ns = carray(address_pointer(card.sample_ns), 1, np.int64)
     codes = carray(address_pointer(card.adc_codes), MAX_CHANNELS, np.int64)
-    copied = carray(address_pointer(card.copied), MAX_CHANNELS, np.int64)
-    held = carray(address_pointer(card.held), MAX_CHANNELS, np.int64)
+    copied_codes = carray(address_pointer(card.copied), MAX_CHANNELS, np.int64)
+    held_codes = carray(address_pointer(card.held), MAX_CHANNELS, np.int64)
     out = carray(values, card.channels + 1)
-    taken_ns = latest_sample(words, sample_ns, codes, copied, card.channels, TRIES)
-    if taken_ns >= 0:
-        card.held_ns = taken_ns
+    sample_time_ns = latest_sample(words, sample_ns, codes, copied_codes, card.channels, TRIES)
+    if sample_time_ns >= 0:
+        card.held_ns = sample_time_ns
         for i in range(card.channels):
-            held[i] = copied[i]
+            held_codes[i] = copied_codes[i]
     elif card.held_ns < 0:
         out[card.channels] = np.inf
         return NO_SAMPLE
     for i in range(card.channels):
-        out[i] = held[i] * LSB_V
+        out[i] = held_codes[i] * LSB_V
     out[card.channels] = (monotonic_ns(card.timespec) - card.held_ns) * 1e-3
     return 0
 
@@ -74,12 +74,15 @@ def shm_write(context, values):
     fifo = carray(address_pointer(card.fifo), FIFO, board.WRITE)
     out = carray(values, card.channels)
     number = load_acquire(words, WRITTEN)
-    write, before = fifo[np.int64(number % np.uint64(FIFO))], fifo[np.int64((number - np.uint64(1)) % np.uint64(FIFO))]
+    write, previous = (
+        fifo[np.int64(number % np.uint64(FIFO))],
+        fifo[np.int64((number - np.uint64(1)) % np.uint64(FIFO))],
+    )
     for i in range(card.channels):
         code = np.int64(np.rint(out[i] / LSB_V))
         write.codes[i] = LOWEST_CODE if code < LOWEST_CODE else (HIGHEST_CODE if code > HIGHEST_CODE else code)
     for i in range(card.channels, MAX_CHANNELS):
-        write.codes[i] = before.codes[i]
+        write.codes[i] = previous.codes[i]
     write.ns = monotonic_ns(card.timespec)
     store_release(words, WRITTEN, number + np.uint64(1))
     return 0
@@ -128,7 +131,7 @@ class ShmDriver(Driver):
             if isinstance(error, DriverError):
                 raise
             raise DriverError(f"{self._file}: {error.strerror or error}") from None
-        copied, held, timespec = (
+        copied_codes, held_codes, timespec = (
             np.zeros(MAX_CHANNELS, np.int64),
             np.zeros(MAX_CHANNELS, np.int64),
             np.zeros(2, np.int64),
@@ -136,10 +139,10 @@ class ShmDriver(Driver):
         context = np.zeros(1, CONTEXT)
         context["channels"], context["held_ns"] = len(self.wiring), -1
         arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "fifo": memory.fifo,
-                  "adc_codes": memory.adc_codes, "copied": copied, "timespec": timespec, "held": held}  # fmt: skip
+                  "adc_codes": memory.adc_codes, "copied": copied_codes, "timespec": timespec, "held": held_codes}  # fmt: skip
         for name, array in arrays.items():
             context[name] = array.ctypes.data
-        self._arrays = context, copied, held, timespec
+        self._arrays = context, copied_codes, held_codes, timespec
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
 
     def outputs_v(self) -> list[float]:

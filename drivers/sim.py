@@ -27,9 +27,9 @@ def sim_read(context, values):
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
     out = carray(values, rig.count * (1 + OBSERVED_PER_AXIS) + rig.looped + 1)
-    looped_v = carray(address_pointer(rig.looped_v), rig.looped, np.float64)
+    loopback_v = carray(address_pointer(rig.looped_v), rig.looped, np.float64)
     for i in range(rig.looped):
-        out[rig.count + i] = looped_v[i]
+        out[rig.count + i] = loopback_v[i]
     out[rig.count + rig.looped] = 0.0
     for i in range(rig.count):
         out[i] = sample(coefficients[i], state[i])
@@ -46,9 +46,9 @@ def sim_write(context, values):
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
     out = carray(values, rig.count + rig.looped)
-    looped_v = carray(address_pointer(rig.looped_v), rig.looped, np.float64)
+    loopback_v = carray(address_pointer(rig.looped_v), rig.looped, np.float64)
     for i in range(rig.looped):
-        looped_v[i] = out[rig.count + i]
+        loopback_v[i] = out[rig.count + i]
     advance(coefficients, state, out[: rig.count])
     return 0
 

@@ -130,9 +130,9 @@ def serve(
         losses = np.zeros(1, LOSSES).view(np.recarray)
         losses.word = seed_word(options.seed, "losses")
         losses.dropped_share, losses.repeated_share = options.dropped_share, options.repeated_share
-        past = np.zeros((MAX_CHANNELS, LEVELS), PAST).view(np.recarray)
+        levels = np.zeros((MAX_CHANNELS, LEVELS), PAST).view(np.recarray)
         arguments = (coefficients, state, memory.words, memory.sample_ns, memory.fifo, memory.adc_codes, memory.seen,
-                     past, losses, timespec.ctypes.data)  # fmt: skip
+                     levels, losses, timespec.ctypes.data)  # fmt: skip
         _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
@@ -187,17 +187,17 @@ def _run(
         if np.uint64(now_ns - wake_ns) > words[LONGEST_LATE_NS]:
             words[LONGEST_LATE_NS] = np.uint64(now_ns - wake_ns)
         fault = load_acquire(words, FAULT)
-        fresh, dated = _arrives(losses[0], words)
+        value_arrives, time_arrives = _arrives(losses[0], words)
         frozen = fault == FROZEN_INPUT
         sequence = load_acquire(words, SEQUENCE)
         store_release(words, SEQUENCE, BUSY)
         fence_release()
         for i in range(coefficients.shape[0]):
             volts = sample(coefficients[i], state[i])
-            if fresh and not frozen:
+            if value_arrives and not frozen:
                 adc_codes[i] = np.int64(np.rint(volts / LSB_V))
             _look(seen[i], state[i], index)
-        if dated and not frozen:
+        if time_arrives and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
         _look_at_outputs(words, fifo, seen, past, coefficients.shape[0], fault != STUCK_OUTPUT, timespec)
@@ -237,11 +237,11 @@ def _look(seen, state, index):
 @jit
 def _look_at_outputs(words, fifo, seen, past, channels, follow, timespec):
     """See the writes since the look before, and what the outputs are at; stuck outputs do not `follow`."""
-    began_ns = monotonic_ns(timespec)
-    written = load_acquire(words, WRITTEN)
+    look_begin_ns = monotonic_ns(timespec)
+    write_count = load_acquire(words, WRITTEN)
     now_ns = monotonic_ns(timespec)
-    see_writes(words, fifo, seen, past, channels, written, now_ns, follow)
-    words[LOOKED_NS] = np.uint64(began_ns)  # what `written` did not count yet was written after this
+    see_writes(words, fifo, seen, past, channels, write_count, now_ns, follow)
+    words[LOOKED_NS] = np.uint64(look_begin_ns)  # what `written` did not count yet was written after this
     for i in range(channels):
         if follow:
             move(seen[i], seen[i].written_v, now_ns)
@@ -250,30 +250,30 @@ def _look_at_outputs(words, fifo, seen, past, channels, follow, timespec):
 @jit
 def see_writes(words, fifo, seen, past, channels, written, now_ns, follow):
     """See every write up to number `written` that was not seen yet; all of them were made before `now_ns`."""
-    taken = words[TAKEN]
-    if written - taken > np.uint64(FIFO):
-        words[UNSEEN] += written - taken - np.uint64(FIFO)
-        taken = written - np.uint64(FIFO)
-    while taken < written:
-        write = fifo[np.int64(taken % np.uint64(FIFO))]
+    examined_count = words[TAKEN]
+    if written - examined_count > np.uint64(FIFO):
+        words[UNSEEN] += written - examined_count - np.uint64(FIFO)
+        examined_count = written - np.uint64(FIFO)
+    while examined_count < written:
+        write = fifo[np.int64(examined_count % np.uint64(FIFO))]
         written_ns = min(max(write.ns, np.int64(words[LOOKED_NS])), now_ns)
         for i in range(channels):
             words[UNSEEN] += np.uint64(see_write(seen[i], past[i], write.codes[i] * LSB_V, written_ns, follow))
-        taken += np.uint64(1)
-    words[TAKEN] = taken
+        examined_count += np.uint64(1)
+    words[TAKEN] = examined_count
 
 
 @jit
 def latest_sample(words, sample_ns, adc_codes, out_codes, channels, tries):
     """Copy the newest sample; returns its time in ns of CLOCK_MONOTONIC, or −1 where none could be had whole."""
     for _ in range(tries):
-        before = load_acquire(words, SEQUENCE)
-        if before == BUSY:
+        sequence = load_acquire(words, SEQUENCE)
+        if sequence == BUSY:
             continue
         for i in range(channels):
             out_codes[i] = adc_codes[i]
-        taken_ns = sample_ns[0]
+        time_ns = sample_ns[0]
         fence_acquire()
-        if load_acquire(words, SEQUENCE) == before:
-            return taken_ns
+        if load_acquire(words, SEQUENCE) == sequence:
+            return time_ns
     return np.int64(-1)

@@ -47,10 +47,10 @@ class Modal:
 
     def zero_order_hold(self, period_s: float) -> Modal:
         """Exact discretisation for an input held constant over each period."""
-        held = period_s * np.ones_like(self.poles)
-        moving = self.poles != 0
-        held[moving] = np.expm1(self.poles[moving] * period_s) / self.poles[moving]
-        return Modal(np.exp(self.poles * period_s), self.residues * held, self.direct)
+        hold_factors = period_s * np.ones_like(self.poles)
+        nonzero = self.poles != 0
+        hold_factors[nonzero] = np.expm1(self.poles[nonzero] * period_s) / self.poles[nonzero]
+        return Modal(np.exp(self.poles * period_s), self.residues * hold_factors, self.direct)
 
     def realise(self) -> StateSpace:
         """Real block-diagonal realisation: 1×1 blocks for real poles, rotation-scaling 2×2 blocks for pairs."""
@@ -79,16 +79,16 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
     real = np.sort(values[np.abs(values.imag) <= 1e-12 * np.abs(values)].real)
     upper = values[values.imag > 1e-12 * np.abs(values)]
     lower = list(values[values.imag < -1e-12 * np.abs(values)])
-    paired: list[complex] = []
+    pairs: list[complex] = []
     for root in upper[np.lexsort((upper.imag, upper.real))]:
-        nearest = min(lower, key=lambda other, root=root: abs(other - np.conj(root)), default=None)
+        nearest = min(lower, key=lambda candidate, root=root: abs(candidate - np.conj(root)), default=None)
         if nearest is None or abs(nearest - np.conj(root)) > 1e-9 * abs(root):
             raise ValueError(f"{root:.6g} has no complex conjugate beside it")
         lower.remove(nearest)
-        paired += [complex(root), complex(np.conj(root))]
+        pairs += [complex(root), complex(np.conj(root))]
     if lower:
         raise ValueError(f"{lower[0]:.6g} has no complex conjugate beside it")
-    return np.concatenate([real.astype(complex), np.asarray(paired, dtype=complex)])
+    return np.concatenate([real.astype(complex), np.asarray(pairs, dtype=complex)])
 
 
 def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Modal:
@@ -101,10 +101,10 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Modal:
         raise ValueError(f"improper: {numerator.size} zeros but {denominator.size} poles")
     residues = np.empty(denominator.size, dtype=complex)
     for i, pole in enumerate(denominator):
-        others = np.delete(denominator, i)
-        if np.any(np.abs(others - pole) <= CLUSTER * max(abs(pole), 1e-300)):
+        other_poles = np.delete(denominator, i)
+        if np.any(np.abs(other_poles - pole) <= CLUSTER * max(abs(pole), 1e-300)):
             raise RepeatedPoles(f"poles near {pole:.6g} are repeated")
-        residues[i] = gain * _ratio_of_products(pole - numerator, pole - others)
+        residues[i] = gain * _ratio_of_products(pole - numerator, pole - other_poles)
     direct = gain if numerator.size == denominator.size else 0.0
     return Modal(denominator, residues[None, :], np.array([direct]))
 

@@ -57,9 +57,9 @@ class Options(BaseModel):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """As pydantic's, but without what was computed from the fields as they were."""
         copy = super().model_copy(update=update, deep=deep)
-        held = vars(copy)
-        for name in held.keys() - type(self).model_fields.keys():
-            del held[name]
+        attributes = vars(copy)
+        for name in attributes.keys() - type(self).model_fields.keys():
+            del attributes[name]
         return copy
 
     def _only_with(self, name: str, value: str, *fields: str) -> None:

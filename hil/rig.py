@@ -75,26 +75,26 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
         if plant.hysteresis.history_v:
             _rest_after(plant.hysteresis.history_v, coefficients[i], state[i])
     _couple(options, axes, coefficients)
-    own_um = state["hysteresis_um"]
-    moved_um = own_um + coefficients["coupling"][:, : len(axes)] @ own_um[:MAX_COUPLED]
-    for i in np.flatnonzero(moved_um):
-        dynamics.settle(coefficients[i], state[i], float(moved_um[i]))
+    uncoupled_um = state["hysteresis_um"]
+    input_um = uncoupled_um + coefficients["coupling"][:, : len(axes)] @ uncoupled_um[:MAX_COUPLED]
+    for i in np.flatnonzero(input_um):
+        dynamics.settle(coefficients[i], state[i], float(input_um[i]))
     return coefficients, state
 
 
 def _couple(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
     """Note what moves what. Raises ValueError for a name that is no axis, and for more axes than may be coupled."""
-    for name, others in options.coupling.items():
-        for other in (name, *others):
-            if other not in axes:
-                raise ValueError(f"coupling.{name}: {other!r} is no axis; there are {', '.join(axes) or 'none'}")
-        if name in others:
+    for name, shares in options.coupling.items():
+        for source in (name, *shares):
+            if source not in axes:
+                raise ValueError(f"coupling.{name}: {source!r} is no axis; there are {', '.join(axes) or 'none'}")
+        if name in shares:
             raise ValueError(f"coupling.{name}.{name}: an axis moves itself by 1 µm per µm; other axes are allowed")
         if len(axes) > MAX_COUPLED:
             raise ValueError(f"coupling: {len(axes)} axes; at most {MAX_COUPLED} may be coupled")
         coefficients["coupled_count"][axes.index(name)] = len(axes)
-        for other, share in others.items():
-            coefficients["coupling"][axes.index(name), axes.index(other)] = share
+        for source, share in shares.items():
+            coefficients["coupling"][axes.index(name), axes.index(source)] = share
 
 
 def _rest_after(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
@@ -111,11 +111,11 @@ def _coefficients_of(plant: PlantOptions, period_s: float) -> dict[str, object]:
     thresholds_v, weights_um_per_v = hysteresis.TRUTHS.get(
         plant.hysteresis.truth, (plant.hysteresis.thresholds_v, plant.hysteresis.weights_um_per_v)
     )
-    empty = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
+    padding = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
     fields: dict[str, object] = {
         "play_count": len(thresholds_v),
-        "thresholds_v": (*thresholds_v, *empty),
-        "weights_um_per_v": (*weights_um_per_v, *empty),
+        "thresholds_v": (*thresholds_v, *padding),
+        "weights_um_per_v": (*weights_um_per_v, *padding),
         "sensor_um_per_v": plant.sensor.um_per_v,
         "sensor_offset_um": plant.sensor.offset_um,
         "sensor_noise_um": plant.sensor.noise_um,
@@ -152,9 +152,11 @@ def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, 
         gain = options.gain or 0.0
     else:
         paper = options.form == "paper"
-        zeros, above = dynamics.roots_of_factors(dynamics.PAPER_NUMERATOR if paper else options.numerator)
-        poles, below = dynamics.roots_of_factors(dynamics.PAPER_DENOMINATOR if paper else options.denominator)
-        gain = (dynamics.PAPER_GAIN if paper else options.gain or 0.0) * above / below
+        zeros, numerator_gain = dynamics.roots_of_factors(dynamics.PAPER_NUMERATOR if paper else options.numerator)
+        poles, denominator_gain = dynamics.roots_of_factors(
+            dynamics.PAPER_DENOMINATOR if paper else options.denominator
+        )
+        gain = (dynamics.PAPER_GAIN if paper else options.gain or 0.0) * numerator_gain / denominator_gain
     if options.resonance_shift:
         poles, gain = dynamics.shift_resonance(zeros, poles, gain, options.resonance_shift)
     return zeros, poles, gain
@@ -191,7 +193,7 @@ def _displacement_um(coefficients, state, actuator_v):
 @jit
 def _moved_um(coefficients, state, i):
     """Displacement of axis `i`, with what the others add to it [µm]."""
-    moved_um = state[i].hysteresis_um
+    total_um = state[i].hysteresis_um
     for j in range(coefficients[i].coupled_count):
-        moved_um += coefficients[i].coupling[j] * state[j].hysteresis_um
-    return moved_um
+        total_um += coefficients[i].coupling[j] * state[j].hysteresis_um
+    return total_um

@@ -54,9 +54,9 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 
 def owners(folder: Path) -> set[int]:
     """Users whose files in `folder` count: we, root, and whom root gave it. Raises OSError, Untrusted."""
-    fd, found, _ = _walk(folder, None, given=True)
+    fd, owner_ids, _ = _walk(folder, None, given=True)
     release(fd)
-    return found
+    return owner_ids
 
 
 def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False) -> int:
@@ -72,12 +72,12 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     finally:
         release(folder)
     status = os.fstat(fd)
-    ours = group and status.st_gid in (os.getegid(), *os.getgroups())
+    is_group_file = group and status.st_gid in (os.getegid(), *os.getgroups())
     if not stat.S_ISREG(status.st_mode):
         reason = "not a regular file"
-    elif not _is_own(status) and not ours:
+    elif not _is_own(status) and not is_group_file:
         reason = _belongs(status)
-    elif status.st_mode & (stat.S_IWOTH if ours else _OTHERS_WRITE):
+    elif status.st_mode & (stat.S_IWOTH if is_group_file else _OTHERS_WRITE):
         reason = "others may write to it"
     else:
         return fd
@@ -215,41 +215,41 @@ def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool =
 
     Without `believes` any folder will do, and a link also counts where its maker alone may write.
     """
-    believed, links = {0, os.geteuid()}, 0
-    left = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))
+    trusted_ids, links = {0, os.geteuid()}, 0
+    remaining_names = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))
     fd, by_root, shared = os.open("/", _FOLDER), True, False
     try:
-        while left:
-            name = left.pop()
+        while remaining_names:
+            name = remaining_names.pop()
             status = _entry(name, fd, mode)
             if stat.S_ISLNK(status.st_mode):
                 links += 1
-                if status.st_uid not in believed and (believes or not _is_alone(os.fstat(fd), status.st_uid)):
+                if status.st_uid not in trusted_ids and (believes or not _is_alone(os.fstat(fd), status.st_uid)):
                     raise Untrusted(path, f"leads through {_belongs(status)}")
                 if links > _MOST_LINKS:
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
                 target = Path(os.readlink(name, dir_fd=fd))
                 if target.is_absolute():
                     fd, by_root = _onward(fd, "/"), True
-                left += reversed([part for part in target.parts if part != "/"])
+                remaining_names += reversed([part for part in target.parts if part != "/"])
                 continue
             fd = _onward(fd, name)
             if not believes:
                 continue
             status = os.fstat(fd)
             if given and by_root:
-                believed.add(status.st_uid)
+                trusted_ids.add(status.st_uid)
             shared = bool(status.st_mode & stat.S_ISVTX and status.st_mode & _OTHERS_WRITE)
-            where = Path(os.readlink(f"/proc/self/fd/{fd}"))
-            if status.st_uid not in believed:
-                raise Untrusted(where, f"{_belongs(status)}, and what is in it is not believed")
+            location = Path(os.readlink(f"/proc/self/fd/{fd}"))
+            if status.st_uid not in trusted_ids:
+                raise Untrusted(location, f"{_belongs(status)}, and what is in it is not believed")
             if status.st_mode & _OTHERS_WRITE and not shared:
-                raise Untrusted(where, "others may write there; it must be its owner's alone (chmod go-w)")
+                raise Untrusted(location, "others may write there; it must be its owner's alone (chmod go-w)")
             by_root = by_root and status.st_uid == 0 and not shared
     except BaseException:
         release(fd)
         raise
-    return fd, believed, shared
+    return fd, trusted_ids, shared
 
 
 def _entry(name: str, folder: int, mode: int | None) -> os.stat_result:

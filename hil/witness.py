@@ -45,7 +45,7 @@ def see_write(seen, past, volts, written_ns, follows):
         return 0
     newest = seen.levels
     written_ns = max(written_ns, past[newest % LEVELS].from_ns)
-    crowded = _judge(seen, past, volts, written_ns)
+    is_unjudged = _judge(seen, past, volts, written_ns)
     seen.levels = newest + 1
     past[seen.levels % LEVELS].volts = volts
     past[seen.levels % LEVELS].from_ns = written_ns
@@ -54,7 +54,7 @@ def see_write(seen, past, volts, written_ns, follows):
     seen.highest_v = max(seen.highest_v, volts)
     if follows:
         move(seen, volts, written_ns)
-    return crowded
+    return is_unjudged
 
 
 @jit

@@ -25,8 +25,8 @@ def most_stuff_bits(bits: int) -> int:
 
 def classic_frame_bits(length: int) -> int:
     """Bits of a classic frame of `length` bytes, at most."""
-    stuffed = _CLASSIC_STUFFED + 8 * length
-    return stuffed + most_stuff_bits(stuffed) + _CLASSIC_UNSTUFFED
+    stuffable_bits = _CLASSIC_STUFFED + 8 * length
+    return stuffable_bits + most_stuff_bits(stuffable_bits) + _CLASSIC_UNSTUFFED
 
 
 def fd_frame_bits(length: int) -> tuple[int, int]:
@@ -34,10 +34,10 @@ def fd_frame_bits(length: int) -> tuple[int, int]:
 
     As many stuff bits as there can be are taken to be slow.
     """
-    stuffed = _FD_SLOW + _FD_HEAD + 8 * length
+    stuffable_bits = _FD_SLOW + _FD_HEAD + 8 * length
     slow_stuff = most_stuff_bits(_FD_SLOW)
     crc = _SHORT_CRC_FIELD if length <= _SHORT_CRC_BYTES else _LONG_CRC_FIELD
-    fast = _FD_HEAD + 8 * length + most_stuff_bits(stuffed) - slow_stuff + crc
+    fast = _FD_HEAD + 8 * length + most_stuff_bits(stuffable_bits) - slow_stuff + crc
     return _FD_SLOW + slow_stuff + _FD_TAIL, fast
 
 

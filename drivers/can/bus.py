@@ -14,9 +14,9 @@ FAILURES = (can.CanError, OSError)
 
 def require_interface(options: BusOptions) -> None:
     """Raises ValueError for an interface that python-can does not have."""
-    known = sorted(can.VALID_INTERFACES)
-    if options.interface not in known:
-        raise ValueError(f"interface: {options.interface!r}; python-can has {', '.join(known)}")
+    interfaces = sorted(can.VALID_INTERFACES)
+    if options.interface not in interfaces:
+        raise ValueError(f"interface: {options.interface!r}; python-can has {', '.join(interfaces)}")
 
 
 def open_bus(options: BusOptions) -> can.BusABC:
@@ -31,5 +31,5 @@ def open_bus(options: BusOptions) -> can.BusABC:
 def described(error: BaseException) -> str:
     """The message of an error, and of the one behind it where python-can hides the cause there."""
     cause = error.__cause__ or error.__context__
-    texts = [str(one) or type(one).__name__ for one in (error, cause) if one is not None]
+    texts = [str(part) or type(part).__name__ for part in (error, cause) if part is not None]
     return ": ".join(dict.fromkeys(texts))

@@ -114,8 +114,8 @@ class CanDriver(PythonDriver):
         try:
             for _ in range(CONFIRMATIONS):
                 deadline_s = time.monotonic() + CONFIRM_S
-                while (left_s := deadline_s - time.monotonic()) > 0:
-                    message = self._receive(left_s)
+                while (remaining_s := deadline_s - time.monotonic()) > 0:
+                    message = self._receive(remaining_s)
                     if message is not None and self._take(message) and self._stream.newest == self._stream.sent:
                         return
                 self.write([channel.safe_v for channel in self.facts.outputs])
@@ -147,8 +147,8 @@ class CanDriver(PythonDriver):
     def _listen(self, for_s: float) -> bool:
         """Whether the answer to an opening frame came within `for_s`."""
         deadline_s = time.monotonic() + for_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            message = self._receive(left_s)
+        while (remaining_s := deadline_s - time.monotonic()) > 0:
+            message = self._receive(remaining_s)
             if message is not None and self._take(message):
                 return True
         return False

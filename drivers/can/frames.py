@@ -61,8 +61,8 @@ class Frame:
 
     def fits(self, message: can.Message) -> bool:
         """Whether a message with this frame's identifier has its form too."""
-        plain = not (message.is_remote_frame or message.is_error_frame or message.is_extended_id)
-        return plain and message.is_fd == self.fd and len(message.data) == self.length
+        is_plain = not (message.is_remote_frame or message.is_error_frame or message.is_extended_id)
+        return is_plain and message.is_fd == self.fd and len(message.data) == self.length
 
 
 class Exchange(NamedTuple):

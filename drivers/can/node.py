@@ -57,8 +57,8 @@ class RigNode:
         """Raises DriverError where another node answers, or is about to start."""
         self.announce()
         deadline_s = time.monotonic() + LISTEN_S
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            message = self._bus.recv(left_s)
+        while (remaining_s := deadline_s - time.monotonic()) > 0:
+            message = self._bus.recv(remaining_s)
             if message is None:
                 break
             if message.arbitration_id == self._exchange.sample.identifier or self._other(message) is not None:

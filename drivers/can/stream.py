@@ -31,9 +31,9 @@ class AnswerStream:
 
     def take(self, sequence: int) -> bool:
         """Count an answer; True where it is newer than all before it."""
-        behind = (self.sent - sequence) % self._highest
-        count = self.sent - behind
-        if behind >= WINDOW or count < 1:
+        age = (self.sent - sequence) % self._highest
+        count = self.sent - age
+        if age >= WINDOW or count < 1:
             self.invalid += 1
             return False
         if count > self.newest:

@@ -46,7 +46,7 @@ class Outward:
     @property
     def _types(self) -> list[Any]:
         """Of its result, and of what it is given."""
-        return [C_TYPES[one] for one in re.findall(r"\w+\(float64\)|\w+", self._signature)]
+        return [C_TYPES[type_name] for type_name in re.findall(r"\w+\(float64\)|\w+", self._signature)]
 
 
 class CFunction(Outward):
@@ -70,8 +70,8 @@ class CFunction(Outward):
     @cached_property
     def _prototype(self) -> Any:
         """With the interpreter waiting, as for every kernel."""
-        result, *given = self._types
-        return ctypes.PYFUNCTYPE(result, *given)
+        result, *argument_types = self._types
+        return ctypes.PYFUNCTYPE(result, *argument_types)
 
     @cached_property
     def _written(self) -> tuple[Any, int]:
@@ -92,8 +92,8 @@ class CFunction(Outward):
         from rtloop.hil.native.standalone import c_function
 
         self._made = numba.cfunc(self._signature, error_model="numpy")(self._function)
-        if found := c_function(self._made, self._name):
-            machine_code.keep(self._name, found)
+        if code := c_function(self._made, self._name):
+            machine_code.keep(self._name, code)
         address: Any = self._made.address
         return address
 
@@ -112,8 +112,8 @@ class Entry(Outward):
     @cached_property
     def _callable(self) -> Any:
         """As compiled functions call each other: places for result and exception, and a status."""
-        _, *given = self._types
-        return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *given)(self.address)
+        _, *argument_types = self._types
+        return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(self.address)
 
     def _compiled(self) -> int:
         from rtloop.hil.native.compiler import signature_of
@@ -131,13 +131,13 @@ def kernel_address(
     from rtloop.hil.native.compiler import numba
     from rtloop.hil.native.standalone import kernel
 
-    made: Any = numba.njit(**options)(function)
-    made.compile(signature)
-    found = made.overloads[signature.args]
-    if code := kernel(found.library, found.fndesc.llvm_func_name, name, raises):
+    dispatcher: Any = numba.njit(**options)(function)
+    dispatcher.compile(signature)
+    overload = dispatcher.overloads[signature.args]
+    if code := kernel(overload.library, overload.fndesc.llvm_func_name, name, raises):
         machine_code.keep(name, code)
-    _made.append(made)
-    return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
+    _made.append(dispatcher)
+    return overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name)
 
 
 _made: list[Any] = []
@@ -151,6 +151,6 @@ class _Raised(ctypes.Structure):
 
 
 def _what_was(raised: int) -> Exception:
-    found = _Raised.from_address(raised)
-    kind, arguments, *_ = pickle.loads(ctypes.string_at(found.pickled, found.size))
+    record = _Raised.from_address(raised)
+    kind, arguments, *_ = pickle.loads(ctypes.string_at(record.pickled, record.size))
     return kind(*(arguments or ()))

@@ -30,8 +30,8 @@ def source_digest() -> str:
     """Hexadecimal digest of all sources of kernels, the compiler's version and the processor."""
     digest = hashlib.sha256()
     for place in KERNELS:
-        found = PACKAGE / place
-        for path in sorted(found.rglob("*.py")) if found.is_dir() else [found]:
+        source = PACKAGE / place
+        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
             if path.name == OPTIONS:
                 continue
             digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")

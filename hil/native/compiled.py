@@ -114,10 +114,10 @@ def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | Non
         def typed(_: Any, *arguments: Any) -> Any:
             return function(compiler, *arguments)
 
-        return compiler.types.Function(compiler.make_intrinsic_template(found, typed, function.__name__))
+        return compiler.types.Function(compiler.make_intrinsic_template(symbol, typed, function.__name__))
 
-    found: Any = Name(function.__name__, meaning, uncompiled)  # as Any, for its callers leave out that parameter
-    return found
+    symbol: Any = Name(function.__name__, meaning, uncompiled)  # as Any, for its callers leave out that parameter
+    return symbol
 
 
 def intrinsic_like(uncompiled: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
@@ -167,8 +167,8 @@ def native_address(kernel: Any, signature: Any) -> int:
     if UNCOMPILED:
         return address_of(kernel)
     kernel.compile(signature)
-    found = kernel.overloads[signature.args]
-    return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
+    overload = kernel.overloads[signature.args]
+    return overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name)
 
 
 def kept_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:

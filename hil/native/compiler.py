@@ -27,12 +27,12 @@ def _load_arrays_without_blas() -> None:
 
     No kernel here uses linear algebra. Whose does finds it as ever: scipy is required, and imported where it is used.
     """
-    asked = numba.np.linalg.ensure_blas
+    ensure_blas = numba.np.linalg.ensure_blas
     numba.np.linalg.ensure_blas = _absent  # pyright: ignore[reportAttributeAccessIssue]
     try:
         from numba.np import arraymath
     finally:
-        numba.np.linalg.ensure_blas = asked
+        numba.np.linalg.ensure_blas = ensure_blas
     arraymath._HAVE_BLAS = True
 
 

@@ -52,8 +52,10 @@ def call_law(compiler: Any, function: Any, result: Any, raised: Any, coefficient
         pointer = ir.IntType(8).as_pointer()
         last = ir.DoubleType() if number else pointer
         target = builder.inttoptr(arguments[0], ir.FunctionType(ir.IntType(32), [pointer] * 4 + [last]).as_pointer())
-        given = [builder.inttoptr(argument, pointer) for argument in arguments[1:5]]
-        return builder.call(target, [*given, arguments[5] if number else builder.inttoptr(arguments[5], pointer)])
+        record_pointers = [builder.inttoptr(argument, pointer) for argument in arguments[1:5]]
+        return builder.call(
+            target, [*record_pointers, arguments[5] if number else builder.inttoptr(arguments[5], pointer)]
+        )
 
     number = isinstance(told, types.Float)
     return types.int32(*[types.intp] * 5, types.float64 if number else types.intp), codegen

@@ -47,17 +47,17 @@ def c_function(made: Any, name: str) -> bytes | None:
 
 
 def _object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
-    for one in (*module.functions, *module.global_variables):
-        if one.name != name and not one.is_declaration:
-            one.linkage = "internal"
+    for symbol in (*module.functions, *module.global_variables):
+        if symbol.name != name and not symbol.is_declaration:
+            symbol.linkage = "internal"
     passes = llvm.create_new_module_pass_manager()
     passes.add_global_dead_code_eliminate_pass()
     passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
     process = ctypes.CDLL(None)
-    needed = [one.name for one in (*module.functions, *module.global_variables) if one.is_declaration]
-    if not all(one.startswith("llvm.") or hasattr(process, one) for one in needed):
+    undefined_names = [symbol.name for symbol in (*module.functions, *module.global_variables) if symbol.is_declaration]
+    if not all(symbol.startswith("llvm.") or hasattr(process, symbol) for symbol in undefined_names):
         return None
-    if not raises and any(one.name.startswith(RAISES) for one in module.global_variables):
+    if not raises and any(symbol.name.startswith(RAISES) for symbol in module.global_variables):
         return None
     return machine.emit_object(module)
 
@@ -69,8 +69,8 @@ def _around_kernel(module: Any, theirs: str, name: str) -> str:
         layout=module.data_layout,
         triple=module.triple,
         kernel=kernel.name,
-        all_types=", ".join(str(one.type) for one in kernel.arguments),
+        all_types=", ".join(str(argument.type) for argument in kernel.arguments),
         result=str(function.global_value_type).partition(" ")[0],
         name=name,
-        arguments=", ".join(f"{one.type} %given.{i}" for i, one in enumerate(function.arguments)),
+        arguments=", ".join(f"{argument.type} %given.{i}" for i, argument in enumerate(function.arguments)),
     )

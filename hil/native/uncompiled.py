@@ -32,11 +32,11 @@ _thread = threading.local()
 @contextmanager
 def as_written() -> Iterator[None]:
     """In this thread, run kernels as they are written if their machine code is not at hand: slower, the same bits."""
-    before, _thread.as_written = runs_as_written(), True
+    previous, _thread.as_written = runs_as_written(), True
     try:
         yield
     finally:
-        _thread.as_written = before
+        _thread.as_written = previous
 
 
 def runs_as_written() -> bool:
@@ -58,13 +58,13 @@ def address_pointer(address: int) -> int:
 
 def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
     """An array over the memory at `pointer`, its records with attributes."""
-    kind = np.dtype(dtype)
-    size = int(np.prod(shape)) * kind.itemsize
+    record_type = np.dtype(dtype)
+    size = int(np.prod(shape)) * record_type.itemsize
     if size == 0:
-        return np.zeros(shape, kind)
+        return np.zeros(shape, record_type)
     memory: Any = (ctypes.c_char * size).from_address(int(pointer))
-    array = np.frombuffer(memory, kind).reshape(shape)
-    return array.view(np.recarray) if kind.names else array
+    array = np.frombuffer(memory, record_type).reshape(shape)
+    return array.view(np.recarray) if record_type.names else array
 
 
 def call(function: int, context: int, values: int) -> Any:

@@ -26,25 +26,25 @@ STATE = [("bw_drive_v", "f8"), ("bw_left_um", "f8")]
 @inlined
 def _slope(coefficients, left_um, sign):
     """dh/du while the drive goes up (`sign` 1) or down (−1)."""
-    size_um = left_um if left_um > 0.0 else -left_um
+    magnitude_um = left_um if left_um > 0.0 else -left_um
     return (
         coefficients.bw_rise_um_per_v
         - coefficients.bw_decay_per_v * sign * left_um
-        - coefficients.bw_lean_per_v * size_um
+        - coefficients.bw_lean_per_v * magnitude_um
     )
 
 
 @jit
 def step(coefficients, state, drive_v):
     """Displacement [µm] at `drive_v`. NaN moves nothing."""
-    way_v = drive_v - state.bw_drive_v
-    if way_v != 0.0 and way_v == way_v:
-        sign = 1.0 if way_v > 0.0 else -1.0
-        needed = sign * way_v / STEP_V
-        count = int(needed) + 1 if needed < MAX_STEPS else MAX_STEPS
-        part_v, left_um = way_v / count, state.bw_left_um
+    travel_v = drive_v - state.bw_drive_v
+    if travel_v != 0.0 and travel_v == travel_v:
+        sign = 1.0 if travel_v > 0.0 else -1.0
+        steps = sign * travel_v / STEP_V
+        count = int(steps) + 1 if steps < MAX_STEPS else MAX_STEPS
+        substep_v, hysteretic_um = travel_v / count, state.bw_left_um
         for _ in range(count):
-            middle_um = left_um + 0.5 * part_v * _slope(coefficients, left_um, sign)
-            left_um += part_v * _slope(coefficients, middle_um, sign)
-        state.bw_left_um, state.bw_drive_v = left_um, drive_v
+            middle_um = hysteretic_um + 0.5 * substep_v * _slope(coefficients, hysteretic_um, sign)
+            hysteretic_um += substep_v * _slope(coefficients, middle_um, sign)
+        state.bw_left_um, state.bw_drive_v = hysteretic_um, drive_v
     return coefficients.bw_um_per_v * state.bw_drive_v - state.bw_left_um

@@ -67,7 +67,7 @@ def drive(coefficients, state, value_v):
     if latency == 0:
         return state.dac_v
     head = state.queue_head
-    arrived_v = state.queue_v[head]
+    delayed_v = state.queue_v[head]
     state.queue_v[head] = state.dac_v
     state.queue_head = head + 1 if head + 1 < latency else 0
-    return arrived_v
+    return delayed_v

@@ -25,12 +25,12 @@ STATE = [("lags_um", "f8", (MAX_LAGS,))]
 
 def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period_s: float) -> dict[str, object]:
     """The kernel's coefficients; `shares` = 1 − exp(−T/τ), what a lag makes up in one period."""
-    empty = [0.0] * (MAX_LAGS - len(gains))
+    padding = [0.0] * (MAX_LAGS - len(gains))
     shares = -np.expm1(-period_s / np.array(time_constants_s, dtype=float))
     return {
         "lag_count": len(gains),
-        "lag_gains": np.array([*gains, *empty]),
-        "lag_shares": np.append(shares, empty),
+        "lag_gains": np.array([*gains, *padding]),
+        "lag_shares": np.append(shares, padding),
     }
 
 

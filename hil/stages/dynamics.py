@@ -122,24 +122,24 @@ def discretise(modal: Modal, period_s: float) -> dict[str, object]:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         discrete = modal.zero_order_hold(period_s)
-    kept = modal.poles.imag >= 0
-    count = int(kept.sum())
+    selected = modal.poles.imag >= 0
+    count = int(selected.sum())
     if count > MAX_MODES:
         raise ValueError(f"{count} modes (real poles and pole pairs, the sensor's included); at most {MAX_MODES} fit")
-    poles = discrete.poles[kept]
-    residues = np.where(modal.poles[kept].imag > 0, 2.0, 1.0) * discrete.residues[:, kept]
+    poles = discrete.poles[selected]
+    residues = np.where(modal.poles[selected].imag > 0, 2.0, 1.0) * discrete.residues[:, selected]
     if not (np.isfinite(poles).all() and np.isfinite(residues).all()):
         raise ValueError(f"overflow at a period of {period_s:g} s: use slower poles or a shorter period")
-    empty = np.zeros(MAX_MODES - count)
+    padding = np.zeros(MAX_MODES - count)
     true, sensed = residues
     return {
         "mode_count": count,
-        "mode_real": np.append(poles.real, empty),
-        "mode_imag": np.append(poles.imag, empty),
-        "true_real": np.append(true.real, empty),
-        "true_imag": np.append(-true.imag, empty),
-        "sensed_real": np.append(sensed.real, empty),
-        "sensed_imag": np.append(-sensed.imag, empty),
+        "mode_real": np.append(poles.real, padding),
+        "mode_imag": np.append(poles.imag, padding),
+        "true_real": np.append(true.real, padding),
+        "true_imag": np.append(-true.imag, padding),
+        "sensed_real": np.append(sensed.real, padding),
+        "sensed_imag": np.append(-sensed.imag, padding),
         "true_direct": modal.direct[0],
         "sensed_direct": modal.direct[1],
     }
@@ -203,5 +203,5 @@ def step(coefficients, state, input_um):
 @inlined
 def _moved(coefficients, real, imag, i, input_um):
     """Mode i after a period: λz + u."""
-    along, across = coefficients.mode_real[i], coefficients.mode_imag[i]
-    return along * real - across * imag + input_um, across * real + along * imag
+    pole_real, pole_imag = coefficients.mode_real[i], coefficients.mode_imag[i]
+    return pole_real * real - pole_imag * imag + input_um, pole_imag * real + pole_real * imag

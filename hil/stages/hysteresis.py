@@ -56,15 +56,15 @@ def step(coefficients, state, drive_v):
     first_um, second_um, third_um, fourth_um = 0.0, 0.0, 0.0, 0.0
     for block in range((coefficients.play_count + 3) // 4):  # the weights beyond the last play are 0
         i = 4 * block
-        one = play(drive_v, thresholds_v[i], plays_v[i])
-        two = play(drive_v, thresholds_v[i + 1], plays_v[i + 1])
-        three = play(drive_v, thresholds_v[i + 2], plays_v[i + 2])
-        four = play(drive_v, thresholds_v[i + 3], plays_v[i + 3])
-        first_um += weights[i] * one
-        second_um += weights[i + 1] * two
-        third_um += weights[i + 2] * three
-        fourth_um += weights[i + 3] * four
-        plays_v[i], plays_v[i + 1], plays_v[i + 2], plays_v[i + 3] = one, two, three, four
+        first_v = play(drive_v, thresholds_v[i], plays_v[i])
+        second_v = play(drive_v, thresholds_v[i + 1], plays_v[i + 1])
+        third_v = play(drive_v, thresholds_v[i + 2], plays_v[i + 2])
+        fourth_v = play(drive_v, thresholds_v[i + 3], plays_v[i + 3])
+        first_um += weights[i] * first_v
+        second_um += weights[i + 1] * second_v
+        third_um += weights[i + 2] * third_v
+        fourth_um += weights[i + 3] * fourth_v
+        plays_v[i], plays_v[i + 1], plays_v[i + 2], plays_v[i + 3] = first_v, second_v, third_v, fourth_v
     # kept side by side, they are one vector to the compiler
     state.sums_um[0], state.sums_um[1], state.sums_um[2], state.sums_um[3] = first_um, second_um, third_um, fourth_um
     return (first_um + second_um) + (third_um + fourth_um)

@@ -128,8 +128,8 @@ class Loop:
     @property
     def is_stable(self) -> bool:
         """Every pole to the left of the imaginary axis, or inside the unit circle."""
-        inside = self.poles.real < 0 if self.period_s is None else np.abs(self.poles) < 1
-        return bool(np.all(inside))
+        is_decaying = self.poles.real < 0 if self.period_s is None else np.abs(self.poles) < 1
+        return bool(np.all(is_decaying))
 
     @cached_property
     def rates(self) -> Complex:

@@ -68,12 +68,12 @@ def compare(
     reference = transfer.response(2j * np.pi * hz)
     error = np.abs(discrete.response(hz) - reference)
     deviation = np.divide(error, np.abs(reference), out=np.zeros_like(error), where=reference != 0)
-    worst = int(np.argmax(deviation))
+    worst_index = int(np.argmax(deviation))
     shifts = _shifts("notch", transfer.zeros, discrete.zeros, discrete.period_s)
     shifts += _shifts("resonance", transfer.poles, discrete.poles, discrete.period_s)
-    moved = [shift for shift in shifts if not _within(shift, largest_shift, largest_part_of_half_width)]
-    warnings = [_warning(shift, discrete) for shift in moved]
-    return Comparison(float(deviation[worst]), float(hz[worst]), limit_hz, tuple(shifts), warnings)
+    large_shifts = [shift for shift in shifts if not _within(shift, largest_shift, largest_part_of_half_width)]
+    warnings = [_warning(shift, discrete) for shift in large_shifts]
+    return Comparison(float(deviation[worst_index]), float(hz[worst_index]), limit_hz, tuple(shifts), warnings)
 
 
 def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
@@ -91,19 +91,19 @@ def _light_pairs(roots: Complex) -> list[complex]:
 
 def _shifts(kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float) -> list[Shift]:
     """Each lightly damped pair beside the nearest image, brought back to s by log(z)/T; an image serves once."""
-    back = list(np.log(images[images.imag > 0]) / period_s)
+    candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
     shifts: list[Shift] = []
     for root in _light_pairs(roots):
-        image = min(back, key=lambda other, root=root: abs(other - root), default=complex(math.nan))
-        back = [other for other in back if other is not image]
+        image = min(candidate_roots, key=lambda candidate, root=root: abs(candidate - root), default=complex(math.nan))
+        candidate_roots = [candidate for candidate in candidate_roots if candidate is not image]
         hz, image_hz = abs(root) / (2 * math.pi), float(abs(image)) / (2 * math.pi)
         shifts.append(Shift(kind, hz, image_hz if hz < 0.5 / period_s else math.nan, abs(root.real) / abs(root)))
     return shifts
 
 
 def _within(shift: Shift, largest_shift: float, largest_part: float) -> bool:
-    allowed = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
-    return abs(shift.relative) <= allowed  # False for NaN
+    max_shift = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
+    return abs(shift.relative) <= max_shift  # False for NaN
 
 
 def _warning(shift: Shift, discrete: DiscreteController) -> str:

@@ -64,7 +64,7 @@ class CoupledPlant:
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
     """K: 1 on the diagonal, and beside it what each axis takes of the others, 0 for those that are not named."""
     pairs = zip(names, coupling, strict=True)
-    return np.array([[1.0 if a == b else taken.get(b, 0.0) for b in names] for a, taken in pairs])
+    return np.array([[1.0 if a == b else factors.get(b, 0.0) for b in names] for a, factors in pairs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +90,8 @@ class BrokenLoop(Loop):
     def matrices(self) -> tuple[Real, Real, Real, Real]:
         """From its reference to its position and its command."""
         a, b, c, _ = self.plant
-        own, direct = self.command.c, self.command.d
-        return a - np.outer(b, c), b, np.vstack([c, own - direct * c]), np.array([0.0, direct])
+        command_row, direct = self.command.c, self.command.d
+        return a - np.outer(b, c), b, np.vstack([c, command_row - direct * c]), np.array([0.0, direct])
 
 
 class TogetherMargins(NamedTuple):
@@ -121,38 +121,38 @@ class CoupledLoop:
         self.period_s = controller.period_s
         self._held, self._coupling = plant.held(controller.period_s), plant.coupling
         self._controller = controller.system
-        self._plant = beside_each_other([one.system for one in self._held]).mixed(plant.coupling)
+        self._plant = beside_each_other([plant_of_axis.system for plant_of_axis in self._held]).mixed(plant.coupling)
         self.count = controller.count
 
     def alone(self, number: int, reference: ReferencePath = AS_IT_IS) -> BrokenLoop:
         """The loop of one axis, broken at its sensor, the others closed."""
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
-        closed = np.eye(self.count)
-        closed[number, number] = 0.0
-        a = np.block([[ap - bp @ dc @ closed @ cp, bp @ cc], [-bc @ closed @ cp, ac]])
+        closed_axes = np.eye(self.count)
+        closed_axes[number, number] = 0.0
+        a = np.block([[ap - bp @ dc @ closed_axes @ cp, bp @ cc], [-bc @ closed_axes @ cp, ac]])
         b = np.concatenate([bp @ dc[:, number], bc[:, number]])
         c = np.concatenate([cp[number], np.zeros(ac.shape[0])])
-        own = System(a, b, c, 0.0)
-        command = System(a, b, np.concatenate([-dc[number] @ closed @ cp, cc[number]]), float(dc[number, number]))
+        plant = System(a, b, c, 0.0)
+        command = System(a, b, np.concatenate([-dc[number] @ closed_axes @ cp, cc[number]]), float(dc[number, number]))
         poles = np.linalg.eigvals(a).astype(np.complex128)
         rates = np.asarray(np.log(poles[np.abs(poles) > 1e-9]) / self.period_s, np.complex128)
-        at_rest = float(own.response(1.0 + BESIDE_ONE)[0].real)
-        static = at_rest if abs(at_rest) < INTEGRATES else np.copysign(np.inf, at_rest)
-        added = Injection(np.concatenate([bp[:, number], np.zeros(ac.shape[0])]), self._held[number].between.direct)
-        between = self._between(number, closed)
-        return BrokenLoop(NOTHING, own, float(static), rates, self.period_s, between, reference, command, added)
+        static_response = float(plant.response(1.0 + BESIDE_ONE)[0].real)
+        static = static_response if abs(static_response) < INTEGRATES else np.copysign(np.inf, static_response)
+        injection = Injection(np.concatenate([bp[:, number], np.zeros(ac.shape[0])]), self._held[number].between.direct)
+        between = self._between(number, closed_axes)
+        return BrokenLoop(NOTHING, plant, float(static), rates, self.period_s, between, reference, command, injection)
 
     def _between(self, number: int, closed: Real) -> Between:
         """Positions of one axis within a period, of all states and of its error; `closed` are the other axes."""
         _, _, cc, dc = self._controller
         rows, direct = self._held[number].between
-        before = sum(one.system.b.size for one in self._held[:number])
-        behind = self._plant.a.shape[0] - before - rows.shape[1]
-        of_commands = np.outer(direct, self._coupling[number])
-        plants = np.pad(rows, ((0, 0), (before, behind))) - of_commands @ dc @ closed @ self._plant.c
-        whole = np.hstack([plants, of_commands @ cc])
-        return Between(np.asarray(whole, np.float64), np.asarray(of_commands @ dc[:, number], np.float64))
+        states_before = sum(axis_plant.system.b.size for axis_plant in self._held[:number])
+        states_after = self._plant.a.shape[0] - states_before - rows.shape[1]
+        command_columns = np.outer(direct, self._coupling[number])
+        plants = np.pad(rows, ((0, 0), (states_before, states_after))) - command_columns @ dc @ closed @ self._plant.c
+        state_rows = np.hstack([plants, command_columns @ cc])
+        return Between(np.asarray(state_rows, np.float64), np.asarray(command_columns @ dc[:, number], np.float64))
 
     @cached_property
     def poles(self) -> Complex:
@@ -174,8 +174,8 @@ class CoupledLoop:
 
     def _inverse(self, hz: npt.ArrayLike, first: SystemTogether, second: SystemTogether) -> Complex:
         points = np.exp(2 * np.pi * (1e-12 + 1j) * np.atleast_1d(np.asarray(hz, float)) * self.period_s)
-        opened = first.response(points) @ second.response(points)
-        return np.asarray(np.linalg.inv(np.eye(self.count) + opened), np.complex128)
+        open_loop = first.response(points) @ second.response(points)
+        return np.asarray(np.linalg.inv(np.eye(self.count) + open_loop), np.complex128)
 
     @cached_property
     def margins(self) -> TogetherMargins:
@@ -183,11 +183,11 @@ class CoupledLoop:
         if not self.is_stable:
             return TogetherMargins(*[np.nan] * len(TogetherMargins._fields))
         hz = np.unique(np.concatenate([self.alone(i).frequencies for i in range(self.count)]))
-        one = np.eye(self.count)
+        identity = np.eye(self.count)
         peak, peak_hz = highest(lambda f: _largest(self.sensitivity(f)), hz)
-        tracking, _ = highest(lambda f: _largest(one - self.sensitivity(f)), hz)
-        disk, disk_hz = highest(lambda f: _structured(self.sensitivity(f) - one / 2), hz)
-        command, command_hz = highest(lambda f: _structured(self.command_sensitivity(f) - one / 2), hz)
+        tracking, _ = highest(lambda f: _largest(identity - self.sensitivity(f)), hz)
+        disk, disk_hz = highest(lambda f: _structured(self.sensitivity(f) - identity / 2), hz)
+        command, command_hz = highest(lambda f: _structured(self.command_sensitivity(f) - identity / 2), hz)
         return TogetherMargins(peak, peak_hz, tracking, 1 / disk, disk_hz, 1 / command, command_hz)
 
 
@@ -202,14 +202,14 @@ def _structured(matrices: Complex) -> Real:
     The scaling makes the norms of each row and column beside the diagonal equal (Osborne, 1960): the Frobenius norm
     is then least, and with it, for two axes, the largest singular value, as their product does not depend on it.
     """
-    found = matrices.copy()
-    axes = np.arange(found.shape[1])
+    balanced = matrices.copy()
+    axes = np.arange(balanced.shape[1])
     for _ in range(BALANCINGS if axes.size > 2 else 1):
         for i in axes:
-            others = axes != i
-            row = np.linalg.norm(found[:, i, others], axis=1)
-            column = np.linalg.norm(found[:, others, i], axis=1)
+            is_other_axis = axes != i
+            row = np.linalg.norm(balanced[:, i, is_other_axis], axis=1)
+            column = np.linalg.norm(balanced[:, is_other_axis, i], axis=1)
             scale = np.sqrt(np.where((row > 0) & (column > 0), column / np.where(row > 0, row, 1.0), 1.0))
-            found[:, i, :] *= scale[:, None]
-            found[:, :, i] /= scale[:, None]
-    return _largest(found)
+            balanced[:, i, :] *= scale[:, None]
+            balanced[:, :, i] /= scale[:, None]
+    return _largest(balanced)

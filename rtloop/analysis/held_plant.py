@@ -38,16 +38,16 @@ def held_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPl
     if delay_ticks < 0:
         raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
     fine = held(plant, period_s / POINTS)
-    row, state, moved = fine.c, np.eye(fine.b.size), np.zeros_like(fine.b)
+    row, state, input_state = fine.c, np.eye(fine.b.size), np.zeros_like(fine.b)
     rows, direct = [], []
     for _ in range(POINTS):
         rows.append(row @ state)
-        direct.append(float(row @ moved))
-        state, moved = fine.a @ state, fine.a @ moved + fine.b
-    found, between = System(state, moved, row, fine.d), Between(np.array(rows), np.array(direct))
+        direct.append(float(row @ input_state))
+        state, input_state = fine.a @ state, fine.a @ input_state + fine.b
+    system, between = System(state, input_state, row, fine.d), Between(np.array(rows), np.array(direct))
     for _ in range(delay_ticks):
-        n = found.b.size
-        a = np.block([[found.a, found.b[:, None]], [np.zeros((1, n + 1))]])
+        n = system.b.size
+        a = np.block([[system.a, system.b[:, None]], [np.zeros((1, n + 1))]])
         between = Between(np.hstack([between.rows, between.direct[:, None]]), np.zeros(POINTS))
-        found = System(a, np.eye(n + 1)[-1], np.append(found.c, 0.0), 0.0)
-    return HeldPlant(found, between)
+        system = System(a, np.eye(n + 1)[-1], np.append(system.c, 0.0), 0.0)
+    return HeldPlant(system, between)

@@ -78,16 +78,16 @@ def learning(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Learning:
         raise ValueError(f"{unstable[0]}: the loop is unstable there, and no table can be learned in it")
     paths = np.array([np.column_stack(_paths(loop, hz)) for _, loop in loops])
     gains = _inverse(paths)
-    left = np.abs(1 - np.einsum("shc,hc->sh", paths, gains))
-    found = Learning(period_ticks, gains, left.max(axis=0))
-    if not found.learned[:2].all():
-        at = int(np.argmax(~found.learned[:2]))
-        worst = loops[int(np.argmax(left[:, at]))][0]
+    contractions = np.abs(1 - np.einsum("shc,hc->sh", paths, gains))
+    result = Learning(period_ticks, gains, contractions.max(axis=0))
+    if not result.learned[:2].all():
+        harmonic = int(np.argmax(~result.learned[:2]))
+        worst_loop = loops[int(np.argmax(contractions[:, harmonic]))][0]
         raise ValueError(
-            f"{worst}: a cycle leaves {found.contraction[at]:.2f} of the error at {hz[at]:g} Hz; "
+            f"{worst_loop}: a cycle leaves {result.contraction[harmonic]:.2f} of the error at {hz[harmonic]:g} Hz; "
             f"less than {LARGEST_CONTRACTION} is needed for it to shrink from one cycle to the next"
         )
-    return found
+    return result
 
 
 def _paths(loop: Loop, hz: Real) -> tuple[Complex, Complex]:

@@ -56,11 +56,11 @@ def margins(loop: OpenLoop) -> Margins:
     """The lowest crossover, the smallest phase margin of all, the smallest factor > 1 that reaches −1, max |S|."""
     hz = loop.frequencies
     response = loop.open(hz)
-    crossed = crossings(loop)
-    phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossed]
+    crossover_frequencies = crossings(loop)
+    phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossover_frequencies]
     gain, gain_hz = _gain_margin(loop, hz, response)
     peak, peak_hz = highest(loop.sensitivity, hz)
-    crossover = crossed[0] if crossed else math.nan
+    crossover = crossover_frequencies[0] if crossover_frequencies else math.nan
     return Margins(crossover, min(phases, default=math.inf), gain, gain_hz, peak, peak_hz)
 
 
@@ -73,8 +73,10 @@ def crossings(loop: OpenLoop) -> list[float]:
 
 def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, float]:
     """Where L is real, negative and above −1: inside the grid and at its ends, where symmetry makes L(z = ±1) real."""
-    found = [zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))]
-    values = [(complex(loop.open(f)[0]), f) for f in found]
+    real_axis_frequencies = [
+        zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))
+    ]
+    values = [(complex(loop.open(f)[0]), f) for f in real_axis_frequencies]
     values.append((complex(loop.static_gain), 0.0))
     if loop.period_s is not None:
         values.append((complex(loop.open(hz[-1])[0].real), float(hz[-1])))
@@ -84,29 +86,29 @@ def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, fl
 
 def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
     """Neighbours on the grid between which `values` changes its sign."""
-    at = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
-    return [(float(hz[i]), float(hz[i + 1])) for i in at]
+    indices = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    return [(float(hz[i]), float(hz[i + 1])) for i in indices]
 
 
 def highest(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
     """Maximum of `function` and where: every peak of the grid that comes near the highest is refined by itself."""
     values = function(hz)
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
-    near = [i for i in inner if values[i] > 0.9 * values.max()]
-    best = (float(values.max()), float(hz[np.argmax(values)]))
-    return max([best, *(_refined(function, float(hz[i - 1]), float(hz[i + 1])) for i in near)])
+    candidates = [i for i in inner if values[i] > 0.9 * values.max()]
+    grid_maximum = (float(values.max()), float(hz[np.argmax(values)]))
+    return max([grid_maximum, *(_refined(function, float(hz[i - 1]), float(hz[i + 1])) for i in candidates)])
 
 
 def _refined(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
     """The peak between two points, by narrowing the grid around its highest point six times."""
-    best = (-math.inf, low)
+    maximum = (-math.inf, low)
     for _ in range(6):
         hz = np.linspace(low, high, 21)
         values = function(hz)
         i = int(np.argmax(values))
-        best = max(best, (float(values[i]), float(hz[i])))
+        maximum = max(maximum, (float(values[i]), float(hz[i])))
         low, high = float(hz[max(i - 1, 0)]), float(hz[min(i + 1, 20)])
-    return best
+    return maximum
 
 
 def delay_tolerated(loop: OpenLoop) -> tuple[float, float]:
@@ -114,5 +116,5 @@ def delay_tolerated(loop: OpenLoop) -> tuple[float, float]:
 
     L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ. inf, NaN: none does.
     """
-    found = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in crossings(loop)]
-    return min(((left % 360 / (360 * f), f) for left, f in found), default=(math.inf, math.nan))
+    phases = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in crossings(loop)]
+    return min(((phase_deg % 360 / (360 * f), f) for phase_deg, f in phases), default=(math.inf, math.nan))

@@ -47,7 +47,7 @@ def maker(controller: Transfer | DiscreteController | Sampled, delay_ticks: int 
 
 def until_unstable(make: Maker, plant: Transfer, change: Change) -> Range:
     """The range over which `make(plant)` stays stable; (0, 0) if it is not as it stands."""
-    return until_bad(lambda moved: make(moved).is_stable, plant, change)
+    return until_bad(lambda changed_plant: make(changed_plant).is_stable, plant, change)
 
 
 def until_bad(
@@ -58,11 +58,11 @@ def until_bad(
         return Range(0.0, 0.0)
     ends = []
     for sign, largest in ((-1, change.down), (1, change.up)):
-        found = reach(
+        limit = reach(
             lambda percent, sign=sign: good(change.apply(plant, sign * percent)),
             largest, coarse * change.step, tolerance,
         )  # fmt: skip
-        ends.append(None if found >= largest else found)
+        ends.append(None if limit >= largest else limit)
     return Range(*ends)
 
 
@@ -75,23 +75,25 @@ def with_damping_changed(plant: Transfer, percent: float) -> Transfer:
     """The plant with the damping ratio of its most lightly damped pair of poles changed; |pole| and D(0) are kept."""
     pair = lightest_pair(plant)
     size, damping = abs(pair), -pair.real / abs(pair) * (1 + percent / 100)
-    moved = size * complex(-damping, math.sqrt(1 - damping**2))
-    poles = np.where(plant.poles == pair, moved, np.where(plant.poles == np.conj(pair), np.conj(moved), plant.poles))
+    new_pole = size * complex(-damping, math.sqrt(1 - damping**2))
+    poles = np.where(
+        plant.poles == pair, new_pole, np.where(plant.poles == np.conj(pair), np.conj(new_pole), plant.poles)
+    )
     return Transfer(plant.zeros, poles, plant.gain)
 
 
 def changes(plant: Transfer) -> dict[str, Change]:
     """What may move: the resonance, if there is one, its damping, the gain."""
-    found = {"gain": Change(with_gain_changed, 99.9, 900.0, 10.0)}
+    changes_by_name = {"gain": Change(with_gain_changed, 99.9, 900.0, 10.0)}
     if np.any(plant.poles.imag > 0):
         pair = lightest_pair(plant)
-        most = 100 * (0.999 * abs(pair) / -pair.real - 1) if pair.real < 0 else 0.0
-        found = {
+        max_percent = 100 * (0.999 * abs(pair) / -pair.real - 1) if pair.real < 0 else 0.0
+        changes_by_name = {
             "resonance": Change(with_resonance_shifted, 50.0, 50.0, 0.25),
-            "damping": Change(with_damping_changed, 99.9, min(900.0, most), 10.0),
-            **found,
+            "damping": Change(with_damping_changed, 99.9, min(900.0, max_percent), 10.0),
+            **changes_by_name,
         }
-    return found
+    return changes_by_name
 
 
 def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
@@ -99,20 +101,20 @@ def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
 
     Raises ValueError for a plant without complex poles.
     """
-    lightest = lightest_pair(plant)
-    moved = (plant.poles == lightest) | (plant.poles == np.conj(lightest))
+    pole = lightest_pair(plant)
+    is_resonant = (plant.poles == pole) | (plant.poles == np.conj(pole))
     factor = 1 + percent / 100
-    gain = plant.gain * factor ** int(moved.sum())
-    return Transfer(plant.zeros, np.where(moved, factor * plant.poles, plant.poles), gain)
+    gain = plant.gain * factor ** int(is_resonant.sum())
+    return Transfer(plant.zeros, np.where(is_resonant, factor * plant.poles, plant.poles), gain)
 
 
 def around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
     """The plant, and with its resonance shifted to `count` places within ±`percent`; itself alone where it has none."""
-    found = [("the model", plant)]
+    plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):
         shifts = [float(shift) for shift in np.linspace(-percent, percent, count) if shift]
-        found += [(f"resonance {shift:+g} %", with_resonance_shifted(plant, shift)) for shift in shifts]
-    return found
+        plants += [(f"resonance {shift:+g} %", with_resonance_shifted(plant, shift)) for shift in shifts]
+    return plants
 
 
 def lightest_pair(plant: Transfer) -> complex:

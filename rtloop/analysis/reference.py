@@ -39,12 +39,12 @@ class ReferencePath:
 
     def toward_error(self, values: npt.ArrayLike) -> Real:
         """Values (…, ticks) behind taps and sections, from rest."""
-        found = _convolved(self.taps, values)
+        filtered = _convolved(self.taps, values)
         if len(self.sections):
             from scipy.signal import sosfilt  # a second of import, for the few who have sections
 
-            found = sosfilt(np.insert(self.sections, 3, 1.0, axis=1), found)
-        return np.asarray(found, np.float64)
+            filtered = sosfilt(np.insert(self.sections, 3, 1.0, axis=1), filtered)
+        return np.asarray(filtered, np.float64)
 
     def toward_command(self, values: npt.ArrayLike) -> Real:
         """Values (…, ticks) behind the command's taps, from rest."""
@@ -53,10 +53,10 @@ class ReferencePath:
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
         """F_x and F_v at points (k,) of the z plane."""
         back = 1 / np.atleast_1d(np.asarray(points, complex))
-        found = np.polyval(self.taps[::-1], back)
+        error_response = np.polyval(self.taps[::-1], back)
         for b0, b1, b2, a1, a2 in self.sections:
-            found = found * (b0 + b1 * back + b2 * back**2) / (1 + a1 * back + a2 * back**2)
-        return np.asarray(found, complex), np.polyval(self.command_taps[::-1], back) + 0j * back
+            error_response = error_response * (b0 + b1 * back + b2 * back**2) / (1 + a1 * back + a2 * back**2)
+        return np.asarray(error_response, complex), np.polyval(self.command_taps[::-1], back) + 0j * back
 
 
 AS_IT_IS = ReferencePath()
@@ -65,4 +65,4 @@ AS_IT_IS = ReferencePath()
 def _convolved(taps: Real, values: npt.ArrayLike) -> Real:
     """Values (…, ticks) behind taps, from rest."""
     signals = np.asarray(values, np.float64)
-    return np.apply_along_axis(lambda one: np.convolve(taps, one)[: one.size], -1, signals)
+    return np.apply_along_axis(lambda signal: np.convolve(taps, signal)[: signal.size], -1, signals)

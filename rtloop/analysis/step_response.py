@@ -52,8 +52,8 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
         return _sampled(loop, loop.period_s, duration_s)
     duration_s = duration_s or _duration(loop)
     fine, coarse = _continuous(loop, duration_s / COUNT / 64), _continuous(loop, duration_s / COUNT)
-    later = coarse.time_s > fine.time_s[-1]
-    return StepResponse(*(np.concatenate([early, late[later]]) for early, late in zip(fine, coarse, strict=True)))
+    is_later = coarse.time_s > fine.time_s[-1]
+    return StepResponse(*(np.concatenate([early, late[is_later]]) for early, late in zip(fine, coarse, strict=True)))
 
 
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
@@ -85,14 +85,14 @@ def position_at(loop: Loop, time_s: float) -> float:
 
 def _settling(response: StepResponse, final: float) -> float:
     """Where the response enters the band of ±5 % for the last time, between samples by a straight line."""
-    outside = np.abs(response.position - final) - SETTLING_BAND * abs(final)
-    last = np.flatnonzero(outside > 0)
+    excess = np.abs(response.position - final) - SETTLING_BAND * abs(final)
+    last = np.flatnonzero(excess > 0)
     if not last.size:
         return 0.0
     i = int(last[-1])
-    if i + 1 == outside.size:
+    if i + 1 == excess.size:
         return math.nan
-    part = outside[i] / (outside[i] - outside[i + 1])
+    part = excess[i] / (excess[i] - excess[i + 1])
     return float(response.time_s[i] + part * (response.time_s[i + 1] - response.time_s[i]))
 
 
@@ -109,15 +109,15 @@ def _continuous(loop: Loop, interval_s: float) -> StepResponse:
 def _sampled(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
     """From rest: what a step toward the error and one toward the command do, each behind what the reference passes."""
     a, b, c, d = loop.matrices
-    reference, (rows, direct), added = loop.reference, loop.positions, loop.injection
+    reference, (rows, direct), injection = loop.reference, loop.positions, loop.injection
     duration_s = duration_s or _duration(loop) + reference.ticks * period_s
     count = min(math.ceil(duration_s / period_s) + 1, COUNT)
     states = _stepped(a, b, count)
     position = reference.toward_error(rows @ states + direct[:, None])
     command = reference.toward_error(c[1] @ states + d[1])
     if reference.commands:
-        states = _stepped(a, added.b, count)
-        position += reference.toward_command(rows @ states + added.between[:, None])
+        states = _stepped(a, injection.b, count)
+        position += reference.toward_command(rows @ states + injection.between[:, None])
         command += reference.toward_command(c[1] @ states + 1.0)
     points = rows.shape[0]
     time_s = period_s / points * np.arange(count * points, dtype=float)

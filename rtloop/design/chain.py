@@ -82,12 +82,12 @@ def identified(hysteresis: Measured, step: Measured, order: int | None = None) -
     """The stage of two recordings. Raises UnsuitableData where one cannot serve."""
     if not step.even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
-    shape = identify_hysteresis([hysteresis])
-    excitation = Excitation(step.name, model_output(shape.model, step.drive_v), step.position_um, step.period_s)
+    fit = identify_hysteresis([hysteresis])
+    excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
     noise_um = min(noise_of(step.position_um), noise_of(hysteresis.position_um))
     _require_explained(step, dynamics, max(noise_um, SMALL_PART * float(np.ptp(excitation.input))))
-    return Stage(hysteresis, step, shape, dynamics, with_gain(shape.model, dynamics.static_gain))
+    return Stage(hysteresis, step, fit, dynamics, with_gain(fit.model, dynamics.static_gain))
 
 
 def designed(stage: Stage, design: DesignOptions) -> Chain:
@@ -95,8 +95,8 @@ def designed(stage: Stage, design: DesignOptions) -> Chain:
 
     Raises NoController and ValueError as the synthesis does.
     """
-    asked = stage.asked(design)
-    return Chain(stage, asked, synthesise_design(asked))
+    completed = stage.asked(design)
+    return Chain(stage, completed, synthesise_design(completed))
 
 
 def _require_explained(step: Measured, dynamics: DynamicsFit, noise_um: float) -> None:
@@ -116,32 +116,32 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
     `spec_name` is the specification's file relative to the configuration's. Raises UnsuitableData for weights without
     an inverse.
     """
-    written = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
-    comments = [line.removeprefix("# ") for line in written.splitlines() if line.startswith("#")]
-    return text_with(chain.stage, {"controller": _section(written, "controller")}, comments, axis, spec_name)
+    controller_text = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
+    comments = [line.removeprefix("# ") for line in controller_text.splitlines() if line.startswith("#")]
+    return text_with(chain.stage, {"controller": _section(controller_text, "controller")}, comments, axis, spec_name)
 
 
 def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str) -> str:
     """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), stepping."""
-    raw = tomllib.loads(stage.fast.configuration)
-    raw["loop"] = {key: value for key, value in raw["loop"].items() if key != "mode"}
-    raw.pop("schedule", None)
-    found = {
+    configuration = tomllib.loads(stage.fast.configuration)
+    configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
+    configuration.pop("schedule", None)
+    sections = {
         "feedforward": _section(feedforward_section(stage.actuator, ()), "feedforward"),
         "model": model_values(stage.dynamics),
         "specification": spec_name,
         **parts,
     }
-    chosen = next(one for one in raw["axis"] if axis in (None, one["name"]))
-    found["reference"] = _steps(LimitsOptions.model_validate(chosen.get("limits", {})).command_um, stage)
-    found["interlocks"] = _with_oscillation(chosen.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
-    raw["axis"] = [{**one, **found} if one is chosen else one for one in raw["axis"]]
+    axis_table = next(table for table in configuration["axis"] if axis in (None, table["name"]))
+    sections["reference"] = _steps(LimitsOptions.model_validate(axis_table.get("limits", {})).command_um, stage)
+    sections["interlocks"] = _with_oscillation(axis_table.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
+    configuration["axis"] = [{**table, **sections} if table is axis_table else table for table in configuration["axis"]]
     heading = [
         *hysteresis_provenance(stage.hysteresis, [stage.slow]),
         *dynamics_provenance(stage.dynamics, stage.fast, "hysteresis"),
         *comments,
     ]
-    return edited(stage.fast.configuration, raw, heading)
+    return edited(stage.fast.configuration, configuration, heading)
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:

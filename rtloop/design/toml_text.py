@@ -21,10 +21,10 @@ def section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) 
     document = tomlkit.document()
     for comment in comments:
         document.add(tomlkit.comment(comment))
-    found: Mapping[str, Any] = values
+    nested: Mapping[str, Any] = values
     for part in reversed(name.split(".") if name else []):
-        found = {part: found}
-    for key, value in _plain_first(found):
+        nested = {part: nested}
+    for key, value in _plain_first(nested):
         document.add(key, item(value))
     return document.as_string()
 
@@ -38,9 +38,9 @@ def edited(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -
     try:
         document = tomlkit.parse(text)
         _update(document, values)
-        found = f"{heading}\n{document.as_string()}"
-        if tomllib.loads(found) == values:
-            return found
+        edited_text = f"{heading}\n{document.as_string()}"
+        if tomllib.loads(edited_text) == values:
+            return edited_text
     except (TOMLKitError, tomllib.TOMLDecodeError):
         pass
     return section("", values, comments)
@@ -50,18 +50,18 @@ def _update(table: Any, values: Mapping[str, Any]) -> None:
     for key in [key for key in table if key not in values]:
         table.remove(key)
     for key, value in _plain_first(values):
-        old = table.get(key)
-        if key in table and old == value:
+        present = table.get(key)
+        if key in table and present == value:
             continue
-        if isinstance(old, MutableMapping) and isinstance(value, Mapping):
-            _update(old, value)
-        elif isinstance(old, AoT) and _is_tables(value) and len(old) == len(value):
-            for one, wanted in zip(old, value, strict=True):
-                _update(one, wanted)
+        if isinstance(present, MutableMapping) and isinstance(value, Mapping):
+            _update(present, value)
+        elif isinstance(present, AoT) and _is_tables(value) and len(present) == len(value):
+            for old_table, new_values in zip(present, value, strict=True):
+                _update(old_table, new_values)
         else:
-            table[key] = made = item(value)
-            if isinstance(made, Table):
-                made.add(tomlkit.nl())
+            table[key] = added = item(value)
+            if isinstance(added, Table):
+                added.add(tomlkit.nl())
 
 
 def item(value: Any) -> Item:
@@ -70,8 +70,8 @@ def item(value: Any) -> Item:
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
     if _is_tables(value):
         tables = tomlkit.aot()
-        for one in value:
-            tables.append(_table(one))
+        for table in value:
+            tables.append(_table(table))
         return tables
     if isinstance(value, list | tuple | np.ndarray):
         return _array(value)
@@ -96,8 +96,8 @@ def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
     if len(items) > WIDTH:  # appended one by one they take a time that grows with its square
         array.add_line(*items, indent="", newline=False)
         return array.multiline(True)
-    for one in items:
-        array.append(one)
+    for element in items:
+        array.append(element)
     return array.multiline(len(array.as_string()) > WIDTH)
 
 
@@ -125,4 +125,4 @@ def _is_table(value: Any) -> bool:
 
 
 def _is_tables(value: Any) -> bool:
-    return isinstance(value, list | tuple) and bool(value) and all(isinstance(one, Mapping) for one in value)
+    return isinstance(value, list | tuple) and bool(value) and all(isinstance(entry, Mapping) for entry in value)

@@ -97,10 +97,10 @@ class Assembly:
         loop.hold_index, loop.hold_min_v = -1 if plan.hold is None else names.index(plan.hold[0]), np.inf
         if plan.hold is not None:
             loop.hold_min_v = plan.hold[1]
-        read = [index_of(facts.inputs, plan.extra_channels[name]) for name in names]
-        written = [index_of(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs]
-        self._point("extra_input_index", np.array(read, np.int64))
-        self._point("extra_output_index", np.array(written, np.int64))
+        read_indices = [index_of(facts.inputs, plan.extra_channels[name]) for name in names]
+        written_indices = [index_of(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs]
+        self._point("extra_input_index", np.array(read_indices, np.int64))
+        self._point("extra_output_index", np.array(written_indices, np.int64))
         self._point("adc_v", np.zeros(len(axes)))
         self._point("references", np.zeros(len(axes)))
         self._point("feeds_um", np.zeros(len(axes)))
@@ -131,8 +131,10 @@ class Assembly:
         loop = self.loop
         loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
         loop.now, loop.clock_context = clock.now, clock.context
-        own = bool(pointers.wait)
-        loop.wait, loop.wait_context = (pointers.wait, pointers.context) if own else (clock.wait, clock.context)
+        driver_waits = bool(pointers.wait)
+        loop.wait, loop.wait_context = (
+            (pointers.wait, pointers.context) if driver_waits else (clock.wait, clock.context)
+        )
 
 
 def rehearse() -> None:
@@ -143,9 +145,9 @@ def rehearse() -> None:
     coefficients = np.zeros(1, layout_of(laws).coefficients)
     coefficients["controller_axes"], coefficients["controller_law"] = 1, REHEARSED_LAWS.index("transfer")
     coefficients["trip_slew_v_per_tick"] = Channel("dac0").maximum_v
-    nothing = np.zeros(0, MESSAGE)
+    empty_schedule = np.zeros(0, MESSAGE)
     plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, laws, coefficients, Mode.OFF,
-                np.zeros(1, GENERATOR), np.zeros(0), nothing, ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
+                np.zeros(1, GENERATOR), np.zeros(0), empty_schedule, ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
     driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
     ring = block.ring("ticks")
     clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)

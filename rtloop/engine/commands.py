@@ -187,10 +187,10 @@ def _load_law(loop, first, another):
     staged = loop.staged + first * size
     count = max(np.int64(carray(address_pointer(staged), 1, COEFFICIENTS)[0].controller_axes), 1)
     for i in range(count):
-        other = carray(address_pointer(staged + i * size), 1, COEFFICIENTS)[0]
+        staged_coefficients = carray(address_pointer(staged + i * size), 1, COEFFICIENTS)[0]
         if not fits(law, first + i, staged + i * size):
             return False
-        if other.controller_axes != coefficients_of(law, first + i).controller_axes:
+        if staged_coefficients.controller_axes != coefficients_of(law, first + i).controller_axes:
             return False
     for i in range(count):
         _take_axis(law, first + i, staged + i * size)
@@ -204,15 +204,15 @@ def _load_law(loop, first, another):
 def _take_axis(law, a, staged):
     """Coefficients of one axis, from an address."""
     before, after = coefficients_of(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
-    refilled = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
-    if not refilled:
+    needs_refill = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
+    if not needs_refill:
         for i in range(after.section_count):
             for j in range(after.sections.shape[1]):
-                refilled = refilled or before.sections[i, j] != after.sections[i, j]
+                needs_refill = needs_refill or before.sections[i, j] != after.sections[i, j]
     size, state = law.coefficients_bytes, state_of(law, a)
     last_um = filtered(before, state)
     copy(law.coefficients + a * size, staged, size)
-    if refilled:
+    if needs_refill:
         fill_prefilter_anew(state)
     elif state.tap_index >= 0:
         set_prefilter(law, a, last_um)

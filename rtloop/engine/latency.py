@@ -61,11 +61,11 @@ def results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt
 
 def main() -> int:
     """Measure and write."""
-    asked = json.load(sys.stdin)
-    pacing = Pacing(**asked["pacing"])
+    request = json.load(sys.stdin)
+    pacing = Pacing(**request["pacing"])
     freeze_garbage_collection()
     granted = prepare_realtime(pacing)
-    lateness_us, missed = measure(pacing, asked["ticks"])
+    lateness_us, missed = measure(pacing, request["ticks"])
     sys.stdout.buffer.write(json.dumps(granted).encode() + b"\n" + lateness_us.tobytes() + missed.tobytes())
     return 0
 

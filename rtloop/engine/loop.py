@@ -159,13 +159,13 @@ def _tick(loop):
     _evaluate(loop, status, now_ns, lateness_us)
     law_ns = _now(loop)
 
-    written = call(loop.write, loop.driver_context, loop.outputs)
+    write_status = call(loop.write, loop.driver_context, loop.outputs)
     write_ns = _now(loop)
 
-    _note(loop, written)
+    _note(loop, write_status)
     state = loop_of(law_of(loop))
     update(law_of(loop))
-    _report(loop, status, written, missed)
+    _report(loop, status, write_status, missed)
     if loop.tick >= loop.record_limit:
         return
     ring, position = tick_ring(loop), np.uint64(loop.tick)
@@ -182,7 +182,7 @@ def _tick(loop):
     row[DRIVER_STATUS] = float(status)
     row[EXEC] = (_now(loop) - wake_ns) * US_PER_NS
     overrun = lateness_us + row[EXEC] > loop.period_us
-    row[FLAGS] = float(state.tick_flags | (OVERRUN if overrun else 0) | (WRITE_FAILED_FLAG if written < 0 else 0))
+    row[FLAGS] = float(state.tick_flags | (OVERRUN if overrun else 0) | (WRITE_FAILED_FLAG if write_status < 0 else 0))
     publish(ring, position)
 
 
@@ -320,9 +320,9 @@ def _report(loop, status, written, missed):
         publish_trip(loop, new_trip)
     if loop.failed == 0 and (status < 0 or written < 0):
         loop.failed = WRITE_FAILED if written < 0 else READ_FAILED
-        failing, verb = (written, 1.0) if written < 0 else (status, 0.0)
+        failing, operation = (written, 1.0) if written < 0 else (status, 0.0)
         loop.failed_tick, loop.failed_status = loop.tick, failing
-        publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), verb))
+        publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), operation))
     if missed > 0.0:
         _note_lateness(loop, missed)
 

@@ -150,10 +150,10 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcom
 
 def _fault(driver: Driver, loop: Any) -> str:
     """Which driver failed at what, when, and why as far as it says so."""
-    verb = "write" if loop.failed == WRITE_FAILED else "read"
+    operation = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
     reason = f"its status was {loop.failed_status}" if error is None else one_line(error)
-    return f"driver {driver.kind!r}: {verb} failed at tick {loop.failed_tick}: {reason}"
+    return f"driver {driver.kind!r}: {operation} failed at tick {loop.failed_tick}: {reason}"
 
 
 if __name__ == "__main__":

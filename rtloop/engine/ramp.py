@@ -46,10 +46,10 @@ def require_short_ramp(where: str, slew_v_per_s: float, output: Channel) -> None
     """
     farthest_v = max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v)
     if slew_v_per_s * LONGEST_RAMP_S < farthest_v:
-        took_s, least = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
+        ramp_s, minimum_v_per_s = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
         raise ValueError(
-            f"{where}: {slew_v_per_s:g} takes {took_s:.3g} s from {farthest_v:g} V to "
-            f"safe; {LONGEST_RAMP_S:g} s, so at least {least:g} V/s, are allowed"
+            f"{where}: {slew_v_per_s:g} takes {ramp_s:.3g} s from {farthest_v:g} V to "
+            f"safe; {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s, are allowed"
         )
 
 
@@ -74,9 +74,9 @@ def found_v(driver: Driver, noted_v: Sequence[float] | Volts | None) -> Volts:
     """
     safe_v = safe_outputs_v(driver)
     lowest_v, highest_v = np.array([(channel.minimum_v, channel.maximum_v) for channel in driver.facts.outputs]).T
-    told = driver.outputs_v()
-    if told is not None:
-        outputs_v = np.clip(np.array(told, float), lowest_v, highest_v)
+    reported_v = driver.outputs_v()
+    if reported_v is not None:
+        outputs_v = np.clip(np.array(reported_v, float), lowest_v, highest_v)
         return np.where(np.isnan(outputs_v), safe_v, outputs_v)
     outputs_v = safe_v.copy()
     if noted_v is not None:
@@ -86,10 +86,10 @@ def found_v(driver: Driver, noted_v: Sequence[float] | Volts | None) -> Volts:
 
 def ramp(from_v: Volts, safe_v: Volts, step_v: float) -> Iterator[Volts]:
     """Rows from `from_v` (exclusive) to `safe_v` (inclusive), no value moving by more than `step_v` a row."""
-    now_v = from_v
-    while not np.array_equal(now_v, safe_v):
-        now_v = np.clip(safe_v, now_v - step_v, now_v + step_v)
-        yield now_v
+    current_v = from_v
+    while not np.array_equal(current_v, safe_v):
+        current_v = np.clip(safe_v, current_v - step_v, current_v + step_v)
+        yield current_v
 
 
 def ramp_to_safe(
@@ -111,8 +111,8 @@ def ramp_to_safe(
     write = _WRITE(pointers.write)
     for row in ramp(from_v, safe_outputs_v(driver), slew_v_per_s * period_s):
         values = np.ascontiguousarray(row)
-        given_up_s = time.monotonic() + GIVE_UP_S
-        while (status := write(pointers.context, values.ctypes.data)) < 0 and time.monotonic() < given_up_s:
+        deadline_s = time.monotonic() + GIVE_UP_S
+        while (status := write(pointers.context, values.ctypes.data)) < 0 and time.monotonic() < deadline_s:
             _wait(time.monotonic() + period_s)
         if status < 0:
             raise DriverError(f"{driver.kind}: write failed while parking at {row.tolist()} V")
@@ -121,6 +121,6 @@ def ramp_to_safe(
 
 
 def _wait(until_s: float) -> None:
-    while (left_s := until_s - time.monotonic()) > 0:
-        if left_s > SPIN_S:
-            time.sleep(left_s - SPIN_S)
+    while (remaining_s := until_s - time.monotonic()) > 0:
+        if remaining_s > SPIN_S:
+            time.sleep(remaining_s - SPIN_S)

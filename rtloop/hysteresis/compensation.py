@@ -106,9 +106,9 @@ def compensated(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayL
 
 def _commands_for(inverse: PlayModel, drives: Real) -> Real:
     """The v ≥ 0 at which the increasing curve of `inverse` reaches each of `drives`."""
-    at = loading_curve(inverse, inverse.thresholds)
-    part = np.clip(np.searchsorted(at, drives, side="right") - 1, 0, None)
-    return inverse.thresholds[part] + (drives - at[part]) / loading_slopes(inverse)[part]
+    levels = loading_curve(inverse, inverse.thresholds)
+    part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
+    return inverse.thresholds[part] + (drives - levels[part]) / loading_slopes(inverse)[part]
 
 
 def _slope_at(model: PlayModel, points: Real) -> Real:

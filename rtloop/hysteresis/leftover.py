@@ -33,9 +33,11 @@ def with_hysteresis_left(model: PlayModel, percent: float, drive_v: float) -> Pl
     def left(share: float) -> float:
         return loop_shape(command_um, model_output(_changed(model, share, drive_v), drives_v)).percent
 
-    least, most = left(0.0), left(LARGEST_SHARE)
-    if not least < percent < most:
-        raise ValueError(f"residual_percent: {percent:g}; above {least:.3g} and below {most:.3g} are allowed here")
+    lowest_percent, highest_percent = left(0.0), left(LARGEST_SHARE)
+    if not lowest_percent < percent < highest_percent:
+        raise ValueError(
+            f"residual_percent: {percent:g}; above {lowest_percent:.3g} and below {highest_percent:.3g} are allowed here"
+        )
     share = root_scalar(lambda share: left(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
     return _changed(model, share, drive_v)
 

@@ -36,8 +36,8 @@ def loop_shape(drive: Real, output: Real) -> LoopShape:
         return LoopShape(np.nan, float(np.ptp(output)))
     ends = [*turns.tolist(), drive.size - 1]
     branches = [slice(start, end + 1) for start, end in pairwise(ends)]
-    whole = [part for part in branches if np.ptp(drive[part]) > 0.98 * span]
-    last = whole[-2:] if len(whole) >= 2 else branches[-2:]
+    whole_branches = [part for part in branches if np.ptp(drive[part]) > 0.98 * span]
+    last = whole_branches[-2:] if len(whole_branches) >= 2 else branches[-2:]
     edges = np.linspace(drive.min(), drive.max(), BINS + 1)
     first, second = (_branch(drive[part], output[part], edges) for part in last)
     whole_loop = output[last[0].start : last[-1].stop]
@@ -48,6 +48,6 @@ def _branch(drive: Real, output: Real, edges: Real) -> Real:
     """Output at the bins' edges, straight between the means of the bins: on a straight piece these lie on it."""
     bins = np.clip(np.digitize(drive, edges) - 1, 0, BINS - 1)
     counts = np.bincount(bins, minlength=BINS)
-    kept = counts > 0
-    means, drives = (np.bincount(bins, values, BINS)[kept] / counts[kept] for values in (output, drive))
+    filled = counts > 0
+    means, drives = (np.bincount(bins, values, BINS)[filled] / counts[filled] for values in (output, drive))
     return np.interp(edges, drives, means)

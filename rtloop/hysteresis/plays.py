@@ -42,19 +42,19 @@ def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
 
 def turning_points(drive: Real, least: float) -> npt.NDArray[np.intp]:
     """Where the drive turned back by at least `least`: its alternating highest and lowest samples, not the first."""
-    found: list[int] = []
+    turns: list[int] = []
     candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
     low = high = 0
     for k in candidates:
         low = k if drive[k] <= drive[low] else low
         high = k if drive[k] >= drive[high] else high
         if drive[k] <= drive[high] - least:
-            found += [high] if not found or drive[found[-1]] < drive[high] else []
+            turns += [high] if not turns or drive[turns[-1]] < drive[high] else []
             low = high = k
         elif drive[k] >= drive[low] + least:
-            found += [low] if not found or drive[found[-1]] > drive[low] else []
+            turns += [low] if not turns or drive[turns[-1]] > drive[low] else []
             low = high = k
-    return np.array([k for k in found if k], dtype=np.intp)
+    return np.array([k for k in turns if k], dtype=np.intp)
 
 
 def loading_slopes(model: PlayModel) -> Real:

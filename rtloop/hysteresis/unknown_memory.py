@@ -39,14 +39,14 @@ def known_stretches(drive: Real) -> npt.NDArray[np.intp]:
 
     A stretch begins at an end of what was covered, and shows plays of up to half of its own range, no larger ones.
     """
-    grown = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
-    beyond = np.concatenate([[True], grown, [True]])
-    found, number, least_v = np.full(drive.size, -1), 0, LEAST_WITHIN * float(np.ptp(drive))
+    is_extended = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
+    beyond = np.concatenate([[True], is_extended, [True]])
+    numbers, number, minimum_v = np.full(drive.size, -1), 0, LEAST_WITHIN * float(np.ptp(drive))
     for start, end in np.flatnonzero(np.diff(beyond)).reshape(-1, 2):
-        if np.ptp(drive[start : end + 1]) >= least_v:
-            found[start + 1 : end + 1] = number
+        if np.ptp(drive[start : end + 1]) >= minimum_v:
+            numbers[start + 1 : end + 1] = number
             number += 1
-    return found
+    return numbers
 
 
 def missing_stroke(drive: Real) -> Missing:

@@ -34,15 +34,15 @@ def read_table(path: Path, group: str | None = None) -> Table:
     Raises UnreadableData, MissingExtra.
     """
     command = [sys.executable, "-m", __name__, str(path), *([] if group is None else [group])]
-    calm = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet, env=calm) as process:
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    devnull = subprocess.DEVNULL
+    with subprocess.Popen(command, stdin=devnull, stdout=subprocess.PIPE, stderr=devnull, env=environment) as process:
         assert process.stdout
         table = _received(path, process.stdout)
     if table is None:
         number = -process.returncode
-        what = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
-        raise UnreadableData(f"{path}: damaged: the library that reads such files came to grief over it ({what})")
+        cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
+        raise UnreadableData(f"{path}: damaged: the library that reads such files came to grief over it ({cause})")
     return table
 
 
@@ -51,18 +51,18 @@ def _received(path: Path, stream: IO[bytes]) -> Table | None:
     line = stream.readline()
     if not line.endswith(b"\n"):
         return None
-    said = json.loads(line)
-    if "error" in said:
+    message = json.loads(line)
+    if "error" in message:
         kinds = {kind.__name__: kind for kind in (MissingExtra, UnopenedData)}
-        raise kinds.get(said["kind"], UnreadableData)(said["error"])
-    columns = {name: np.empty(said["rows"]) for name in said["columns"]}
+        raise kinds.get(message["kind"], UnreadableData)(message["error"])
+    columns = {name: np.empty(message["rows"]) for name in message["columns"]}
     for values in columns.values():
-        rest = values.data.cast("B")
-        while len(rest) and (count := stream.readinto(rest)):  # type: ignore[attr-defined]
-            rest = rest[count:]
-        if len(rest):
+        remaining = values.data.cast("B")
+        while len(remaining) and (count := stream.readinto(remaining)):  # type: ignore[attr-defined]
+            remaining = remaining[count:]
+        if len(remaining):
             return None
-    return Table(columns, said["units"], said["time"], said["about"], tuple(said["in_other_files"]))
+    return Table(columns, message["units"], message["time"], message["about"], tuple(message["in_other_files"]))
 
 
 def _main(path: Path, group: str | None) -> None:
@@ -79,9 +79,9 @@ def _main(path: Path, group: str | None) -> None:
     except Exception as fault:  # whatever a library lets through of a damaged file
         _say(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})
         return
-    about = {"rows": rows_of(table), "columns": [*table.columns], "units": dict(table.units)}
-    about |= {"time": table.time, "about": dict(table.about), "in_other_files": [*table.in_other_files]}
-    _say(out, about)
+    header = {"rows": rows_of(table), "columns": [*table.columns], "units": dict(table.units)}
+    header |= {"time": table.time, "about": dict(table.about), "in_other_files": [*table.in_other_files]}
+    _say(out, header)
     for values in table.columns.values():
         out.write(values.data.cast("B"))
     out.flush()

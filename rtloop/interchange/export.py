@@ -44,16 +44,16 @@ def export(
     """
     if to not in FORMATS:
         raise RecordingError(f"export to {to!r}: possible are {', '.join(FORMATS)}")
-    recording, tell = load(files), progress or (lambda _: None)
+    recording, report_ticks = load(files), progress or (lambda _: None)
     path = find_files(files)[0]
     target = path.with_suffix(FORMATS[to]) if output is None else Path(output)
     writers = {"csv": _write_csv, "parquet": _write_parquet, "npz": _write_npz, "hdf5": _write_hdf5}
     with _new_file(target) as part:
         if to == "mat":
             ticks = write_mat(recording, part, target, selection)
-            tell(ticks)
+            report_ticks(ticks)
         else:
-            ticks = writers[to](recording, part, selection, tell)
+            ticks = writers[to](recording, part, selection, report_ticks)
     size = target.stat().st_size
     return {
         "recording": str(path),
@@ -118,18 +118,18 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
 
 def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
     """An array a signal, and `header_json` and `events_json`; several passes where memory asks for it."""
-    everything = selection.names(recording)
+    all_names = selection.names(recording)
     ticks = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
-    at_once = max(PASS_BYTES // (8 * max(ticks, 1)), 1)
+    columns_per_pass = max(PASS_BYTES // (8 * max(ticks, 1)), 1)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for name, value in (("header_json", recording.header), ("events_json", recording.events)):
             _add_array(archive, name, np.array(json.dumps(value)))
-        for start in range(0, len(everything), at_once):
-            names = everything[start : start + at_once]
+        for start in range(0, len(all_names), columns_per_pass):
+            names = all_names[start : start + columns_per_pass]
             blocks = list(selection.blocks(recording, names)) or [np.empty((0, len(names)))]
             for index, name in enumerate(names):
                 _add_array(archive, name, np.concatenate([rows[:, index] for rows in blocks]))
-            progress(ticks * (start + len(names)) // len(everything))
+            progress(ticks * (start + len(names)) // len(all_names))
     return ticks
 
 
@@ -161,11 +161,11 @@ def _add_array(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any])
 
 def _grouped(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
     """The blocks, joined to about ROW_GROUP rows."""
-    waiting: list[np.ndarray[Any, Any]] = []
+    pending: list[np.ndarray[Any, Any]] = []
     for rows in blocks:
-        waiting.append(rows)
-        if sum(map(len, waiting)) >= ROW_GROUP:
-            yield np.concatenate(waiting)
-            waiting = []
-    if waiting:
-        yield np.concatenate(waiting)
+        pending.append(rows)
+        if sum(map(len, pending)) >= ROW_GROUP:
+            yield np.concatenate(pending)
+            pending = []
+    if pending:
+        yield np.concatenate(pending)

@@ -24,6 +24,6 @@ def begin(place: Any, name: str) -> Any:
 def append(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
     """Rows (n, datasets) behind what is there."""
     for dataset, values in zip(datasets, rows.T, strict=True):
-        there = dataset.shape[0]
-        dataset.resize(there + len(values), axis=0)
-        dataset[there:] = values
+        length = dataset.shape[0]
+        dataset.resize(length + len(values), axis=0)
+        dataset[length:] = values

@@ -69,17 +69,17 @@ def import_data(
     Raises UnreadableData, MissingExtra, OutputError; nothing is left of an output that could not be written.
     """
     table = read_table(path, wanted.group) if table is None else table
-    found = sampling(table, path, wanted.time, wanted.rate_hz)
-    signals = _signals(table, path, wanted, found)
+    time_base = sampling(table, path, wanted.time, wanted.rate_hz)
+    signals = _signals(table, path, wanted, time_base)
     output = output or path.with_name(f"{path.stem}{'.imported' if path.suffix == '.mcap' else ''}.mcap")
-    _write(output, _header(path, signals, found), signals, found.rate_hz, progress or (lambda _: None))
+    _write(output, _header(path, signals, time_base), signals, time_base.rate_hz, progress or (lambda _: None))
     return {
         "file": str(path),
         "output": str(output),
-        "ticks": len(found.deadline_ns),
-        "rate_hz": found.rate_hz,
-        "duration_s": float(np.ptp(found.deadline_ns)) * 1e-9 + 1 / found.rate_hz,
-        "time": found.said,
+        "ticks": len(time_base.deadline_ns),
+        "rate_hz": time_base.rate_hz,
+        "duration_s": float(np.ptp(time_base.deadline_ns)) * 1e-9 + 1 / time_base.rate_hz,
+        "time": time_base.said,
         "signals": [
             {"name": name, "unit": unit, "from": signals.mapping[name], **extremes(signals.columns[name])}
             for name, unit in signals.units.items()
@@ -96,13 +96,13 @@ def listing(path: Path, table: Table, wanted: Wanted) -> dict[str, Any]:
         {"name": name, "unit": unit_in(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
         for name, values in table.columns.items()
     ]
-    said: dict[str, Any] = {"time": None, "rate_hz": None, "time_column": time_column(table)}
+    summary: dict[str, Any] = {"time": None, "rate_hz": None, "time_column": time_column(table)}
     try:
-        found = sampling(table, path, wanted.time, wanted.rate_hz)
-        said |= {"time": found.said, "rate_hz": found.rate_hz, "notes": found.notes}
+        time_base = sampling(table, path, wanted.time, wanted.rate_hz)
+        summary |= {"time": time_base.said, "rate_hz": time_base.rate_hz, "notes": time_base.notes}
     except UnreadableData as fault:
-        said["notes"] = [str(fault).removeprefix(f"{path}: ")]
-    return {"file": str(path), "rows": rows_of(table), **said, "columns": columns, "about": dict(table.about)} | {
+        summary["notes"] = [str(fault).removeprefix(f"{path}: ")]
+    return {"file": str(path), "rows": rows_of(table), **summary, "columns": columns, "about": dict(table.about)} | {
         "in_other_files": [*table.in_other_files]
     }
 
@@ -119,11 +119,11 @@ def extremes(values: Real) -> dict[str, float | None]:
 
 def _signals(table: Table, path: Path, wanted: Wanted, found: Sampling) -> Signals:
     """The wanted columns as signals. Raises UnreadableData."""
-    made = _columns(table, path, wanted)
-    notes = [*found.notes, *(column.assumed for column in made.values() if column.assumed)]
-    ticks, renumbered = _ticks(table, len(found.deadline_ns))
+    signals = _columns(table, path, wanted)
+    notes = [*found.notes, *(column.assumed for column in signals.values() if column.assumed)]
+    ticks, tick_notes = _ticks(table, len(found.deadline_ns))
     columns = {OWN[0]: ticks, OWN[1]: found.deadline_ns}
-    for name, column in made.items():
+    for name, column in signals.items():
         columns[name] = column.values(table)
         if name in WHOLE and (fault := whole_fault(name, columns[name])):
             raise UnreadableData(f"{path}: {fault}; --map says another name for it")
@@ -132,51 +132,57 @@ def _signals(table: Table, path: Path, wanted: Wanted, found: Sampling) -> Signa
         notes.append("no numbers: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count))
     return Signals(
         columns,
-        {name: _words(column.said) for name, column in made.items()},
-        {name: _words(column.unit) for name, column in made.items()},
-        [*map(_words, notes), *renumbered],
+        {name: _words(column.said) for name, column in signals.items()},
+        {name: _words(column.unit) for name, column in signals.items()},
+        [*map(_words, notes), *tick_notes],
     )
 
 
 def _columns(table: Table, path: Path, wanted: Wanted) -> dict[str, Column]:
     """By signal's name. Raises UnreadableData for a name that is taken, or where nothing is left to be a signal."""
-    made: dict[str, Column] = {}
+    signals: dict[str, Column] = {}
     for name, source in wanted.signals.items():
         if (name := signal_name(name)) in OWN:
             raise UnreadableData(f"{path}: {name} is made of the time; --time says which column that is")
-        made[name] = column_of(table, path, name, source)
-    kept = [find_column(table, path, asked) for asked in wanted.keep]
+        signals[name] = column_of(table, path, name, source)
+    plain_columns = [find_column(table, path, column_name) for column_name in wanted.keep]
     if wanted.everything or not wanted:
-        used = {column.name for column in made.values()} | {*kept, *_times(table, path, wanted)}
-        kept += [name for name in table.columns if name not in used]
-    for column in kept:
+        used = {column.name for column in signals.values()} | {*plain_columns, *_times(table, path, wanted)}
+        plain_columns += [name for name in table.columns if name not in used]
+    for column in plain_columns:
         name = column if came_from_a_recording(table) and NAME.fullmatch(column) else own_name(column)
-        free = next(one for one in (name, *(f"{name}_{k}" for k in range(2, len(made) + 3))) if one not in made)
+        free_name = next(
+            candidate
+            for candidate in (name, *(f"{name}_{k}" for k in range(2, len(signals) + 3)))
+            if candidate not in signals
+        )
         unit = unit_of(column) if came_from_a_recording(table) and not table.units else unit_in(table, column) or ""
-        made[free] = Column(column, Fraction(1), 0.0, unit, f"{bare(column)} [{unit}]" if unit else column, None)
-    if not made:
+        signals[free_name] = Column(
+            column, Fraction(1), 0.0, unit, f"{bare(column)} [{unit}]" if unit else column, None
+        )
+    if not signals:
         raise UnreadableData(f"{path}: holds no column beside its time")
-    return made
+    return signals
 
 
 def _times(table: Table, path: Path, wanted: Wanted) -> set[str | None]:
     """Columns that are times, and no signals."""
     if came_from_a_recording(table):
         return {*OWN, table.time}
-    given = None if wanted.time is None else column_of(table, path, "", wanted.time).name
-    return {time_column(table), given}
+    time_column_name = None if wanted.time is None else column_of(table, path, "", wanted.time).name
+    return {time_column(table), time_column_name}
 
 
 def _ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
     """The ticks of what came from a recording, where they count samples one by one; else they are counted anew."""
-    counted = np.arange(float(rows))
+    new_ticks = np.arange(float(rows))
     if not came_from_a_recording(table):
-        return counted, []
+        return new_ticks, []
     ticks = table.columns[OWN[0]]
     steps = np.diff(ticks)
     if whole_fault(OWN[0], ticks) is None and np.all(steps >= 1) and (rows < 2 or np.median(steps) == 1):
         return ticks, []
-    return counted, [f"its ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count its samples; they are counted anew"]
+    return new_ticks, [f"its ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count its samples; they are counted anew"]
 
 
 def _header(path: Path, signals: Signals, found: Sampling) -> dict[str, Any]:

@@ -50,20 +50,20 @@ class Column(NamedTuple):
 
     def values(self, table: Table) -> Real:
         """The signal, (rows,)."""
-        found = scaled(table.columns[self.name], self.factor)
-        return found + self.offset if self.offset else found
+        values = scaled(table.columns[self.name], self.factor)
+        return values + self.offset if self.offset else values
 
 
 def column_of(table: Table, path: Path, signal: str, source: str) -> Column:
     """What `signal` is made of, by the words of a mapping. Raises UnreadableData."""
     parts = {} if source in table.columns else _parts(source)
     name = find_column(table, path, parts.get("column") or source)
-    by, target = parts.get("by") or "", unit_of(signal)
+    sensitivity_unit, target = parts.get("by") or "", unit_of(signal)
     in_file = unit_in(table, name)
-    known = parts.get("unit") or in_file
-    unit = known or (by.partition("/")[2] if by else target)
+    source_unit = parts.get("unit") or in_file
+    unit = source_unit or (sensitivity_unit.partition("/")[2] if sensitivity_unit else target)
     try:
-        factor = factor_between(unit, target, by) if target else Fraction(1)
+        factor = factor_between(unit, target, sensitivity_unit) if target else Fraction(1)
         factor *= Fraction(parts.get("factor") or 1)
         offset = float(parts.get("offset") or 0) * (-1 if parts.get("sign") == "-" else 1)
         offset *= float(factor_between(parts.get("of") or target, target))
@@ -72,26 +72,26 @@ def column_of(table: Table, path: Path, signal: str, source: str) -> Column:
             f"{path}: {signal}: column {name!r}: {fault}; its unit stands in brackets, a factor behind a star: "
             f'"{bare(name)} [V] * 2.5 µm/V"'
         ) from None
-    assumed = None
-    if target and not known:
-        assumed = f"{signal}: no unit is known of {name!r}; it is taken for {unit}"
-    elif in_file and in_file != known:
-        assumed = f"{signal}: the file says that {name!r} is in {in_file}; it is taken for {unit}"
-    return Column(name, factor, offset, target or known or "", _said(name, unit, parts), assumed)
+    assumption = None
+    if target and not source_unit:
+        assumption = f"{signal}: no unit is known of {name!r}; it is taken for {unit}"
+    elif in_file and in_file != source_unit:
+        assumption = f"{signal}: the file says that {name!r} is in {in_file}; it is taken for {unit}"
+    return Column(name, factor, offset, target or source_unit or "", _said(name, unit, parts), assumption)
 
 
 def _parts(source: str) -> dict[str, str | None]:
-    found = _SOURCE.fullmatch(source)
-    return found.groupdict() if found else {}
+    match = _SOURCE.fullmatch(source)
+    return match.groupdict() if match else {}
 
 
 def _said(name: str, unit: str, parts: dict[str, str | None]) -> str:
-    said = f"{bare(name)} [{unit}]" if unit else name
+    text = f"{bare(name)} [{unit}]" if unit else name
     if parts.get("factor"):
-        said += f" * {parts['factor']} {parts.get('by') or ''}".rstrip()
+        text += f" * {parts['factor']} {parts.get('by') or ''}".rstrip()
     if parts.get("offset"):
-        said += f" {parts['sign']} {parts['offset']} {parts.get('of') or ''}".rstrip()
-    return said
+        text += f" {parts['sign']} {parts['offset']} {parts.get('of') or ''}".rstrip()
+    return text
 
 
 def find_column(table: Table, path: Path, asked: str) -> str:
@@ -100,14 +100,14 @@ def find_column(table: Table, path: Path, asked: str) -> str:
         return asked
     rules = (lambda name: _plain(name) == _plain(asked), lambda name: _slashed(name).endswith("/" + _slashed(asked)))
     for rule in rules:
-        found = [name for name in table.columns if rule(name)]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise UnreadableData(f"{path}: column {asked!r}: several are called so: {_listed(found)}")
-    alike = difflib.get_close_matches(asked, list(table.columns), ALIKE, 0.4) or list(table.columns)[: 4 * ALIKE]
+        matches = [name for name in table.columns if rule(name)]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            raise UnreadableData(f"{path}: column {asked!r}: several are called so: {_listed(matches)}")
+    similar = difflib.get_close_matches(asked, list(table.columns), ALIKE, 0.4) or list(table.columns)[: 4 * ALIKE]
     left_out = f" (left out: {table.about['left out']})" if "left out" in table.about else ""
-    raise UnreadableData(f"{path}: no column {asked!r}; there are {_listed(alike)}{left_out}")
+    raise UnreadableData(f"{path}: no column {asked!r}; there are {_listed(similar)}{left_out}")
 
 
 def unit_in(table: Table, name: str) -> str | None:
@@ -140,16 +140,25 @@ def own_name(column: str) -> str:
 
 def axes_of(signals: list[str]) -> list[str]:
     """The axes that the names of signals speak of, in their order; `x_true_position_um` is of x where there is an x."""
-    found = [name.removesuffix(f"_{one.name}") for name in signals for one in PER_AXIS if name.endswith(f"_{one.name}")]
-    axes = list(dict.fromkeys(found))
-    driven = {axis for axis in axes if f"{axis}_{PER_AXIS[DRIVE].name}" in signals}
-    return [axis for axis in axes if axis in driven or not any(axis.startswith(f"{other}_") for other in axes)]
+    candidates = [
+        name.removesuffix(f"_{signal.name}")
+        for name in signals
+        for signal in PER_AXIS
+        if name.endswith(f"_{signal.name}")
+    ]
+    axes = list(dict.fromkeys(candidates))
+    axes_with_drive = {axis for axis in axes if f"{axis}_{PER_AXIS[DRIVE].name}" in signals}
+    return [
+        axis
+        for axis in axes
+        if axis in axes_with_drive or not any(axis.startswith(f"{other_axis}_") for other_axis in axes)
+    ]
 
 
 def _split(name: str) -> tuple[str, str | None]:
-    found = _BRACKETED.fullmatch(name.strip())
-    unit = next(filter(None, found.groups()[1:]), "") if found else ""
-    return (found[1], unit) if found and is_unit(unit) else (name, None)
+    match = _BRACKETED.fullmatch(name.strip())
+    unit = next(filter(None, match.groups()[1:]), "") if match else ""
+    return (match[1], unit) if match and is_unit(unit) else (name, None)
 
 
 def _plain(name: str) -> str:

@@ -56,15 +56,17 @@ def sampling(table: Table, path: Path, time: str | None, rate_hz: float | None) 
     unit, notes = unit_of_time(table, column.name, time, column.said), []
     if unit is None:
         unit, notes = "s", [f"no unit is known of the time {column.name!r}; it is taken for s"]
-    deadlines, more = _in_ns(path, column.name, table.columns[column.name], unit)
-    period_ns, odd = _regularity(deadlines)
-    found_hz = _rate_hz(deadlines, period_ns)
-    if not LOWEST_RATE_HZ <= found_hz <= HIGHEST_RATE_HZ:
+    deadlines, conversion_notes = _in_ns(path, column.name, table.columns[column.name], unit)
+    period_ns, irregularity_notes = _regularity(deadlines)
+    measured_rate_hz = _rate_hz(deadlines, period_ns)
+    if not LOWEST_RATE_HZ <= measured_rate_hz <= HIGHEST_RATE_HZ:
         raise UnreadableData(
-            f"{path}: {found_hz:g} Hz by the time {column.name!r} in {unit}; {LOWEST_RATE_HZ:g} to {HIGHEST_RATE_HZ:g} "
+            f"{path}: {measured_rate_hz:g} Hz by the time {column.name!r} in {unit}; {LOWEST_RATE_HZ:g} to {HIGHEST_RATE_HZ:g} "
             f"Hz are possible: --time '{bare(column.name)} [ms]' says another unit, --rate HZ the rate"
         )
-    return Sampling(deadlines, found_hz, f"{bare(column.name)} [{unit}]", [*notes, *more, *odd])
+    return Sampling(
+        deadlines, measured_rate_hz, f"{bare(column.name)} [{unit}]", [*notes, *conversion_notes, *irregularity_notes]
+    )
 
 
 def came_from_a_recording(table: Table) -> bool:
@@ -76,8 +78,8 @@ def time_column(table: Table) -> str | None:
     """The deadlines of a recording; the column that the file calls its time, or that is called so in any file."""
     if came_from_a_recording(table):
         return OWN[1]
-    called = [name for name in table.columns if bare(name).rpartition("/")[2].strip(" \"'").casefold() in TIMES]
-    return table.time or next(iter(called), None) or _unnamed_time(table)
+    named_columns = [name for name in table.columns if bare(name).rpartition("/")[2].strip(" \"'").casefold() in TIMES]
+    return table.time or next(iter(named_columns), None) or _unnamed_time(table)
 
 
 def _unnamed_time(table: Table) -> str | None:
@@ -95,8 +97,8 @@ def grows_evenly(values: Real) -> bool:
 
 def unit_of_time(table: Table, name: str, asked: str, said: str) -> str | None:
     """What times are counted in, by the mapping, else by the file."""
-    given = said.rpartition("[")[2].rstrip("]") if asked != name and said.endswith("]") else None
-    return given or unit_in(table, name)
+    mapping_unit = said.rpartition("[")[2].rstrip("]") if asked != name and said.endswith("]") else None
+    return mapping_unit or unit_in(table, name)
 
 
 def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
@@ -112,9 +114,9 @@ def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[st
         notes = [f"the time begins at {times[0]:g} {unit} in the file; it is counted from there"]
         times = times - times[0]
     deadlines = np.rint(scaled(times, factor))
-    growing = np.diff(deadlines) > 0
-    if not growing.all():
-        row = int(np.argmin(growing))
+    is_growing = np.diff(deadlines) > 0
+    if not is_growing.all():
+        row = int(np.argmin(is_growing))
         raise UnreadableData(
             f"{path}: time {name!r}: does not grow: {times[row + 1]:g} {unit} in row {row + 2} after {times[row]:g}; "
             "--time COLUMN names another, --rate HZ counts instead"
@@ -128,8 +130,8 @@ def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[st
 
 def _rate_hz(deadlines: Real, period_ns: float) -> float:
     """By the mean period where it is even, else by the usual one."""
-    even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
-    period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if even else period_ns
+    is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
+    period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if is_even else period_ns
     return float(f"{1e9 / period_ns:.9g}")
 
 
@@ -137,17 +139,19 @@ def _regularity(deadlines: Real) -> tuple[float, list[str]]:
     """The usual period in ns, and in words what jitters and what is missing."""
     intervals = np.diff(deadlines)
     period, notes = float(np.median(intervals)), []
-    near = intervals[intervals < MISSING * period]
-    off = np.abs(near - period)
-    if off.size and off.max() > max(JITTER * period, ROUNDED_NS):
-        rms = float(np.sqrt(np.mean(off**2)))
+    regular_intervals = intervals[intervals < MISSING * period]
+    deviation = np.abs(regular_intervals - period)
+    if deviation.size and deviation.max() > max(JITTER * period, ROUNDED_NS):
+        rms = float(np.sqrt(np.mean(deviation**2)))
         notes.append(
-            f"sample times jitter: by {rms / 1e3:.3g} µs rms, {off.max() / 1e3:.3g} µs at most, about a period of "
+            f"sample times jitter: by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a period of "
             f"{period / 1e3:.6g} µs; they are kept as they are"
         )
-    wide = np.flatnonzero(intervals >= MISSING * period)
-    if wide.size:
-        samples = int(np.sum(np.rint(intervals[wide] / period) - 1))
-        where = f"first behind {deadlines[wide[0]] * 1e-9:.6g} s"
-        notes.append(f"about {counted(samples, 'sample')} missing, in {counted(wide.size, 'place')}, {where}")
+    gap_indices = np.flatnonzero(intervals >= MISSING * period)
+    if gap_indices.size:
+        samples = int(np.sum(np.rint(intervals[gap_indices] / period) - 1))
+        first_gap_text = f"first behind {deadlines[gap_indices[0]] * 1e-9:.6g} s"
+        notes.append(
+            f"about {counted(samples, 'sample')} missing, in {counted(gap_indices.size, 'place')}, {first_gap_text}"
+        )
     return period, notes

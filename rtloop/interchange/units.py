@@ -58,18 +58,18 @@ def parsed(text: str) -> Unit:
     for place, part in enumerate(text.strip().translate(_SAME).split("/")):
         sign = 1 if place == 0 else -1
         for factor in part.strip().split("·"):
-            one, more = _factor(factor.strip(), text)
-            scale *= one**sign
-            powers = _product(powers, tuple((symbol, sign * exponent) for symbol, exponent in more))
+            base_scale, base_powers = _factor(factor.strip(), text)
+            scale *= base_scale**sign
+            powers = _product(powers, tuple((symbol, sign * exponent) for symbol, exponent in base_powers))
     return Unit(scale, powers)
 
 
 def factor_between(source: str, target: str, by: str = "") -> Fraction:
     """What values in `source`, times one `by`, are to be multiplied by to be in `target`. Raises UnknownUnit."""
-    before, between, behind = parsed(source), parsed(by), parsed(target)
-    if _product(before.powers, between.powers) != behind.powers:
+    source_unit, by_unit, target_unit = parsed(source), parsed(by), parsed(target)
+    if _product(source_unit.powers, by_unit.powers) != target_unit.powers:
         raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} is no {target or '1'}")
-    return before.scale * between.scale / behind.scale
+    return source_unit.scale * by_unit.scale / target_unit.scale
 
 
 def is_unit(text: str) -> bool:
@@ -102,8 +102,8 @@ def _factor(text: str, whole: str) -> Unit:
     if text in OTHERS:
         scale, symbol = OTHERS[text]
         return Unit(scale, ((symbol, 1),) if symbol else ())
-    found = _POWER.fullmatch(text.translate(_SUPERSCRIPT))
-    name, exponent = (found[1], int(found[2] or 1)) if found else (text, 1)
+    match = _POWER.fullmatch(text.translate(_SUPERSCRIPT))
+    name, exponent = (match[1], int(match[2] or 1)) if match else (text, 1)
     name = NAMED.get(name, NAMED.get(name.lower(), name))
     if name in OTHERS and name:
         scale, symbol = OTHERS[name]

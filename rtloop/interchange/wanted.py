@@ -66,13 +66,18 @@ def mapping_beside(data: Path) -> Path | None:
 def read_mapping(path: Path) -> Wanted:
     """What a mapping's file asks for. Raises InputFileError, ConfigError."""
     try:
-        found = _File.model_validate(parse_toml(read_text(path)))
+        mapping = _File.model_validate(parse_toml(read_text(path)))
     except ValidationError as error:
-        faults = [f"{'.'.join(map(str, one['loc']))}: {one['msg'].lower()}" for one in error.errors()]
+        faults = [
+            f"{'.'.join(map(str, error_detail['loc']))}: {error_detail['msg'].lower()}"
+            for error_detail in error.errors()
+        ]
         raise ConfigError(str(path), faults) from None
     except ValueError as error:
         raise ConfigError(str(path), [str(error)]) from None
-    wrong = [name for name in found.signals if not NAME.fullmatch(name)]
-    if wrong:
-        raise ConfigError(str(path), [f"signals: {name!r}; letters, digits and _ make a name" for name in wrong])
-    return Wanted(found.signals, tuple(found.keep), found.all, found.time, found.rate_hz, found.group)
+    invalid_names = [name for name in mapping.signals if not NAME.fullmatch(name)]
+    if invalid_names:
+        raise ConfigError(
+            str(path), [f"signals: {name!r}; letters, digits and _ make a name" for name in invalid_names]
+        )
+    return Wanted(mapping.signals, tuple(mapping.keep), mapping.all, mapping.time, mapping.rate_hz, mapping.group)

@@ -71,11 +71,11 @@ def hand_in(record):
     for a in range(law.axis_count):
         count = np.int64(coefficients_of(law, a).controller_axes)
         if count != 0:
-            told = _told(law, a, count)
+            volts = _told(law, a, count)
             for k in range(record.extra_input_count):
-                told[k] = inputs[k]
+                volts[k] = inputs[k]
             for k in range(record.extra_output_count):
-                told[MAX_EXTRAS + k] = outputs[k].safe_v
+                volts[MAX_EXTRAS + k] = outputs[k].safe_v
 
 
 @seldom
@@ -90,10 +90,10 @@ def hand_out(record):
         outputs[k].value_v = outputs[k].safe_v
     for a in range(law.axis_count):
         count = np.int64(coefficients_of(law, a).controller_axes)
-        told = _told(law, a, max(count, 1))
+        volts = _told(law, a, max(count, 1))
         for k in range(record.extra_output_count):
             if loop.mode == CLOSED_LOOP and a <= outputs[k].axis < a + count:
-                value_v = told[MAX_EXTRAS + k]
+                value_v = volts[MAX_EXTRAS + k]
                 if usable(value_v):
                     outputs[k].value_v = clip(value_v, outputs[k].lowest_v, outputs[k].highest_v)
                 else:

@@ -83,12 +83,12 @@ def fits(law, a, address):
 @jit
 def all_fit(law):
     """Whether `fits` holds for every axis, and each has a controller, its own or that of one before it."""
-    owned = 0
+    owned_axes = 0
     for a in range(law.axis_count):
         count = np.int64(coefficients_of(law, a).controller_axes)
-        if (count == 0) != (a < owned) or not fits(law, a, law.coefficients + a * law.coefficients_bytes):
+        if (count == 0) != (a < owned_axes) or not fits(law, a, law.coefficients + a * law.coefficients_bytes):
             return False
-        owned = max(owned, a + count)
+        owned_axes = max(owned_axes, a + count)
     return True
 
 
@@ -119,11 +119,11 @@ def set_controller(law, a):
 def set_prefilter(law, a, last_um):
     """Have axis `a` go on with other taps, which are in place, from what those before made of the last references."""
     coefficients, state = coefficients_of(law, a), state_of(law, a)
-    wanted_um, added_um = filtered(coefficients, state)
+    target_um, added_um = filtered(coefficients, state)
     if loop_of(law).mode == CLOSED_LOOP:
         state.command_bump_um += last_um[1] - added_um
         if coefficients.section_count == 0:
-            state.bump += wanted_um - last_um[0]
+            state.bump += target_um - last_um[0]
 
 
 @jit
@@ -149,10 +149,10 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
         state.usable = 1 if usable(adc_v[a]) and usable(references[a]) and usable(feeds_um[a]) else 0
         causes |= axis_causes(coefficients, state, adc_v[a], conditions)
         causes |= watch(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
-        wanted_um, added_um = references[a], 0.0
+        target_um, added_um = references[a], 0.0
         if state.usable != 0:
-            wanted_um, added_um = prefilter(coefficients, state, references[a])
-        state.error_um, state.feed_um = wanted_um - state.position_um, feeds_um[a] + added_um
+            target_um, added_um = prefilter(coefficients, state, references[a])
+        state.error_um, state.feed_um = target_um - state.position_um, feeds_um[a] + added_um
     loop.new_trip = causes & ~loop.trip
     loop.trip |= causes
     if loop.trip != 0:
@@ -187,10 +187,10 @@ def _control(law, a):
     """Command of one axis that has a controller of its own; False where that failed."""
     coefficients, state = coefficients_of(law, a), state_of(law, a)
     _tell(law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um))
-    good = state.entering == 0 or controller_enter(law, a, law.controls)
+    is_good = state.entering == 0 or controller_enter(law, a, law.controls)
     succeeded, command_um = controller_output(law, a, coefficients, law.controls)
-    good = good and succeeded
-    return _command(law, a, coefficients, state, command_um) and good
+    is_good = is_good and succeeded
+    return _command(law, a, coefficients, state, command_um) and is_good
 
 
 @seldom
@@ -212,37 +212,41 @@ def _control_together(law, first, count):
     for i in range(first, first + count):
         coefficients, resting_um = coefficients_of(law, i), 0.0
         for j in range(count):
-            other = state_of(law, first + j)
-            resting_um += coefficients.resting_error[j] * (other.applied_command_um - other.feed_um)
+            coupled_state = state_of(law, first + j)
+            resting_um += coefficients.resting_error[j] * (coupled_state.applied_command_um - coupled_state.feed_um)
         _tell(law, i, coefficients, state_of(law, i), resting_um)
         entering = entering or state_of(law, i).entering != 0
     _gather(law, first, count)
-    good = not entering or controller_enter(law, first, law.together)
+    is_good = not entering or controller_enter(law, first, law.together)
     succeeded, _ = controller_output(law, first, coefficients_of(law, first), law.together)
-    good = good and succeeded
+    is_good = is_good and succeeded
     commands_um = together_of(law, first, count)[COMMAND]
     for i in range(count):
         a = first + i
-        good = _command(law, a, coefficients_of(law, a), state_of(law, a), commands_um[i]) and good
-    return good
+        is_good = _command(law, a, coefficients_of(law, a), state_of(law, a), commands_um[i]) and is_good
+    return is_good
 
 
 @jit
 def _gather(law, first, count):
     """What the axes from `first` on are told, as the controller that they share finds it."""
-    together = together_of(law, first, count)
+    joint = together_of(law, first, count)
     for i in range(count):
-        told = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
+        signals = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
         for field in range(CONTROL_FIELDS):
-            together[field, i] = told[field]
+            joint[field, i] = signals[field]
 
 
 @jit
 def _tell(law, i, coefficients, state, resting_um):
     """What a controller meets on axis `i`, where it rests at an error of `resting_um`."""
     control = control_of(law, i)
-    met_um = state.error_um - _bump(coefficients, state, state.error_um - resting_um)
-    control.reference_um, control.position_um, control.error_um = state.position_um + met_um, state.position_um, met_um
+    entry_error_um = state.error_um - _bump(coefficients, state, state.error_um - resting_um)
+    control.reference_um, control.position_um, control.error_um = (
+        state.position_um + entry_error_um,
+        state.position_um,
+        entry_error_um,
+    )
     control.command_um = control.applied_um = state.applied_command_um - state.feed_um
 
 

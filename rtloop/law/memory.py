@@ -65,10 +65,10 @@ class Layout:
 
     def room(self, slot: Slot) -> tuple[int, int]:
         """Bytes of coefficients and of state that a slot has."""
-        own = [law for law in self.laws if law.slot == slot]
+        slot_laws = [law for law in self.laws if law.slot == slot]
         return (
-            max((law.coefficients.itemsize for law in own), default=0),
-            max((law.state.itemsize for law in own), default=0),
+            max((law.coefficients.itemsize for law in slot_laws), default=0),
+            max((law.state.itemsize for law in slot_laws), default=0),
         )
 
     @property
@@ -136,8 +136,8 @@ class Layout:
     def description(self) -> dict[str, Any]:
         """What a recording says of the layout of its snapshots, and a digest of it."""
         tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
-        described: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
-        described["laws"] = [
+        content: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
+        content["laws"] = [
             {
                 "name": law.name,
                 "axes": law.axes,
@@ -146,7 +146,7 @@ class Layout:
             }
             for law in self.laws
         ]
-        return {**described, "sha256": hashlib.sha256(repr(described).encode()).hexdigest(), "revision": REVISION}
+        return {**content, "sha256": hashlib.sha256(repr(content).encode()).hexdigest(), "revision": REVISION}
 
     def rules(self) -> list[npt.NDArray[Any]]:
         """Of each law, its rules for coefficients as RULE records."""
@@ -166,11 +166,11 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
 
 def require_owners(controller_axes: Sequence[int]) -> None:
     """Raise ValueError where an axis has no controller, or two."""
-    owned = 0
+    owned_axes = 0
     for number, count in enumerate(controller_axes):
-        if (count == 0) != (number < owned):
+        if (count == 0) != (number < owned_axes):
             raise ValueError(f"controller_axes of axis {number}: {count}; each axis has one controller")
-        owned = max(owned, number + count)
+        owned_axes = max(owned_axes, number + count)
 
 
 def view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
@@ -180,9 +180,9 @@ def view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
 
 def records(dtype: np.dtype[Any], count: int) -> Records:
     """Zeroed records at a cache line, with attribute access also where the kernels run uncompiled."""
-    room = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
-    begin = -room.ctypes.data % LINE_BYTES
-    return room[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
+    buffer = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
+    begin = -buffer.ctypes.data % LINE_BYTES
+    return buffer[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
 
 
 def copied(source: npt.NDArray[Any]) -> Records:
@@ -210,9 +210,9 @@ class LawMemory:
         self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
         rules = layout.rules()
         self._functions, count = functions.copy(), 0
-        for one, law, own in zip(self._functions, layout.laws, rules, strict=True):
-            one["axes"], one["coefficients_bytes"] = law.axes, law.coefficients.itemsize
-            one["state_bytes"], one["first_rule"], one["rule_count"] = law.state.itemsize, count, len(own)
+        for record, law, own in zip(self._functions, layout.laws, rules, strict=True):
+            record["axes"], record["coefficients_bytes"] = law.axes, law.coefficients.itemsize
+            record["state_bytes"], record["first_rule"], record["rule_count"] = law.state.itemsize, count, len(own)
             count += len(own)
         self._kept = {
             "coefficients": coefficients,
@@ -227,9 +227,9 @@ class LawMemory:
             "extra_inputs": np.zeros(MAX_EXTRAS),
             "extra_outputs": records(EXTRA_OUTPUT, MAX_EXTRAS),
         }
-        for one, output in zip(self._kept["extra_outputs"], extras.outputs, strict=False):
-            one["value_v"] = one["safe_v"] = output.safe_v
-            one["lowest_v"], one["highest_v"], one["axis"] = output.lowest_v, output.highest_v, output.axis
+        for record, output in zip(self._kept["extra_outputs"], extras.outputs, strict=False):
+            record["value_v"] = record["safe_v"] = output.safe_v
+            record["lowest_v"], record["highest_v"], record["axis"] = output.lowest_v, output.highest_v, output.axis
         self.records: Any = records(LAW, 1)
         for name, array in self._kept.items():
             self.records[name] = array.ctypes.data
@@ -251,10 +251,10 @@ class LawMemory:
         extras: Extras = NO_EXTRAS,
     ) -> LawMemory:
         """Outputs at their safe values, an unloaded actuator that never moved."""
-        own = copied(coefficients)
-        axes = records(layout.state, own.size)
-        axes["drive_v"] = own["safe_v"]
-        return cls(layout, functions, own, axes, records(LOOP_STATE, 1), extras)
+        owned_coefficients = copied(coefficients)
+        axes = records(layout.state, owned_coefficients.size)
+        axes["drive_v"] = owned_coefficients["safe_v"]
+        return cls(layout, functions, owned_coefficients, axes, records(LOOP_STATE, 1), extras)
 
     def of_law(self, axis: int, slot: Slot, what: Which) -> Any:
         """A plug-in's record of axis number `axis`, by attributes; None for a controller that another axis owns."""
@@ -268,16 +268,16 @@ class LawMemory:
 
 def fields(layout: Layout, coefficients: Records, which: Which) -> list[list[Any]]:
     """Of each axis: (name, type, offset) of every field of its coefficients or state, its plug-ins' included."""
-    found: list[list[Any]] = []
+    tables: list[list[Any]] = []
     for axis in coefficients:
         table = getattr(layout, which)
-        own: list[Any] = []
+        rows: list[Any] = []
         for name, (dtype, start, *_) in table.fields.items():
             law = layout.law(axis, name) if name in ("feedforward", "controller") else None
             if law is not None:
                 inner = getattr(law, which)
-                own += [(field, kind, start + place) for field, (kind, place, *_) in inner.fields.items()]
+                rows += [(field, kind, start + place) for field, (kind, place, *_) in inner.fields.items()]
                 start, dtype = start + inner.itemsize, np.dtype((np.uint8, (dtype.itemsize - inner.itemsize,)))
-            own.append((name, dtype, start))
-        found.append(own)
-    return found
+            rows.append((name, dtype, start))
+        tables.append(rows)
+    return tables

@@ -142,13 +142,13 @@ def admitted(law, number, coefficients):
     functions = functions_of(law, number)
     rules = carray(address_pointer(law.rules), functions.first_rule + functions.rule_count, RULE)
     for rule in range(functions.first_rule, functions.first_rule + functions.rule_count):
-        one = rules[rule]
-        for i in range(one.count):
-            place = coefficients + one.offset + i * one.octets
-            if one.octets == 1:
+        limits = rules[rule]
+        for i in range(limits.count):
+            place = coefficients + limits.offset + i * limits.octets
+            if limits.octets == 1:
                 value = np.int64(carray(address_pointer(place), 1, np.uint8)[0])
             else:
                 value = carray(address_pointer(place), 1, np.int64)[0]
-            if value < one.low or value > one.high or value % one.step != 0:
+            if value < limits.low or value > limits.high or value % limits.step != 0:
                 return False
     return True

@@ -36,25 +36,25 @@ def functions_of(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
 @cache
 def _bound(reference: LawReference) -> npt.NDArray[Any]:
     """One law, shape (1,): compiled and looked through once in a process, however often it is asked for."""
-    law, found = law_class(reference), np.zeros(1, FUNCTIONS)
-    keeps = law.records(reference.axes)
+    law, record = law_class(reference), np.zeros(1, FUNCTIONS)
+    law_records = law.records(reference.axes)
     for name in functions_in(law):
-        found[name] = _address(law, keeps, name)
-    return found
+        record[name] = _address(law, law_records, name)
+    return record
 
 
 def signatures_of(law: type[Law], keeps: LawRecords) -> dict[str, Any]:
     """What each function that a law has takes and returns, for the compiler."""
     from numba import from_dtype, types
 
-    told = from_dtype(told_by(keeps.axes)) if keeps.axes else types.float64
+    input_type = from_dtype(told_by(keeps.axes)) if keeps.axes else types.float64
     returns = {
         "output": types.void if keeps.axes > 1 else types.float64,
         "update": types.void if keeps.axes else types.float64,
         "enter": types.void,
     }
     return {
-        name: result(from_dtype(keeps.coefficients), from_dtype(keeps.state), told)
+        name: result(from_dtype(keeps.coefficients), from_dtype(keeps.state), input_type)
         for name, result in returns.items()
         if name in functions_in(law)
     }
@@ -70,22 +70,22 @@ def _address(law: type[Law], keeps: LawRecords, name: str) -> int:
     if UNCOMPILED:
         return native_address(_from_addresses(function, keeps), None)
     if law.shipped:
-        of_axes = f".{keeps.axes}" if keeps.axes > 1 else ""
-        place = f"{law.__module__}.{law.__qualname__}.{name}{of_axes}"
-        return kept_address(function, place, lambda: signatures_of(law, keeps)[name])
+        axes_suffix = f".{keeps.axes}" if keeps.axes > 1 else ""
+        cache_name = f"{law.__module__}.{law.__qualname__}.{name}{axes_suffix}"
+        return kept_address(function, cache_name, lambda: signatures_of(law, keeps)[name])
     kernel, signature = _kernel(function), signatures_of(law, keeps)[name]
     try:
         address = native_address(kernel, signature)
     except Exception as error:  # whatever the compiler comes upon
         file = function.__code__.co_filename
-        where = f"law {law.kind!r}{_line(error, file)}: {name}"
+        location = f"law {law.kind!r}{_line(error, file)}: {name}"
         if RETURNS_NOTHING in str(error):
-            raise ValueError(f"{where} returns nothing on one of its paths; each needs a `return`") from error
-        raise ValueError(f"{where} cannot be compiled: {_short(error)}") from error
+            raise ValueError(f"{location} returns nothing on one of its paths; each needs a `return`") from error
+        raise ValueError(f"{location} cannot be compiled: {_short(error)}") from error
     for called, reason in foreign_calls(kernel, signature, law.libm).items():
         code = function.__code__
-        where = f"law {law.kind!r} ({Path(code.co_filename).name}), line {code.co_firstlineno}: {name}"
-        raise ValueError(f"{where} {reason if reason == MEMORY else f'calls {called}, which {reason}'}")
+        location = f"law {law.kind!r} ({Path(code.co_filename).name}), line {code.co_firstlineno}: {name}"
+        raise ValueError(f"{location} {reason if reason == MEMORY else f'calls {called}, which {reason}'}")
     return address
 
 
@@ -102,17 +102,22 @@ def _short(error: Exception) -> str:
     if not isinstance(error, NumbaError):
         return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]
-    kept = [line for line in lines if line and not line.startswith(("During:", "- Resolution", "Failed in", "[", "<<"))]
-    end = next((i for i, line in enumerate(kept) if line.startswith(("File ", "There are", "def "))), len(kept))
-    text = " ".join(kept[: max(end, 1)])
+    message_lines = [
+        line for line in lines if line and not line.startswith(("During:", "- Resolution", "Failed in", "[", "<<"))
+    ]
+    end = next(
+        (i for i, line in enumerate(message_lines) if line.startswith(("File ", "There are", "def "))),
+        len(message_lines),
+    )
+    text = " ".join(message_lines[: max(end, 1)])
     operation = re.search(r"Function\(<built-in function (\w+)>\) found for signature: >>> \w+(\(.*\))", text)
     return (f"no {operation[1]} for {operation[2]}" if operation else text)[:MAX_CHARACTERS]
 
 
 def _line(error: Exception, file: str) -> str:
     """Where in the law's own file it happened, as the compiler says."""
-    found = re.findall(r'File "([^"]+)", line (\d+)', str(error))
-    lines = [number for name, number in found if Path(name).name == Path(file).name]
+    locations = re.findall(r'File "([^"]+)", line (\d+)', str(error))
+    lines = [number for name, number in locations if Path(name).name == Path(file).name]
     return f" ({Path(file).name}), line {lines[-1]}" if lines else ""
 
 
@@ -120,7 +125,7 @@ def _from_addresses(function: Callable[..., Any], keeps: LawRecords) -> Callable
     """An uncompiled function as the loop calls it."""
 
     def call(coefficients: int, state: int, told: Any) -> Any:
-        given = carray(told, 1, told_by(keeps.axes))[0] if keeps.axes else told
-        return function(carray(coefficients, 1, keeps.coefficients)[0], carray(state, 1, keeps.state)[0], given)
+        control = carray(told, 1, told_by(keeps.axes))[0] if keeps.axes else told
+        return function(carray(coefficients, 1, keeps.coefficients)[0], carray(state, 1, keeps.state)[0], control)
 
     return call

@@ -61,28 +61,34 @@ class LawConformance:
 
     def test_whole_numbers_are_bounded(self) -> None:
         """Whatever the functions use as an index has its range in `allowed_coefficients` and `allowed_state`."""
-        keeps = self.law.records(self.law.count)
-        for what, allowed in (("coefficients", keeps.allowed_coefficients), ("state", keeps.allowed_state)):
-            table = getattr(keeps, what)
-            whole = {
+        law_records = self.law.records(self.law.count)
+        for kind, allowed in (("coefficients", law_records.allowed_coefficients), ("state", law_records.allowed_state)):
+            table = getattr(law_records, kind)
+            integer_fields = {
                 name for name in table.names if table[name].base.kind in "iu" and name not in ("unused", "reserved")
             }
-            assert set(allowed) == whole, f"allowed_{what} must name {sorted(whole)}; it names {sorted(allowed)}"
+            assert set(allowed) == integer_fields, (
+                f"allowed_{kind} must name {sorted(integer_fields)}; it names {sorted(allowed)}"
+            )
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
         """Results and state, over ticks with wild errors and limited commands."""
-        other = Bench(self.law, compiled=False)
-        for number, (one, two) in enumerate(zip(bench.run(TICKS), other.run(TICKS), strict=True)):
-            assert one == two, f"tick {number}: compiled {one}, uncompiled {two}"
+        uncompiled = Bench(self.law, compiled=False)
+        for number, (tick_compiled, tick_uncompiled) in enumerate(
+            zip(bench.run(TICKS), uncompiled.run(TICKS), strict=True)
+        ):
+            assert tick_compiled == tick_uncompiled, (
+                f"tick {number}: compiled {tick_compiled}, uncompiled {tick_uncompiled}"
+            )
 
     def test_its_state_is_in_its_record(self, bench: Bench) -> None:
         """From the same bytes it goes on the same, compiled or not: nothing is remembered anywhere else."""
-        for one in (bench, Bench(self.law, compiled=False)):
-            list(one.run(TICKS))
-            kept = one.state.copy()
-            first = list(one.run(TICKS, SEED + 1))
-            one.state[:] = kept
-            assert list(one.run(TICKS, SEED + 1)) == first, "from the same state it went on otherwise"
+        for tested in (bench, Bench(self.law, compiled=False)):
+            list(tested.run(TICKS))
+            saved_state = tested.state.copy()
+            first = list(tested.run(TICKS, SEED + 1))
+            tested.state[:] = saved_state
+            assert list(tested.run(TICKS, SEED + 1)) == first, "from the same state it went on otherwise"
 
     def test_its_coefficients_are_read_only(self, bench: Bench) -> None:
         """They are what a recording says of the law."""
@@ -109,9 +115,9 @@ class LawConformance:
         random = np.random.default_rng(SEED)
         for _ in range(50):
             position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, (3, self.law.count))
-            found = bench.enter(position_um, error_um, command_um)
+            first_um = bench.enter(position_um, error_um, command_um)
             room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
-            assert np.all(np.abs(found - command_um) <= room), f"told to go on at {command_um}, it gave {found}"
+            assert np.all(np.abs(first_um - command_um) <= room), f"told to go on at {command_um}, it gave {first_um}"
 
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
         """After a limit was long in force, the loop comes back as soon as from rest, and overshoots no further.
@@ -125,13 +131,13 @@ class LawConformance:
             pytest.skip("without a limit its loop around a lag with the gain of its model, or 1, does not come back")
         most_ticks = int((1 + LATER) * free.ticks) + LATER_TICKS
         saturated_ticks = max(SATURATED * free.ticks, self.saturated_ticks)
-        found = bench.limited_loop().limited_return(saturated_ticks, most_ticks)
-        assert found is not None, (
+        limited = bench.limited_loop().limited_return(saturated_ticks, most_ticks)
+        assert limited is not None, (
             f"wound up: {saturated_ticks} ticks beyond the limit, and it was not back after {most_ticks} ticks; "
             f"it takes {free.ticks} without a limit"
         )
-        assert found.overshoot <= free.overshoot + FURTHER, (
-            f"wound up: back from the limit it overshot by {100 * found.overshoot:.1f} % of the way; "
+        assert limited.overshoot <= free.overshoot + FURTHER, (
+            f"wound up: back from the limit it overshot by {100 * limited.overshoot:.1f} % of the way; "
             f"without a limit by {100 * free.overshoot:.1f} %"
         )
 
@@ -159,17 +165,17 @@ class Bench:
     """A law's functions on records of its own, compiled as the loop has them or as they are written."""
 
     def __init__(self, law: Law, compiled: bool = True) -> None:
-        keeps, self._law = law.records(law.count), law
-        self.coefficients: Any = records(keeps.coefficients, 1)
+        law_records, self._law = law.records(law.count), law
+        self.coefficients: Any = records(law_records.coefficients, 1)
         self.coefficients[:] = record_of(law)
-        self.state: Any = records(keeps.state, 1)
+        self.state: Any = records(law_records.state, 1)
         self._told: Any = records(told_by(law.count), 1) if law.count else None
         self._rows = (self.coefficients[0], self.state[0])
         self._kernels: dict[str, Any] = {}
-        self._signatures = signatures_of(type(law), keeps)
+        self._signatures = signatures_of(type(law), law_records)
         for name, signature in self._signatures.items():
-            plain = as_written(getattr(type(law), name))
-            self._kernels[name] = _compiled(plain, signature) if compiled else plain
+            python_kernel = as_written(getattr(type(law), name))
+            self._kernels[name] = _compiled(python_kernel, signature) if compiled else python_kernel
 
     def _call(self, name: str, told: Any) -> Any:
         with np.errstate(all="ignore"):
@@ -184,18 +190,18 @@ class Bench:
                 followed = float(self._call("update", random.uniform(-10, 10)))
                 yield value + followed, self.state.tobytes()
                 continue
-            told = self._told[0]
+            control = self._told[0]
             reach = 1e6 if wild and number % 97 == 0 else REACH_UM
             axes = None if self._law.count == 1 else self._law.count
             position_um, reference_um = random.uniform(-reach, reach, axes), random.uniform(-reach, reach, axes)
-            told["position_um"], told["reference_um"] = position_um, reference_um
-            told["error_um"] = reference_um - position_um
-            told["command_um"] = told["applied_um"] = random.uniform(-REACH_UM, REACH_UM, axes)
-            told["inputs"], told["outputs"] = random.uniform(-10, 10, MAX_EXTRAS), 0.0
-            value = self._commands(told)
-            told["command_um"], told["applied_um"] = value, np.clip(value, -REACH_UM, REACH_UM)
-            self._call("update", told)
-            yield value, self.state.tobytes() + told["outputs"].tobytes()
+            control["position_um"], control["reference_um"] = position_um, reference_um
+            control["error_um"] = reference_um - position_um
+            control["command_um"] = control["applied_um"] = random.uniform(-REACH_UM, REACH_UM, axes)
+            control["inputs"], control["outputs"] = random.uniform(-10, 10, MAX_EXTRAS), 0.0
+            value = self._commands(control)
+            control["command_um"], control["applied_um"] = value, np.clip(value, -REACH_UM, REACH_UM)
+            self._call("update", control)
+            yield value, self.state.tobytes() + control["outputs"].tobytes()
 
     def _commands(self, told: Any) -> Any:
         """What the controller commands: a number, or a tuple with one for each of its axes."""
@@ -221,14 +227,14 @@ class Bench:
         if self._law.count == 0:
             return 0.0
         self.state.view(np.uint8)[:] = 0
-        told = self._told[0]
+        control = self._told[0]
         if self._law.count == 1:
             position_um, error_um, command_um = float(position_um[0]), float(error_um[0]), float(command_um[0])
-        told.position_um, told.error_um, told.reference_um = position_um, error_um, position_um + error_um
-        told.command_um = told.applied_um = command_um
+        control.position_um, control.error_um, control.reference_um = position_um, error_um, position_um + error_um
+        control.command_um = control.applied_um = command_um
         if "enter" in self._kernels:
-            self._call("enter", told)
-        return self._commands(told)
+            self._call("enter", control)
+        return self._commands(control)
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
         """The law at the edge of what the limit can hold; one without `enter` is brought to rest there if `at_rest`."""
@@ -241,15 +247,19 @@ class Bench:
 
     def _follow(self, position_um: Any, reference_um: Any, limit_um: float) -> Any:
         """One tick with a limit of the command; what was applied. All (axes,)."""
-        told = self._told[0]
+        control = self._told[0]
         if self._law.count == 1:
             position_um, reference_um = float(position_um[0]), float(reference_um[0])
-        told.position_um, told.reference_um, told.error_um = position_um, reference_um, reference_um - position_um
-        told.inputs, told.outputs = 0.0, 0.0
-        value = self._commands(told)
-        told.command_um, told.applied_um = value, np.clip(value, -limit_um, limit_um)
-        self._call("update", told)
-        return np.atleast_1d(np.array(told.applied_um))
+        control.position_um, control.reference_um, control.error_um = (
+            position_um,
+            reference_um,
+            reference_um - position_um,
+        )
+        control.inputs, control.outputs = 0.0, 0.0
+        value = self._commands(control)
+        control.command_um, control.applied_um = value, np.clip(value, -limit_um, limit_um)
+        self._call("update", control)
+        return np.atleast_1d(np.array(control.applied_um))
 
     def foreign(self) -> Iterator[tuple[str, dict[str, str]]]:
         """Of each function what it calls that a law may not."""

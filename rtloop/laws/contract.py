@@ -171,35 +171,35 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
 def _announce(law: Law) -> None:
     """Say that functions of a law are called next, where it is of somebody's own."""
     if not law.shipped:
-        of = getattr(law.options, "law", None)
-        announce(law.kind, of.file if of is not None else type(law).__module__)
+        reference = getattr(law.options, "law", None)
+        announce(law.kind, reference.file if reference is not None else type(law).__module__)
 
 
 def record_of(law: Law) -> Any:
     """The coefficients that a law builds, shape (1,). Raises ValueError for a name or a shape that does not fit."""
     _announce(law)
     dtype = law.records().coefficients
-    found = np.zeros(1, dtype)
-    known = [name for name in dtype.names or () if name not in ("reserved", "scratch")]
+    record = np.zeros(1, dtype)
+    names = [name for name in dtype.names or () if name not in ("reserved", "scratch")]
     built = law.build()
     if not isinstance(built, Mapping):
         raise ValueError(f"{_place(law)} returns {built!r}; a dict with a value for each coefficient is needed")
-    if other := [name for name in built if name not in known]:
-        raise ValueError(f"{_place(law)} gives {', '.join(other)}; the coefficients are {', '.join(known)}")
-    if not law.shipped and (absent := [name for name in known if name not in built]):
-        raise ValueError(f"{_place(law)} gives no {', '.join(absent)}; the coefficients are {', '.join(known)}")
+    if unknown := [name for name in built if name not in names]:
+        raise ValueError(f"{_place(law)} gives {', '.join(unknown)}; the coefficients are {', '.join(names)}")
+    if not law.shipped and (missing := [name for name in names if name not in built]):
+        raise ValueError(f"{_place(law)} gives no {', '.join(missing)}; the coefficients are {', '.join(names)}")
     for name, value in built.items():
-        numbers, target = np.asarray(value), found[name]
+        numbers, target = np.asarray(value), record[name]
         if numbers.dtype.kind not in "biuf":
             raise ValueError(f"{_place(law)} gives {name} = {value!r}, which is no number")
         room = target.shape[1:]
-        if numbers.ndim != len(room) or any(n > most for n, most in zip(numbers.shape, room, strict=True)):
+        if numbers.ndim != len(room) or any(n > limit for n, limit in zip(numbers.shape, room, strict=True)):
             needed = f"an array of at most {room}" if room else "one number"
             raise ValueError(f"{_place(law)} gives {name} as an array of {numbers.shape}; {needed} is needed")
         if np.isnan(numbers).any():
             raise ValueError(f"{_place(law)} gives {name} = {value!r}; NaN is not allowed")
         target[(0, *(slice(0, length) for length in numbers.shape))] = numbers
-    return found
+    return record
 
 
 def _place(law: Law) -> str:

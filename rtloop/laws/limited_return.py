@@ -59,14 +59,14 @@ class LimitedLoop:
 
     def unlimited_return(self) -> Return | None:
         """From rest at the edge to 0; None where it is not back after MOST_TICKS, or overshoots by FURTHEST."""
-        part, nothing = np.ones((1, self._gains.size)), np.zeros_like(self._gains)
-        while (ticks := _ticks_until_back(part)) is None:
-            if part.shape[0] > MOST_TICKS or not np.abs(part).max() < BEYOND:
+        shares, zero_um = np.ones((1, self._gains.size)), np.zeros_like(self._gains)
+        while (ticks := _ticks_until_back(shares)) is None:
+            if shares.shape[0] > MOST_TICKS or not np.abs(shares).max() < BEYOND:
                 return None
-            part = np.concatenate([part, self.follow(nothing, 100, limited=False) / self.edge_um])
-        rest = self.follow(nothing, ticks, limited=False) / self.edge_um
-        found = Return(ticks, _overshoot(np.concatenate([part, rest])))
-        return found if found.overshoot < FURTHEST else None
+            shares = np.concatenate([shares, self.follow(zero_um, 100, limited=False) / self.edge_um])
+        further_shares = self.follow(zero_um, ticks, limited=False) / self.edge_um
+        result = Return(ticks, _overshoot(np.concatenate([shares, further_shares])))
+        return result if result.overshoot < FURTHEST else None
 
     def limited_return(self, saturated_ticks: int, most_ticks: int) -> Return | None:
         """From the limit to 0; None where it is not back after `most_ticks`."""
@@ -90,4 +90,4 @@ def _overshoot(part: Real) -> float:
 def gains_of(model: Any, axes: int) -> Real:
     """Gain at 0 Hz of each axis's model (axes,); 1 where there is none."""
     models = model if isinstance(model, tuple) else (model,) * axes
-    return np.array([1.0 if one is None else one.transfer().dc_gain for one in models])
+    return np.array([1.0 if axis_model is None else axis_model.transfer().dc_gain for axis_model in models])

@@ -27,8 +27,8 @@ Real = npt.NDArray[np.float64]
 
 def linear_part(law: Controller) -> Any:
     """What the law itself says of it, or else what is found. Raises ValueError where nothing can be."""
-    known = law.linear()
-    return linearised(law) if known is None else known
+    declared = law.linear()
+    return linearised(law) if declared is None else declared
 
 
 def linearised(law: Controller) -> Sampled | SampledTogether:
@@ -46,9 +46,9 @@ def linearised(law: Controller) -> Sampled | SampledTogether:
     except (ArithmeticError, IndexError, ValueError) as error:
         raise ValueError(f"at rest it fails: {type(error).__name__}: {error}") from error
     n = tick.size
-    seen = _reached(narrow[:n, :n], narrow[:n, n:]) & _reached(narrow[:n, :n].T, narrow[n:, :n].T)
-    kept = np.concatenate([np.flatnonzero(seen), np.arange(n, len(narrow))])
-    wide, narrow, n = wide[np.ix_(kept, kept)], narrow[np.ix_(kept, kept)], int(seen.sum())
+    is_minimal = _reached(narrow[:n, :n], narrow[:n, n:]) & _reached(narrow[:n, :n].T, narrow[n:, :n].T)
+    indices = np.concatenate([np.flatnonzero(is_minimal), np.arange(n, len(narrow))])
+    wide, narrow, n = wide[np.ix_(indices, indices)], narrow[np.ix_(indices, indices)], int(is_minimal.sum())
     scale = np.abs(wide).max(axis=1, keepdims=True, initial=0.0) + 1e-12
     if not np.all(np.abs(wide - narrow) <= AGREEMENT * scale):
         raise ValueError("it is not smooth at rest")
@@ -60,23 +60,25 @@ def linearised(law: Controller) -> Sampled | SampledTogether:
 
 def _reached(a: Real, b: Real) -> npt.NDArray[np.bool_]:
     """States that an input reaches at all, (n,); with Aᵀ and Cᵀ those that an output sees. Counters are neither."""
-    reached = np.any(b != 0, axis=1)
+    reachable = np.any(b != 0, axis=1)
     while True:
-        wider = reached | np.any((a != 0) & reached, axis=1)
-        if np.array_equal(wider, reached):
-            return reached
-        reached = wider
+        wider = reachable | np.any((a != 0) & reachable, axis=1)
+        if np.array_equal(wider, reachable):
+            return reachable
+        reachable = wider
 
 
 def _derivatives(tick: _Tick, step: float) -> Real:
     """Of the states after a tick and of the commands (n + m,), by the states before it and the errors (n + m)."""
     size = tick.size + tick.axes
-    found = np.zeros((size, size))
+    matrix = np.zeros((size, size))
     for i in range(size):
-        at = np.zeros(size)
-        at[i] = step
-        found[:, i] = (tick(at[: tick.size], at[tick.size :]) - tick(-at[: tick.size], -at[tick.size :])) / (2 * step)
-    return found
+        point = np.zeros(size)
+        point[i] = step
+        matrix[:, i] = (
+            tick(point[: tick.size], point[tick.size :]) - tick(-point[: tick.size], -point[tick.size :])
+        ) / (2 * step)
+    return matrix
 
 
 class _Tick:
@@ -95,20 +97,22 @@ class _Tick:
 
     def __call__(self, states: Real, errors_um: Real) -> Real:
         self._state.view(np.uint8)[:] = 0
-        at = 0
+        offset = 0
         for name in self._fields:
             target = self._state[name].reshape(-1)
-            target[:] = states[at : at + target.size]
-            at += target.size
-        told = records(self._told, 1)
-        told.position_um, told.error_um = -errors_um, errors_um
+            target[:] = states[offset : offset + target.size]
+            offset += target.size
+        control = records(self._told, 1)
+        control.position_um, control.error_um = -errors_um, errors_um
         state = self._state[0]
-        returned = self._output(self._coefficients, state, told[0])
+        returned = self._output(self._coefficients, state, control[0])
         if self.axes == 1:
-            told.command_um = returned
-        told.applied_um = told.command_um
-        self._update(self._coefficients, state, told[0])
-        return np.concatenate([*(self._state[name].reshape(-1) for name in self._fields), told.command_um.reshape(-1)])
+            control.command_um = returned
+        control.applied_um = control.command_um
+        self._update(self._coefficients, state, control[0])
+        return np.concatenate(
+            [*(self._state[name].reshape(-1) for name in self._fields), control.command_um.reshape(-1)]
+        )
 
 
 def as_written(function: Any) -> Callable[..., Any]:

@@ -27,15 +27,15 @@ _LIBRARY = _MATHEMATICS | {
 
 def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, str]:
     """What a compiled kernel calls that a law may not, and why not; `libm` allows the processor's own mathematics."""
-    found = kernel.overloads[signature.args]
-    text = found.library.get_llvm_str()
+    overload = kernel.overloads[signature.args]
+    text = overload.library.get_llvm_str()
     bodies = {match.group(1): match.group(0) for match in _DEFINED.finditer(text)}
-    pending, seen, outside = [found.fndesc.llvm_func_name], set[str](), set[str]()
+    pending, visited, outside = [overload.fndesc.llvm_func_name], set[str](), set[str]()
     while pending:
         name = pending.pop()
-        if name in seen:
+        if name in visited:
             continue
-        seen.add(name)
+        visited.add(name)
         if _CALLED_BY_ADDRESS.search(bodies[name]):
             outside.add(ADDRESS)
         for called in _CALLED.findall(bodies[name]):

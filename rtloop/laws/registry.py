@@ -58,24 +58,24 @@ class LawReference:
 
 def kinds() -> dict[str, str]:
     """Every known kind and where it is defined; a third party cannot replace a built-in kind."""
-    found = {point.name: point.value for point in entry_points(group=GROUP)}
-    return dict(sorted({**found, **BUILT_IN}.items()))
+    installed = {point.name: point.value for point in entry_points(group=GROUP)}
+    return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
 def reference(kind: str) -> LawReference:
     """A shipped law, or an installed one. Raises ValueError for a kind that is not known or cannot be imported."""
     if kind in BUILT_IN:
         return LawReference(kind)
-    known = kinds()
-    if kind not in known:
-        raise ValueError(f"{kind!r} is not a known law; there are {', '.join(known)}")
-    module = known[kind].partition(":")[0]
+    locations = kinds()
+    if kind not in locations:
+        raise ValueError(f"{kind!r} is not a known law; there are {', '.join(locations)}")
+    module = locations[kind].partition(":")[0]
     announce(kind, module)
     try:
         file = inspect.getsourcefile(import_module(module))
         return from_text(Path(file or "").read_text(encoding="utf-8"), str(file), kind)
     except (ImportError, OSError) as error:
-        raise ValueError(f"law {kind!r}, {known[kind]}: cannot be imported: {error}") from error
+        raise ValueError(f"law {kind!r}, {locations[kind]}: cannot be imported: {error}") from error
 
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
@@ -91,15 +91,15 @@ def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 def from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     """The law that a text defines; `kind` says which, where there are several. Raises ValueError."""
     announce(kind or Path(file).stem, file)
-    found = {law.kind: law for law in _laws_in(text, file)}
-    if kind is None and len(found) == 1:
-        return next(iter(found.values()))
-    if kind not in found:
-        if found:
-            raise ValueError(f"{file}: defines {', '.join(found)}; kind says which is meant")
+    laws = {law.kind: law for law in _laws_in(text, file)}
+    if kind is None and len(laws) == 1:
+        return next(iter(laws.values()))
+    if kind not in laws:
+        if laws:
+            raise ValueError(f"{file}: defines {', '.join(laws)}; kind says which is meant")
         reason = missing_law(text, vars(_module(text, file)))
         raise ValueError(f"{file}: defines no law" if reason is None else f"{file}, line {reason.line}: {reason.what}")
-    return found[kind]
+    return laws[kind]
 
 
 def law_class(law: LawReference) -> type[Law]:
@@ -138,8 +138,8 @@ def _module(text: str, file: str) -> ModuleType:
 
 def _classes(module: ModuleType) -> dict[str, type[Law]]:
     """The laws that a module itself defines, by kind."""
-    own = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
-    return {one.kind: one for one in own if issubclass(one, Law) and not inspect.isabstract(one)}
+    classes = [law for law in vars(module).values() if isinstance(law, type) and law.__module__ == module.__name__]
+    return {law.kind: law for law in classes if issubclass(law, Law) and not inspect.isabstract(law)}
 
 
 def _line(error: Exception, file: str) -> str:

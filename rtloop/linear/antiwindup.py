@@ -39,13 +39,13 @@ def antiwindup(system: System, form: Form) -> Real:
     Raises ValueError where the spectral radius is not below 1.
     """
     correction = np.zeros(system.b.size)
-    chosen = _chosen(system, form)
-    if chosen.size == 0:
+    selected = _chosen(system, form)
+    if selected.size == 0:
         return correction
-    part = System(system.a[np.ix_(chosen, chosen)], system.b[chosen], system.c[chosen], system.d)
+    part = System(system.a[np.ix_(selected, selected)], system.b[selected], system.c[selected], system.d)
     spread = _weights(part) @ part.c
     if (weight := float(part.c @ spread)) > 0:
-        correction[chosen] = spread / weight
+        correction[selected] = spread / weight
     radius = _radius(system.a - np.outer(system.a @ correction, system.c))
     if not radius < 1:
         raise ValueError(
@@ -94,32 +94,32 @@ def steady_state_gain(system: System) -> Real:
     for block in blocks(system.a):
         resting[block] = block.stop - block.start == 2 or system.a[block.start, block.start] != 1.0
     gain = np.zeros(system.b.size)
-    kept = np.eye(int(resting.sum())) - system.a[np.ix_(resting, resting)]
-    gain[resting] = np.linalg.solve(kept, system.b[resting])
+    system_matrix = np.eye(int(resting.sum())) - system.a[np.ix_(resting, resting)]
+    gain[resting] = np.linalg.solve(system_matrix, system.b[resting])
     return gain
 
 
 def _chosen(system: System, form: Form) -> npt.NDArray[np.intp]:
     """The states that take up the correction."""
     states = np.arange(system.b.size)
-    seen = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
-    loose = [block for block in blocks(system.a) if _radius(system.a[block, block]) >= 1]
-    if loose:
-        return np.concatenate([states[block] for block in loose])
+    is_observable = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
+    unstable_blocks = [block for block in blocks(system.a) if _radius(system.a[block, block]) >= 1]
+    if unstable_blocks:
+        return np.concatenate([states[block] for block in unstable_blocks])
     if form == "modal":
-        return states if np.any(seen) else states[:0]
-    return next((states[block] for block in blocks(system.a) if np.any(seen[block])), states[:0])
+        return states if np.any(is_observable) else states[:0]
+    return next((states[block] for block in blocks(system.a) if np.any(is_observable[block])), states[:0])
 
 
 def _weights(part: System) -> Real:
     """W, symmetric and positive."""
-    found = blocks(part.a)
-    if len(found) > 1 and any(_radius(part.a[block, block]) >= 1 for block in found):
+    diagonal_blocks = blocks(part.a)
+    if len(diagonal_blocks) > 1 and any(_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):
         return _covariance(part)
     weights = np.empty(part.b.size)
-    for block in found:
-        away = abs(1 - np.linalg.eigvals(part.a[block, block])[0])
-        weights[block] = np.sum(part.b[block] ** 2) / away**2 if len(found) > 1 else 1.0
+    for block in diagonal_blocks:
+        distance = abs(1 - np.linalg.eigvals(part.a[block, block])[0])
+        weights[block] = np.sum(part.b[block] ** 2) / distance**2 if len(diagonal_blocks) > 1 else 1.0
         if block.stop - block.start == 2:  # a section close to a double pole is an uneven rotation
             weights[block.start + 1] *= -part.a[block.start + 1, block.start] / part.a[block.start, block.start + 1]
     return np.diag(np.maximum(weights, 1e-12 * weights.max()) if weights.max() > 0 else weights + 1)

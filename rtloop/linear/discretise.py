@@ -121,8 +121,8 @@ def discretised(
     """The transfer function alone, without what only a controller needs: for plants, too. Raises as `discretise`."""
     _check(period_s, method, prewarp_hz)
     if transfer.gain == 0 or transfer.order == 0:
-        nothing, static = np.empty(0, dtype=complex), _static(transfer)
-        return Discrete(nothing, nothing, static.d, static, "modal")
+        no_roots, static = np.empty(0, dtype=complex), _static(transfer)
+        return Discrete(no_roots, no_roots, static.d, static, "modal")
     if method in ("zoh", "foh"):
         system, form = _held(transfer, period_s, method == "foh")
         zeros, gain = zeros_and_gain(system)
@@ -167,12 +167,14 @@ def _matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, flo
             f"poles: {transfer.poles.real.max():g} rad/s to the right grows beyond all digits in a period of "
             f"{period_s:g} s; at most {SEEN / period_s:g} rad/s is allowed"
         )
-    seen = transfer.zeros.real * period_s <= SEEN
-    zeros, poles = (np.exp(roots * period_s).astype(complex) for roots in (transfer.zeros[seen], transfer.poles))
+    is_representable = transfer.zeros.real * period_s <= SEEN
+    zeros, poles = (
+        np.exp(roots * period_s).astype(complex) for roots in (transfer.zeros[is_representable], transfer.poles)
+    )
     gain = complex(transfer.gain)
-    for root in transfer.zeros[~seen]:
+    for root in transfer.zeros[~is_representable]:
         gain *= -root
-    for root, image in zip(transfer.zeros[seen], zeros, strict=True):
+    for root, image in zip(transfer.zeros[is_representable], zeros, strict=True):
         gain *= -root / (1 - image) if root else 1 / period_s
     for root, image in zip(transfer.poles, poles, strict=True):
         gain *= (1 - image) / -root if root else period_s

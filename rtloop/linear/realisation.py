@@ -52,13 +52,13 @@ class System(NamedTuple):
         powers = np.array(list(accumulate(repeat(self.a, TOGETHER), np.matmul, initial=np.eye(order))))
         ages = np.subtract.outer(np.arange(TOGETHER), np.arange(TOGETHER))
         answers = np.where(ages[..., None] >= 0, (powers[:-1] @ self.b)[ages], 0.0)
-        stretches = np.append(inputs, np.zeros(-inputs.size % TOGETHER)).reshape(-1, TOGETHER)
-        behind = np.einsum("sj,mjn->smn", stretches, answers, optimize=True)
-        before = np.zeros(order)
-        for stretch in behind:
-            stretch += powers[1:] @ before
-            before = stretch[-1]
-        return np.vstack([np.zeros(order), behind.reshape(stretches.size, order)])[: inputs.size]
+        chunks = np.append(inputs, np.zeros(-inputs.size % TOGETHER)).reshape(-1, TOGETHER)
+        chunk_states = np.einsum("sj,mjn->smn", chunks, answers, optimize=True)
+        last_state = np.zeros(order)
+        for chunk in chunk_states:
+            chunk += powers[1:] @ last_state
+            last_state = chunk[-1]
+        return np.vstack([np.zeros(order), chunk_states.reshape(chunks.size, order)])[: inputs.size]
 
 
 def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:
@@ -91,8 +91,8 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
     The poles of largest real part come last in the series: integrators stand first in the state.
     """
     total = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
-    for group, above in _sections(zeros, poles):
-        section = _section(above, group)
+    for group, section_zeros in _sections(zeros, poles):
+        section = _section(section_zeros, group)
         a = np.block([[section.a, np.outer(section.b, total.c)], [np.zeros((total.b.size, group.size)), total.a]])
         b = np.concatenate([section.b * total.d, total.b])
         total = System(a, b, np.concatenate([section.c, section.d * total.c]), section.d * total.d)
@@ -103,8 +103,8 @@ def _section(zeros: Complex, poles: Complex) -> System:
     """One or two poles with as many zeros or fewer, gain 1. Numerators are expanded about the poles, not about 0."""
     if poles.size == 1:
         p = poles[0].real
-        rest, direct = (p - zeros[0].real, 1.0) if zeros.size else (1.0, 0.0)
-        return System(np.array([[p]]), np.ones(1), np.array([rest]), direct)
+        residue, direct = (p - zeros[0].real, 1.0) if zeros.size else (1.0, 0.0)
+        return System(np.array([[p]]), np.ones(1), np.array([residue]), direct)
     first, second = poles
     centre, lag = second.real, first.imag**2
     if first.imag:  # one state follows the other: b = (1, 0), 1/q is reached through `step`
@@ -159,13 +159,13 @@ def scaled(system: System, points: Complex) -> System:
 
 def blocks(a: Real) -> list[slice]:
     """The diagonal blocks (1×1 and 2×2) of an upper quasi-triangular matrix."""
-    found: list[slice] = []
+    slices: list[slice] = []
     row = 0
     while row < a.shape[0]:
         width = 2 if row + 1 < a.shape[0] and a[row + 1, row] != 0 else 1
-        found.append(slice(row, row + width))
+        slices.append(slice(row, row + width))
         row += width
-    return found
+    return slices
 
 
 def row_bands(a: Real) -> npt.NDArray[np.int64]:

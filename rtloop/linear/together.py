@@ -42,20 +42,20 @@ class SystemTogether(NamedTuple):
 def beside_each_other(systems: list[System]) -> SystemTogether:
     """Systems of one input and one output each, none of which knows of the others."""
     return SystemTogether(
-        np.asarray(block_diag(*(one.a for one in systems))),
-        _columns([one.b for one in systems]),
-        _columns([one.c for one in systems]).T,
-        np.diag([one.d for one in systems]),
+        np.asarray(block_diag(*(system.a for system in systems))),
+        _columns([system.b for system in systems]),
+        _columns([system.c for system in systems]).T,
+        np.diag([system.d for system in systems]),
     )
 
 
 def _columns(vectors: list[Real]) -> Real:
     """A column for each vector, which stands in it where its states are."""
-    found, row = np.zeros((sum(vector.size for vector in vectors), len(vectors))), 0
+    matrix, row = np.zeros((sum(vector.size for vector in vectors), len(vectors))), 0
     for column, vector in enumerate(vectors):
-        found[row : row + vector.size, column] = vector
+        matrix[row : row + vector.size, column] = vector
         row += vector.size
-    return found
+    return matrix
 
 
 def tustin(system: SystemTogether, period_s: float, prewarp_hz: float | None = None) -> SystemTogether:

@@ -55,9 +55,9 @@ class Transfer:
         cls, gain: float, numerator: Sequence[npt.ArrayLike] = (), denominator: Sequence[npt.ArrayLike] = ()
     ) -> Transfer:
         """From real polynomials to be multiplied, each a list of coefficients in s, highest power first."""
-        zeros, above = _product("numerator", numerator)
-        poles, below = _product("denominator", denominator)
-        return cls(zeros, poles, float(_finite("gain", gain)) * above / below)
+        zeros, numerator_gain = _product("numerator", numerator)
+        poles, denominator_gain = _product("denominator", denominator)
+        return cls(zeros, poles, float(_finite("gain", gain)) * numerator_gain / denominator_gain)
 
     @classmethod
     def from_transfer_function(cls, numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Transfer:
@@ -189,14 +189,14 @@ def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLi
     matrix = np.atleast_2d(_finite("a", a)) if np.size(a) else np.empty((0, 0))
     column, row, direct = _finite("b", b).ravel(), _finite("c", c).ravel(), _finite("d", d).ravel()
     order = matrix.shape[0]
-    for name, found, allowed in (
+    for name, shape, allowed in (
         ("a", matrix.shape, (order, order)),
         ("b", column.shape, (order,)),
         ("c", row.shape, (order,)),
         ("d", direct.shape, (1,)),
     ):
-        if found != allowed:
-            raise ValueError(f"{name}: shape {found} does not fit; {allowed} is allowed (one input, one output)")
+        if shape != allowed:
+            raise ValueError(f"{name}: shape {shape} does not fit; {allowed} is allowed (one input, one output)")
     return System(matrix, column, row, float(direct[0]))
 
 

@@ -56,7 +56,7 @@ class Recording:
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
             self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated) for reader in readers)
-            self.skipped: list[Range] = [one for reader in readers for one in reader.skipped]
+            self.skipped: list[Range] = [tick_range for reader in readers for tick_range in reader.skipped]
             self.problems += absent_parts(readers)
             self._note_problems(readers)
 
@@ -119,11 +119,11 @@ class Recording:
             for reader in readers:
                 entries = reader.chunks_between(start_s, end_s)
                 for rows in reader.blocks([self.columns[DEADLINE], *names], entries):
-                    inside = (rows[:, 0] >= start_s * 1e9) & (rows[:, 0] <= end_s * 1e9)
-                    if inside.all():
+                    in_interval = (rows[:, 0] >= start_s * 1e9) & (rows[:, 0] <= end_s * 1e9)
+                    if in_interval.all():
                         yield rows[:, 1:]
-                    elif inside.any():
-                        yield rows[inside, 1:]
+                    elif in_interval.any():
+                        yield rows[in_interval, 1:]
 
     def to_pandas(
         self, signals: Sequence[str] = (), start_s: float = 0.0, end_s: float = math.inf, every: int = 1
@@ -164,8 +164,8 @@ class Recording:
 
     def _note_problems(self, readers: Sequence[Reader]) -> None:
         for reader in readers:
-            for mine, found in ((self.problems, reader.problems), (self.left_out, reader.left_out)):
-                mine += [problem for problem in found if problem not in mine]
+            for collected, reader_problems in ((self.problems, reader.problems), (self.left_out, reader.left_out)):
+                collected += [problem for problem in reader_problems if problem not in collected]
 
 
 def load(path: Files) -> Recording:

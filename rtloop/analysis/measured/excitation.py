@@ -34,9 +34,9 @@ def first(grid: Grid, amplitude_um: float) -> Real:
 def shaped(grid: Grid, played: Real, seen: Signals, amplitude_um: float, aim: float) -> Real:
     """A period (samples,) for an added motion of `aim` times `amplitude_um`, by what the one `played` before showed."""
     reference = grid.amplitudes(played)
-    moved, least = _answer(grid, seen.position, reference)
-    asked, _ = _answer(grid, seen.command, reference)
-    return fitting(grid, moved, asked, amplitude_um, aim, least)
+    position_response, min_response = _answer(grid, seen.position, reference)
+    command_response, _ = _answer(grid, seen.command, reference)
+    return fitting(grid, position_response, command_response, amplitude_um, aim, min_response)
 
 
 def fitting(
@@ -49,9 +49,11 @@ def fitting(
     sizes = np.minimum(sizes, LARGEST_REFERENCE * np.median(sizes))
     flat = flattened(grid, sizes * np.maximum(np.abs(moved), 1e-12))
     lines = sizes * np.exp(1j * (np.angle(flat) - np.angle(moved)))
-    peaks = [_peak(grid, lines * one) for one in (moved, asked, np.ones_like(moved))]
-    allowed = (aim, LARGEST_COMMAND, LARGEST_REFERENCE)
-    return grid.waveform(lines) * min(amplitude_um * most / peak for most, peak in zip(allowed, peaks, strict=True))
+    peaks = [_peak(grid, lines * response) for response in (moved, asked, np.ones_like(moved))]
+    peak_ratios = (aim, LARGEST_COMMAND, LARGEST_REFERENCE)
+    return grid.waveform(lines) * min(
+        amplitude_um * peak_ratio / peak for peak_ratio, peak in zip(peak_ratios, peaks, strict=True)
+    )
 
 
 def _answer(grid: Grid, signal: Real, reference: Complex) -> tuple[Complex, Real]:

@@ -89,19 +89,19 @@ def put_together(place: Real, values: Complex, std: Real) -> tuple[Complex, Real
     About each one a parabola over the widest of HALF_WIDTHS whose residuals are no larger than `std` explains; the
     value itself where none is.
     """
-    found, left = values.copy(), std.copy()
+    smoothed, smoothed_std = values.copy(), std.copy()
     for i in range(values.size):
-        for half in HALF_WIDTHS:
-            near = slice(max(i - half, 0), i + half + 1)
-            x = place[near] - place[i]
-            if x.size < half + 3:
+        for half_width in HALF_WIDTHS:
+            window = slice(max(i - half_width, 0), i + half_width + 1)
+            x = place[window] - place[i]
+            if x.size < half_width + 3:
                 break
-            rows = np.vander(x / np.abs(x).max(), 3, increasing=True) / std[near, None]
-            scaled = values[near] / std[near]
+            rows = np.vander(x / np.abs(x).max(), 3, increasing=True) / std[window, None]
+            scaled = values[window] / std[window]
             inverse = np.linalg.pinv(rows)
             solution = inverse @ scaled
             freedom = x.size - 3
             if np.sum(np.abs(scaled - rows @ solution) ** 2) / freedom > 1 + CHANCE / np.sqrt(freedom):
                 break
-            found[i], left[i] = solution[0], float(np.linalg.norm(inverse[0]))
-    return found, left
+            smoothed[i], smoothed_std[i] = solution[0], float(np.linalg.norm(inverse[0]))
+    return smoothed, smoothed_std

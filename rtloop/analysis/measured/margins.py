@@ -39,13 +39,15 @@ class MeasuredMargins:
 def measured_margins(loop: MeasuredLoop, with_moved_mode: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
     """Of a measured loop, and of what it would be with each figure of its light mode off by a standard deviation."""
     half = math.sqrt(0.5)  # of each part of a complex number
-    here, *moved = map(margins, (loop, loop.moved(half), loop.moved(1j * half), *with_moved_mode))
+    nominal, *perturbed = map(margins, (loop, loop.moved(half), loop.moved(1j * half), *with_moved_mode))
 
     def uncertain(name: str) -> Uncertain:
-        value = getattr(here, name)
+        value = getattr(nominal, name)
         if not math.isfinite(value):
             return Uncertain(math.nan, math.nan)
-        return Uncertain(value, math.hypot(*(getattr(one, name) - value for one in moved)))
+        return Uncertain(
+            value, math.hypot(*(getattr(perturbed_margins, name) - value for perturbed_margins in perturbed))
+        )
 
     fields = {name: uncertain(name) for name in Margins._fields}
     peak = fields["max_sensitivity"]

@@ -43,14 +43,14 @@ class Measurement:
 
     def figures(self) -> dict[str, Any]:
         """What status and metrics tell: no curves."""
-        found = self.response
+        measured = self.response
         return plain(
             {
-                "periods": found.periods,
-                "lines": found.hz.size,
-                "from_hz": found.hz[0],
-                "to_hz": found.hz[-1],
-                "moved_um": found.moved_um,
+                "periods": measured.periods,
+                "lines": measured.hz.size,
+                "from_hz": measured.hz[0],
+                "to_hz": measured.hz[-1],
+                "moved_um": measured.moved_um,
                 "margins": self.margins,
                 "resonance": self.mode,
                 "gain": self.gain,
@@ -60,12 +60,12 @@ class Measurement:
 
     def for_json(self) -> dict[str, Any]:
         """Figures, and every line."""
-        found, loop = self.response, self.loop.loop
-        curves = fields_of(found) | {"loop": loop, "loop_spread": self.loop.spread}
+        measured, loop = self.response, self.loop.loop
+        curves = fields_of(measured) | {"loop": loop, "loop_spread": self.loop.spread}
         curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
         curves["sensitivity_spread"] = np.abs(curves["tracking"]) * self.loop.spread
         if self.model is not None:
-            curves["model_loop"] = self.model.open(found.hz)
+            curves["model_loop"] = self.model.open(measured.hz)
             curves["model_sensitivity"] = 1 / (1 + curves["model_loop"])
         return plain(self.figures() | {"response": curves})
 
@@ -73,8 +73,8 @@ class Measurement:
         """Margins that the model has, and how much larger the measured loop's gain is, in the median."""
         if self.model is None:
             return None
-        certain = self.loop.spread < CERTAIN
-        ratio = np.abs(self.loop.loop / self.model.open(self.loop.hz))[certain]
+        is_certain = self.loop.spread < CERTAIN
+        ratio = np.abs(self.loop.loop / self.model.open(self.loop.hz))[is_certain]
         return {"margins": margins(self.model), "gain_ratio": np.median(ratio) if ratio.size else math.nan}
 
 
@@ -98,20 +98,24 @@ def measurement(
     if part is None:
         raise ValueError("reference: no part of it repeats itself twice after settling; a multisine is needed")
     grid = part.grid(reference, rate_hz)
-    whole = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
-    error, command, position = (part.folded(signals[name])[whole] for name in ("error_um", "command_um", "position_um"))
-    past = np.convolve(command_taps or (0.0,), reference)[: reference.size] + signals.get("feed_um", 0.0)
-    found = response(grid, Signals(error, command, position, part.folded(past)[0]))
-    mode = _mode(found, rate_hz, near_hz)
-    loop = measured_loop(found, rate_hz, mode)
-    with_moved_mode = [measured_loop(found, rate_hz, moved) for moved in mode.moved()] if mode else []
-    return Measurement(found, loop, measured_margins(loop, with_moved_mode), mode, model)
+    is_complete = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
+    error, command, position = (
+        part.folded(signals[name])[is_complete] for name in ("error_um", "command_um", "position_um")
+    )
+    direct_um = np.convolve(command_taps or (0.0,), reference)[: reference.size] + signals.get("feed_um", 0.0)
+    measured = response(grid, Signals(error, command, position, part.folded(direct_um)[0]))
+    mode = _mode(measured, rate_hz, near_hz)
+    loop = measured_loop(measured, rate_hz, mode)
+    perturbed_loops = (
+        [measured_loop(measured, rate_hz, perturbed_mode) for perturbed_mode in mode.moved()] if mode else []
+    )
+    return Measurement(measured, loop, measured_margins(loop, perturbed_loops), mode, model)
 
 
 def _mode(found: Response, rate_hz: float, near_hz: float | None) -> LightMode | None:
     if near_hz is None:
-        certain = np.where(found.spread < CERTAIN, np.abs(found.plant), 0.0)
-        near_hz = float(found.hz[np.argmax(certain)])
+        certain_gains = np.where(found.spread < CERTAIN, np.abs(found.plant), 0.0)
+        near_hz = float(found.hz[np.argmax(certain_gains)])
     if np.count_nonzero(np.abs(found.hz / near_hz - 1) <= BAND) < LEAST_LINES:
         return None
     return light_mode(found, rate_hz, near_hz)

@@ -54,13 +54,13 @@ def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BA
     """The mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines there."""
     from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
 
-    kept = np.abs(found.hz / near_hz - 1) <= band
-    if (lines := int(kept.sum())) < LEAST_LINES:
+    in_band = np.abs(found.hz / near_hz - 1) <= band
+    if (lines := int(in_band.sum())) < LEAST_LINES:
         raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; {LEAST_LINES} are needed")
-    hz, plant = found.hz[kept], found.plant[kept]
-    fit = _Fit(hz, plant, np.abs(plant) * found.spread[kept], rate_hz)
-    start = min(((f, z) for f in hz[1:-1:2] for z in DAMPINGS), key=lambda one: _squares(fit.left(*one)))
-    answer = least_squares(
+    hz, plant = found.hz[in_band], found.plant[in_band]
+    fit = _Fit(hz, plant, np.abs(plant) * found.spread[in_band], rate_hz)
+    start = min(((f, z) for f in hz[1:-1:2] for z in DAMPINGS), key=lambda guess: _squares(fit.left(*guess)))
+    solution = least_squares(
         lambda values: _parts(fit.left(*values)),
         start,
         bounds=([hz[0], LEAST_DAMPING], [hz[-1], LARGEST_DAMPING]),
@@ -68,14 +68,14 @@ def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BA
         xtol=1e-12,
         ftol=1e-12,
     )
-    squares = 2 * answer.cost
+    squares = 2 * solution.cost
     freedom = 2 * lines - 2 * (BACKGROUND + 1) - 2
     scale = max(squares / freedom, 1e-300)
     if (_squares(fit.smooth_left()) - squares) / scale < CLEAR:
         return None
     # a complex residual of standard deviation 1 has parts of variance ½
-    std = np.sqrt(np.diag(np.linalg.inv(answer.jac.T @ answer.jac)) * max(0.5, scale))
-    f, z = answer.x
+    std = np.sqrt(np.diag(np.linalg.inv(solution.jac.T @ solution.jac)) * max(0.5, scale))
+    f, z = solution.x
     return LightMode(
         float(f), float(std[0]), float(z), float(std[1]), float(hz[0]), float(hz[-1]), float(np.sqrt(2 * scale))
     )

@@ -73,12 +73,12 @@ def grid(
         raise ValueError(f"{from_hz:g} … {to_hz:g} Hz: {odd.size} odd lines of {rate_hz / samples:g} Hz; 3 are needed")
     decades = np.log10(odd[-1] / odd[0])
     targets = np.geomspace(odd[0], odd[-1], max(2, round(PER_DECADE * decades)))
-    chosen = np.unique(odd[np.abs(odd[:, None] - targets[None, :]).argmin(axis=0)])
+    candidates = np.unique(odd[np.abs(odd[:, None] - targets[None, :]).argmin(axis=0)])
     if near_hz is not None:
         line = near_hz * samples / rate_hz
-        chosen = np.union1d(chosen, odd[np.abs(odd - line) <= NEAR * line])
-    left_out = _left_out(chosen, np.random.default_rng(seed))
-    excited = np.setdiff1d(chosen, left_out)
+        candidates = np.union1d(candidates, odd[np.abs(odd - line) <= NEAR * line])
+    silent_candidates = _left_out(candidates, np.random.default_rng(seed))
+    excited = np.setdiff1d(candidates, silent_candidates)
     silent = np.setdiff1d(np.arange(max(1, odd[0] - 1), odd[-1] + 2), excited)
     return Grid(samples, rate_hz, excited, silent)
 
@@ -93,15 +93,15 @@ def _left_out(chosen: Lines, random: np.random.Generator) -> Lines:
 def flattened(grid: Grid, sizes: Real, seed: int = 0) -> Complex:
     """Amplitudes of these `sizes` (excited,) with phases that keep the peak of the waveform low."""
     phases: Complex = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
-    best, lowest = sizes * phases, np.inf
+    lowest_crest, lowest_peak = sizes * phases, np.inf
     for _ in range(FLATTENINGS):
         wave = grid.waveform(sizes * phases)
         peak = float(np.abs(wave).max())
-        if peak < lowest:
-            best, lowest = sizes * phases, peak
+        if peak < lowest_peak:
+            lowest_crest, lowest_peak = sizes * phases, peak
         clipped = grid.amplitudes(np.clip(wave, -CLIPPED * peak, CLIPPED * peak))
         phases = np.exp(1j * np.angle(clipped))
-    return best
+    return lowest_crest
 
 
 def played(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:

@@ -54,8 +54,8 @@ def periodic_part(reference: Real) -> Periodic | None:
 
     Of equally long ones it is the last.
     """
-    found = [part for start, end in _stretches(reference) if (part := _repeating(reference, start, end))]
-    return max(reversed(found), key=lambda part: part.samples * part.periods, default=None)
+    parts = [part for start, end in _stretches(reference) if (part := _repeating(reference, start, end))]
+    return max(reversed(parts), key=lambda part: part.samples * part.periods, default=None)
 
 
 def _stretches(reference: Real) -> list[tuple[int, int]]:
@@ -71,17 +71,21 @@ def _stretches(reference: Real) -> list[tuple[int, int]]:
 def _repeating(reference: Real, start: int, end: int) -> Periodic | None:
     part = reference[start:end]
     middle = part.size // 2
-    again = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES
-    for samples in again.tolist():
+    candidate_periods = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES
+    for samples in candidate_periods.tolist():
         if middle + samples + COMPARED > part.size:
             return None
         if np.array_equal(part[middle : middle + COMPARED], part[middle + samples : middle + samples + COMPARED]):
             break
     else:
         return None
-    differs = np.flatnonzero(part[:-samples] != part[samples:])
-    first = int(differs[differs < middle][-1]) + 1 if np.any(differs < middle) else 0
-    last = (int(differs[differs > middle][0]) if np.any(differs > middle) else part.size - samples) + samples
+    difference_ticks = np.flatnonzero(part[:-samples] != part[samples:])
+    first = int(difference_ticks[difference_ticks < middle][-1]) + 1 if np.any(difference_ticks < middle) else 0
+    last = (
+        int(difference_ticks[difference_ticks > middle][0])
+        if np.any(difference_ticks > middle)
+        else part.size - samples
+    ) + samples
     periods = (last - first) // samples
     if first < SETTLING * samples:
         periods -= 1

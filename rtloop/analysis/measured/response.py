@@ -63,18 +63,18 @@ def response(grid: Grid, signals: Signals) -> Response:
     periods = len(signals.position)
     if periods < 2:
         raise ValueError(f"{periods} periods; at least 2 are needed")
-    x, v, e = (grid.amplitudes(one) for one in (signals.position, signals.command, signals.error))
-    past = 0.0 if signals.direct is None else grid.amplitudes(signals.direct)
-    mean_x, mean_v, mean_e = (one.mean(axis=0) for one in (x, v, e))
+    x, v, e = (grid.amplitudes(signal) for signal in (signals.position, signals.command, signals.error))
+    direct = 0.0 if signals.direct is None else grid.amplitudes(signals.direct)
+    mean_x, mean_v, mean_e = (signal.mean(axis=0) for signal in (x, v, e))
     if not (np.all(mean_v) and np.all(mean_e) and np.all(mean_x)):
         raise ValueError("the loop does not answer: command, error or position stands still")
     variance = (np.abs(x - mean_x) ** 2).sum(axis=0) / (periods - 1)
     noise = _smooth(variance / periods)
     total = np.maximum(_at_silent_lines(grid, signals.position.mean(axis=0)), noise)
-    plant, controller = mean_x / mean_v, (mean_v - past) / mean_e
+    plant, controller = mean_x / mean_v, (mean_v - direct) / mean_e
     factor = np.abs(1 + plant * controller) / np.abs(mean_x)
     power = np.abs(mean_x) ** 2
-    about = signals.position - signals.position.mean()
+    deviation = signals.position - signals.position.mean()
     return Response(
         grid.hz,
         plant,
@@ -83,7 +83,7 @@ def response(grid: Grid, signals: Signals) -> Response:
         factor * np.sqrt(noise),
         power / (power + _smooth(variance)),
         periods,
-        float(np.abs(about).max()),
+        float(np.abs(deviation).max()),
     )
 
 

@@ -68,12 +68,16 @@ def frequency_response(
             f"{u.size * period_s:g} s; a frequency response needs at least {2 * segment_s:g} s of excitation"
         )
     settings = {"fs": 1 / period_s, "nperseg": samples, "noverlap": 3 * samples // 4}
-    by = u if instrument is None else instrument
-    hz, cross = csd(by, x, **settings)
-    moved, inputs, outputs = csd(by, u, **settings)[1], welch(by, **settings)[1], welch(x, **settings)[1]
-    inside = (hz > 0) & (inputs > 1e-12 * inputs.max()) & (np.abs(moved) > 0)
-    coherence = np.abs(cross[inside]) ** 2 / (inputs[inside] * np.maximum(outputs[inside], 1e-300))
-    return FrequencyResponse(hz[inside], np.asarray(cross[inside] / moved[inside], dtype=complex), coherence)
+    reference = u if instrument is None else instrument
+    hz, cross = csd(reference, x, **settings)
+    input_cross, inputs, outputs = (
+        csd(reference, u, **settings)[1],
+        welch(reference, **settings)[1],
+        welch(x, **settings)[1],
+    )
+    excited = (hz > 0) & (inputs > 1e-12 * inputs.max()) & (np.abs(input_cross) > 0)
+    coherence = np.abs(cross[excited]) ** 2 / (inputs[excited] * np.maximum(outputs[excited], 1e-300))
+    return FrequencyResponse(hz[excited], np.asarray(cross[excited] / input_cross[excited], dtype=complex), coherence)
 
 
 def measured_response(run: Excitation) -> FrequencyResponse:

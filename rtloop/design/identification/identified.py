@@ -41,9 +41,9 @@ def model_section(fit: DynamicsFit, comments: Sequence[str]) -> str:
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
     """The keys of [axis.model]."""
-    d = fit.transfer
-    found = {"form": "zpk", "gain": d.gain, "zeros": roots(d.zeros), "poles": roots(d.poles)}
-    return {**found, "delay_ticks": fit.delay_ticks}
+    transfer = fit.transfer
+    values = {"form": "zpk", "gain": transfer.gain, "zeros": roots(transfer.zeros), "poles": roots(transfer.poles)}
+    return {**values, "delay_ticks": fit.delay_ticks}
 
 
 def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[str]:
@@ -95,17 +95,17 @@ def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOp
 def feedforward_of(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
     """The same, from TOML text. Raises ConfigError."""
     try:
-        found: Any = parse_toml(content).get("axis")
+        table: Any = parse_toml(content).get("axis")
     except ValueError as error:
         raise ConfigError(source, [str(error)]) from None
-    if isinstance(found, list):
-        found = next((one for one in found if isinstance(one, dict) and axis in (None, one.get("name"))), None)
-    if not isinstance(found, dict) or "feedforward" not in found:
+    if isinstance(table, list):
+        table = next((entry for entry in table if isinstance(entry, dict) and axis in (None, entry.get("name"))), None)
+    if not isinstance(table, dict) or "feedforward" not in table:
         raise ConfigError(source, [f"axis.feedforward: missing{f' for axis {axis!r}' if axis else ''}; it is needed"])
     try:
-        return PrandtlIshlinskiiOptions.model_validate(found["feedforward"])
+        return PrandtlIshlinskiiOptions.model_validate(table["feedforward"])
     except ValidationError as error:
-        raise ConfigError(source, describe(error, "axis.feedforward", found["feedforward"])) from None
+        raise ConfigError(source, describe(error, "axis.feedforward", table["feedforward"])) from None
 
 
 def write_new(path: Path, content: str) -> None:

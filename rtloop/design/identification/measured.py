@@ -69,20 +69,20 @@ def measured(path: Path, axis: str | None = None) -> Measured:
         raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
     if "flags" in recording:
         _refuse_trip(path, recording["flags"])
-    reading = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
-    require_usable(str(path), drive, position, recording[reading])
+    reading_name = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
+    require_usable(str(path), drive, position, recording[reading_name])
     intervals = np.diff(deadlines)
     if not np.all(intervals > 0):
         raise UnsuitableData(f"{path}: time stands still or goes back at tick {int(np.argmax(intervals <= 0)) + 1}")
     period_ns = float(np.median(intervals))
-    missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
-    even = not missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
+    any_missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
+    is_even = not any_missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
     command = f"{axis}_command_um"
-    given = recording[command] if command in recording else np.full(drive.size, np.nan)
+    commands = recording[command] if command in recording else np.full(drive.size, np.nan)
     if "imported" in recording.header:
-        drive, given, position, deadlines = drive[1:], given[1:], position[:-1], deadlines[1:]
+        drive, commands, position, deadlines = drive[1:], commands[1:], position[:-1], deadlines[1:]
     return Measured(
-        str(path), period_ns * 1e-9, drive, position, given, even, recording.configuration, _digest(recording.paths),
+        str(path), period_ns * 1e-9, drive, position, commands, is_even, recording.configuration, _digest(recording.paths),
         deadlines * 1e-9,
     )  # fmt: skip
 
@@ -110,9 +110,9 @@ def _ticks_of(run: Measured) -> str:
 
 
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
-    absent = [name for name in names if name not in recording]
-    if absent:
-        raise UnsuitableData(f"{path}: it has no {', '.join(absent)}; identification needs them")
+    missing = [name for name in names if name not in recording]
+    if missing:
+        raise UnsuitableData(f"{path}: it has no {', '.join(missing)}; identification needs them")
     return recording.read(*names)
 
 
@@ -130,9 +130,9 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
             f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
             f"at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm is needed: drive further"
         )
-    if (where := _clipped(drive_v, adc_v)) is not None:
+    if (tick := _clipped(drive_v, adc_v)) is not None:
         raise UnsuitableData(
-            f"{name}: saturated: the reading stands still at {adc_v[where]:.6g} V from tick {where} on while it should "
+            f"{name}: saturated: the reading stands still at {adc_v[tick]:.6g} V from tick {tick} on while it should "
             "move; a smaller drive, or a sensor or converter of larger range, is needed"
         )
 
@@ -157,15 +157,15 @@ def noise_of(position: Real) -> float:
 def _clipped(drive: Real, adc: Real) -> int | None:
     """First tick of a plateau at an extreme that is none of the signal's own, or None. A rest at the start is."""
     changes = np.abs(np.diff(adc))
-    usual = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
+    usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
     for extreme in (adc.max(), adc.min()):
-        at = adc == extreme
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]])))
+        at_extreme = adc == extreme
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], at_extreme, [False]])))
         for start, end in edges.reshape(-1, 2):
             if start == 0 or end - start < PLATEAU_TICKS:
                 continue
-            into, out_of = changes[start - 1], changes[end - 1] if end < adc.size else 0.0
-            if max(into, out_of) > PLATEAU_JUMP * usual:
+            change_before, change_after = changes[start - 1], changes[end - 1] if end < adc.size else 0.0
+            if max(change_before, change_after) > PLATEAU_JUMP * usual_change:
                 return int(start)
             if np.ptp(drive[start:end]) > PLATEAU_DRIVE * np.ptp(drive):
                 return int(start)
@@ -173,10 +173,10 @@ def _clipped(drive: Real, adc: Real) -> int | None:
 
 
 def _refuse_trip(path: Path, flags: Real) -> None:
-    tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
-    if not np.any(tripped):
+    is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
+    if not np.any(is_tripped):
         return
-    first = int(np.argmax(np.isin(flags, np.unique(flags)[tripped])))
+    first = int(np.argmax(np.isin(flags, np.unique(flags)[is_tripped])))
     raise UnsuitableData(
         f"{path}: the run tripped at tick {first} ({', '.join(trip_causes(flags[first]))}); one to the end is needed "
         "(a smaller drive, or interlocks that allow this one)"

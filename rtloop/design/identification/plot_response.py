@@ -52,8 +52,8 @@ def _with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
 
 
 def _complex(pairs: Any) -> Complex:
-    found = np.array(pairs, dtype=float)
-    return found[:, 0] + 1j * found[:, 1]
+    parts = np.array(pairs, dtype=float)
+    return parts[:, 0] + 1j * parts[:, 1]
 
 
 def _told(found: Mapping[str, float | None]) -> str:

@@ -31,22 +31,22 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
 
     Raises OutputError, MissingExtra.
     """
-    figure, (loop, in_time, over_drive) = figure_of(1, 3, (17, 5))
-    for i, one in enumerate(judgements):
-        name = {"label": Path(one.name).name} if len(judgements) > 1 else {}
+    figure, (loop_panel, time_panel, drive_panel) = figure_of(1, 3, (17, 5))
+    for i, judgement in enumerate(judgements):
+        name = {"label": Path(judgement.name).name} if len(judgements) > 1 else {}
         color = f"C{i}"
-        position, time_s = one.position_um - one.offset_um, one.time_s - one.time_s[0]
-        loop.plot(one.drive_v, position, color=color, linewidth=2, **({"label": "measured"} | name))
+        position, time_s = judgement.position_um - judgement.offset_um, judgement.time_s - judgement.time_s[0]
+        loop_panel.plot(judgement.drive_v, position, color=color, linewidth=2, **({"label": "measured"} | name))
         model = {"label": "model, held out"} if i == len(judgements) - 1 else {}
-        loop.plot(one.drive_v, position - one.error_um, color="0.15", linewidth=0.8, **model)
-        in_time.plot(time_s, one.error_um, color=color, linewidth=0.8, **name)
-        over_drive.plot(one.drive_v, one.error_um, color=color, linewidth=0.8)
-        in_time.plot(time_s, one.early_um, color=color, linewidth=0.8, alpha=0.3)
-    label(loop, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
+        loop_panel.plot(judgement.drive_v, position - judgement.error_um, color="0.15", linewidth=0.8, **model)
+        time_panel.plot(time_s, judgement.error_um, color=color, linewidth=0.8, **name)
+        drive_panel.plot(judgement.drive_v, judgement.error_um, color=color, linewidth=0.8)
+        time_panel.plot(time_s, judgement.early_um, color=color, linewidth=0.8, alpha=0.3)
+    label(loop_panel, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
-    rms_um = float(np.sqrt(np.mean([one.rms_um**2 for one in judgements if one.judged_part])))
-    label(in_time, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1)
-    label(over_drive, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
+    rms_um = float(np.sqrt(np.mean([judgement.rms_um**2 for judgement in judgements if judgement.judged_part])))
+    label(time_panel, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1)
+    label(drive_panel, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
     save(figure, output)
 
 
@@ -57,14 +57,14 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     count = min(run.input.size, POINTS)
     time_s = np.arange(count) * run.period_s
     time.plot(time_s, run.position_um[:count], color="tab:blue", linewidth=2, label="measured")
-    left = left_by(fit.model, run) if isinstance(run, LoopExcitation) else None
-    modelled = fit.model.output(run.input) + offset if left is None else run.position_um - left
+    residual_um = left_by(fit.model, run) if isinstance(run, LoopExcitation) else None
+    modelled = fit.model.output(run.input) + offset if residual_um is None else run.position_um - residual_um
     time.plot(time_s, modelled[:count], color="0.15", linewidth=0.8, label="model")
     label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
     if measured is not None:
-        kept = measured.trusted
-        shown = np.abs(measured.response[kept])
-        frequency.loglog(measured.hz[kept], shown, ".", color="tab:blue", markersize=3, label="measured")
+        trusted = measured.trusted
+        magnitude = np.abs(measured.response[trusted])
+        frequency.loglog(measured.hz[trusted], magnitude, ".", color="tab:blue", markersize=3, label="measured")
     hz = np.geomspace(1.0, 0.5 / run.period_s, 4000)
     response = fit.model.discrete().response(np.exp(2j * np.pi * hz * run.period_s))[0]
     frequency.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
@@ -75,16 +75,16 @@ def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
     """y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
-    figure, (whole, rest) = figure_of(1, 2)
+    figure, (output_panel, residual_panel) = figure_of(1, 2)
     command: Real = residual.command_um * np.sin(np.linspace(0, 5 * np.pi, 4000))
     y = compensated(actuator, inverse, command)
-    whole.plot(command, y, color="tab:blue", linewidth=1)
-    label(whole, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
+    output_panel.plot(command, y, color="tab:blue", linewidth=1)
+    label(output_panel, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
     bound = residual.bound_um(residual.gain)
-    rest.plot(command, y - residual.gain * command, color="tab:red", linewidth=1, label="Ω of a sine")
+    residual_panel.plot(command, y - residual.gain * command, color="tab:red", linewidth=1, label="Ω of a sine")
     for sign in (-1, 1):
-        rest.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
-    label(rest, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
+        residual_panel.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
+    label(residual_panel, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
     save(figure, output)
 
 

@@ -34,15 +34,15 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
         names["feed_um"] = f"{axis}_feed_um"
     # all in one pass: a recording may still be growing
     signals: dict[str, Real] = dict(zip(names, recording.read(*names.values()), strict=True))
-    configured = tomllib.loads(recording.configuration)
-    described = next(one for one in configured["axis"] if one["name"] == axis)
-    of_rig = configured["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == IN_STEP else 0
-    model, known, taps = None, None, described.get("prefilter", {}).get("command_taps", ())
+    configuration = tomllib.loads(recording.configuration)
+    axis_table = next(table for table in configuration["axis"] if table["name"] == axis)
+    rig_ticks = configuration["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == IN_STEP else 0
+    model, model_resonance, taps = None, None, axis_table.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
-        options = AxisOptions.model_validate(described)
-        model = promised_loop(options, rate_hz, loop_delay_ticks(options, of_rig))
-        known = options.model and resonance_hz(options.model.transfer())
-    near_hz = near_hz or (known[0] if known else None)
+        options = AxisOptions.model_validate(axis_table)
+        model = promised_loop(options, rate_hz, loop_delay_ticks(options, rig_ticks))
+        model_resonance = options.model and resonance_hz(options.model.transfer())
+    near_hz = near_hz or (model_resonance[0] if model_resonance else None)
     try:
         return measurement(signals, rate_hz, near_hz, model, taps)
     except ValueError as fault:

@@ -47,41 +47,41 @@ class Certificate(NamedTuple):
         """What is not kept, in words; nothing where all is."""
         if not self.is_stable:
             return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]
-        asked = [
+        checks = [
             ("max |S|", self.sensitivity, walls.sensitivity),
             (f"|S| at {walls.disturbance_hz:g} Hz", self.disturbance, walls.disturbance),
             ("noise gain into v", self.noise_gain, walls.noise_gain),
             ("slowest mode around a resonance, in ms,", self.decay_ms, decay_ms or math.inf),
         ]
         return [
-            f"{name} is {found.value:.4g} with {found.scenario}; at most {limit:.4g} is asked for"
-            for name, found, limit in asked
-            if found.value > limit * (1 + 1e-9)
+            f"{name} is {case.value:.4g} with {case.scenario}; at most {limit:.4g} is asked for"
+            for name, case, limit in checks
+            if case.value > limit * (1 + 1e-9)
         ]
 
     def worst(self) -> list[Scenario]:
         """The scenarios that are worst in something, each once."""
-        return list(dict.fromkeys(found.scenario for found in self[1:]))
+        return list(dict.fromkeys(case.scenario for case in self[1:]))
 
 
 def certified(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
     """Of a controller, over sweeps and random draws of a family's plants."""
     scenarios = dict.fromkeys([*family.corners(), *family.swept(SWEPT), *family.drawn(DRAWN, seed)])
-    found = {scenario: _measured(controller, family, walls, scenario) for scenario in scenarios}
-    worst = [Worst(*max((values[i], scenario) for scenario, values in found.items())) for i in range(5)]
-    return Certificate(len(found), *worst)
+    measures = {scenario: _measured(controller, family, walls, scenario) for scenario in scenarios}
+    cases = [Worst(*max((values[i], scenario) for scenario, values in measures.items())) for i in range(5)]
+    return Certificate(len(measures), *cases)
 
 
 def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
     """Time constant in ms of the slowest closed-loop mode in one of the bands (rad/s), of all where one is empty."""
     if not loop.is_stable:
         return math.inf
-    sizes, listed = np.abs(loop.rates.imag), list(bands)
-    counted = np.full(sizes.shape, not listed)
-    for low, high in listed:
-        within = (sizes >= low) & (sizes <= high)
-        counted |= within if within.any() else True
-    return float(np.max(-1e3 / loop.rates.real[counted], initial=0.0))
+    sizes, all_bands = np.abs(loop.rates.imag), list(bands)
+    is_counted = np.full(sizes.shape, not all_bands)
+    for low, high in all_bands:
+        is_in_band = (sizes >= low) & (sizes <= high)
+        is_counted |= is_in_band if is_in_band.any() else True
+    return float(np.max(-1e3 / loop.rates.real[is_counted], initial=0.0))
 
 
 def noise_gain(loop: Loop) -> float:

@@ -70,31 +70,31 @@ def designed_robustly(
     with what is missed. The specification is one that `require_enough` lets through.
     """
     _require_plays(stage, design)
-    asked = stage.asked(design)
-    asked, found = _controller(asked, progress)
-    comments = provenance(found, asked, spec_name, spec_text)
-    parts = {"controller": written_values(found, asked)}
-    plain = text_with(stage, parts, comments, axis, spec_name)
-    configuration, findings = parse(plain, "designed", folder, spec_name), Findings()
+    final_design = stage.asked(design)
+    final_design, controller = _controller(final_design, progress)
+    comments = provenance(controller, final_design, spec_name, spec_text)
+    parts = {"controller": written_values(controller, final_design)}
+    plain_text = text_with(stage, parts, comments, axis, spec_name)
+    configuration, findings = parse(plain_text, "designed", folder, spec_name), Findings()
     checks = check_axes(configuration, findings)
-    chosen = next(one for one in configuration.axes if axis in (None, one.name))
-    check = next(one for one in checks if one.name == chosen.name)
+    axis_options = next(entry for entry in configuration.axes if axis in (None, entry.name))
+    check = next(entry for entry in checks if entry.name == axis_options.name)
     try:
-        subject = subject_of(chosen, check, _with_taps(asked, found.family))
+        subject = subject_of(axis_options, check, _with_taps(final_design, controller.family))
     except ValueError as error:
-        raise NoDesign(f"axis.{chosen.name}.{error}") from None
-    subject = _within_command(subject, asked)
+        raise NoDesign(f"axis.{axis_options.name}.{error}") from None
+    subject = _within_command(subject, final_design)
     subject, taps = _taps(subject, "scenarios" in design.shape.model_fields_set, progress)
     comments += taps_provenance(taps, subject, spec_name)
     text = text_with(stage, {**parts, "prefilter": taps_values(taps.taps)}, comments, axis, spec_name)
-    return RobustChain(stage, asked, found, subject, taps), text
+    return RobustChain(stage, final_design, controller, subject, taps), text
 
 
 def require_enough(design: DesignOptions, source: str) -> None:
     """Before minutes are spent. Raises ConfigError."""
-    asked = design.specification
-    faults = lacking(asked)
-    if asked.disturbance is not None and asked.disturbance.up_to_hz is None:
+    specification = design.specification
+    faults = lacking(specification)
+    if specification.disturbance is not None and specification.disturbance.up_to_hz is None:
         faults.append("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
     if faults:
         raise ConfigError(source, faults)
@@ -126,16 +126,16 @@ def _controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions
     """The controller for the widest range that has one. Raises NoDesign."""
     asked = _with_disturbance(asked)
     *wider, last = _ranges(asked)
-    for one in wider:
+    for narrowed in wider:
         try:
-            return one, _damped(one, progress)
+            return narrowed, _damped(narrowed, progress)
         except NoController as error:
-            progress(f"±{one.scenarios.resonance_percent:g} % is too wide: {error}")
+            progress(f"±{narrowed.scenarios.resonance_percent:g} % is too wide: {error}")
     try:
         return last, _damped(last, progress)
     except (NoController, ValueError) as error:
-        tried = "" if not wider else f"not even for resonances within ±{last.scenarios.resonance_percent:g} %: "
-        raise NoDesign(f"{tried}{error}") from None
+        prefix = "" if not wider else f"not even for resonances within ±{last.scenarios.resonance_percent:g} %: "
+        raise NoDesign(f"{prefix}{error}") from None
 
 
 def _damped(asked: DesignOptions, progress: Progress) -> Robust:
@@ -143,16 +143,16 @@ def _damped(asked: DesignOptions, progress: Progress) -> Robust:
 
     Raises NoController.
     """
-    found = robust_controller(asked, progress)
-    if asked.robust.decay_ms is None and found.family.leading:
-        hz, damping = _lightest(found)
+    robust = robust_controller(asked, progress)
+    if asked.robust.decay_ms is None and robust.family.leading:
+        hz, damping = _lightest(robust)
         if damping < LEAST_DAMPING:
             raise NoController(
                 f"robust: {hz:.4g} Hz keep ringing, with a damping of {damping:.2g} in closed loop; {LEAST_DAMPING:g} "
                 "is needed, or what the inverse leaves excites them in every step. Modes that are so close, so light "
                 "or so late need more than this controller; robust.decay_ms, a time that is accepted, lets it pass"
             )
-    return found
+    return robust
 
 
 def _lightest(found: Robust) -> tuple[float, float]:
@@ -161,9 +161,9 @@ def _lightest(found: Robust) -> tuple[float, float]:
     controller = discretise(found.controller, family.period_s, "matched")
     rates = discrete_loop(controller, family.plant(family.nominal), family.nominal.delay_ticks).rates
     sizes, leading = np.abs(rates), np.abs(family.modes[list(family.leading)])
-    within = rates[(sizes > leading.min() / ABOUT) & (sizes < leading.max() * ABOUT)]
-    lightest = min(within, key=lambda rate: -rate.real / abs(rate), default=complex(-1.0))
-    return abs(lightest) / (2 * math.pi), float(-lightest.real / abs(lightest))
+    nearby = rates[(sizes > leading.min() / ABOUT) & (sizes < leading.max() * ABOUT)]
+    least_damped = min(nearby, key=lambda rate: -rate.real / abs(rate), default=complex(-1.0))
+    return abs(least_damped) / (2 * math.pi), float(-least_damped.real / abs(least_damped))
 
 
 def _ranges(asked: DesignOptions) -> Iterator[DesignOptions]:
@@ -184,20 +184,20 @@ def _with_disturbance(asked: DesignOptions) -> DesignOptions:
     period_s = 1 / asked.controller.rate_hz
     family = Family(asked.plant.transfer(), asked.plant.delay_ticks, asked.scenarios, period_s)
     slowest_hz = _slowest_hz(family)
-    held = DisturbanceOptions(largest_um=1.0, error_um=HELD, up_to_hz=slowest_hz / SLOWER)
-    return asked.model_copy(update={"specification": specification.model_copy(update={"disturbance": held})})
+    disturbance = DisturbanceOptions(largest_um=1.0, error_um=HELD, up_to_hz=slowest_hz / SLOWER)
+    return asked.model_copy(update={"specification": specification.model_copy(update={"disturbance": disturbance})})
 
 
 def _with_taps(asked: DesignOptions, family: Family) -> DesignOptions:
     """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, in
     a band that leaves room for what is not linear."""
     shape: ShapeOptions = asked.shape
-    lasting = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
-    taps = min(max(lasting, shape.taps), MOST_TAPS)
+    needed_taps = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
+    taps = min(max(needed_taps, shape.taps), MOST_TAPS)
     points = max(FEWEST_POINTS, shape.points_per_tick * shape.taps // taps)
-    open_ones = {"taps": taps, "points_per_tick": points, "band_percent": NARROW_PERCENT}
-    given = {name: value for name, value in open_ones.items() if name not in shape.model_fields_set}
-    return asked.model_copy(update={"shape": shape.model_copy(update=given)})
+    defaults = {"taps": taps, "points_per_tick": points, "band_percent": NARROW_PERCENT}
+    unset = {name: value for name, value in defaults.items() if name not in shape.model_fields_set}
+    return asked.model_copy(update={"shape": shape.model_copy(update=unset)})
 
 
 def _slowest_hz(family: Family) -> float:
@@ -222,9 +222,9 @@ def _taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject
     if is_asked:
         return subject, shaped(subject, progress=progress)
     *wider, last = [subject.around(percent) for percent in TAPS_RANGES_PERCENT]
-    for one in wider:
+    for narrowed in wider:
         try:
-            return one, shaped(one, progress=progress)
+            return narrowed, shaped(narrowed, progress=progress)
         except NoDesign as error:
-            progress(f"taps for ±{one.options.scenarios.resonance_percent:g} %: {error}")
+            progress(f"taps for ±{narrowed.options.scenarios.resonance_percent:g} %: {error}")
     return last, shaped(last, progress=progress)

@@ -63,18 +63,18 @@ def bounds(sections: int) -> tuple[Real, Real]:
 def candidates(points: Real) -> Candidates:
     """Controllers of points (k, 2 + 4m) within their bounds."""
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
-    above = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
-    below = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
-    return Candidates(np.exp(points[:, 0]), 1 - np.exp(points[:, 1]), above, below)
+    numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
+    denominators = _coefficients(np.exp(sections[..., 2]), np.exp(sections[..., 3]))
+    return Candidates(np.exp(points[:, 0]), 1 - np.exp(points[:, 1]), numerators, denominators)
 
 
 def transfer_of(point: Real, period_s: float) -> Transfer:
     """C(s) of which the method "matched" makes C(z) again, root by root: none stands at infinity or on a fold."""
     sections = point[2:].reshape(-1, 4)
-    above = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
-    below = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]
-    zeros: Complex = np.array([math.log1p(-math.exp(point[1])), *above]) / complex(period_s)
-    poles: Complex = np.array([0.0, *below]) / complex(period_s)
+    zero_rates = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
+    pole_rates = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]
+    zeros: Complex = np.array([math.log1p(-math.exp(point[1])), *zero_rates]) / complex(period_s)
+    poles: Complex = np.array([0.0, *pole_rates]) / complex(period_s)
     image = discretised(Transfer(zeros, poles, 1.0), period_s, "matched")
     return Transfer(zeros, poles, math.exp(point[0]) / image.gain)
 

@@ -51,7 +51,9 @@ class Objective:
         self.walls, self.period_s = walls, family.period_s
         self.low, self.high = bounds(sections)
         self.bands = family.bands if family.modes.size else np.array([[0.0, np.inf]])
-        plants = [sampled_plant(family.plant(one), family.period_s, one.delay_ticks) for one in scenarios]
+        plants = [
+            sampled_plant(family.plant(scenario), family.period_s, scenario.delay_ticks) for scenario in scenarios
+        ]
         self.plants = _alike(plants)
         hz, self.shares = _grid(family, walls)
         self.z = np.exp(2j * np.pi * hz * family.period_s)
@@ -59,32 +61,32 @@ class Objective:
 
     def __call__(self, points: Real) -> Real:
         """Costs (k,) of points (k, n); outside the bounds what the nearest point within costs, and the distance."""
-        within = np.clip(points, self.low, self.high)
-        found, walls = self.measured(within), self.walls
-        beyond = [(found.sensitivity, walls.sensitivity), (found.noise_gain, walls.noise_gain)]
+        clipped = np.clip(points, self.low, self.high)
+        measures, walls = self.measured(clipped), self.walls
+        limited = [(measures.sensitivity, walls.sensitivity), (measures.noise_gain, walls.noise_gain)]
         if walls.disturbance_hz:
-            beyond.append((found.disturbance, walls.disturbance))
+            limited.append((measures.disturbance, walls.disturbance))
         with np.errstate(invalid="ignore"):
-            excess = sum(np.maximum(0, np.log(value / (INSIDE * limit))) for value, limit in beyond)
-            decay = np.log(np.maximum(found.decay_s / self.period_s, 1.0))
+            excess = sum(np.maximum(0, np.log(value / (INSIDE * limit))) for value, limit in limited)
+            decay = np.log(np.maximum(measures.decay_s / self.period_s, 1.0))
             cost = 0.5 * (decay.max(axis=1) + decay.mean(axis=1)) + STEEP * excess
-        cost = np.where((found.radius < 1) & np.isfinite(cost), cost, FAR * (1 + np.minimum(found.radius, FAR)))
-        return cost + np.sum((points - within) ** 2, axis=1)
+        cost = np.where((measures.radius < 1) & np.isfinite(cost), cost, FAR * (1 + np.minimum(measures.radius, FAR)))
+        return cost + np.sum((points - clipped) ** 2, axis=1)
 
     def measured(self, points: Real) -> Measures:
         """The worst of every quantity for points (k, n) within the bounds."""
-        chosen = candidates(points)
-        images = self._poles(*chosen.matrices())
-        rates = np.log(np.maximum(np.abs(images), 1e-300)) / self.period_s
-        sizes = np.abs(np.angle(images)) / self.period_s
-        constants = -1 / np.minimum(rates, -1e-9)
-        decay = np.stack([_slowest(constants, sizes, low, high) for low, high in self.bands], axis=1)
-        controller = chosen.response(self.z)
+        controllers = candidates(points)
+        z_poles = self._poles(*controllers.matrices())
+        rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s
+        sizes = np.abs(np.angle(z_poles)) / self.period_s
+        time_constants = -1 / np.minimum(rates, -1e-9)
+        decay = np.stack([_slowest(time_constants, sizes, low, high) for low, high in self.bands], axis=1)
+        controller = controllers.response(self.z)
         sensitivity = 1 / np.abs(1 + controller[:, None] * self.responses)
         noise = np.sqrt((np.abs(controller[:, None]) * sensitivity) ** 2 @ self.shares)
         at_disturbance = sensitivity[:, :, 0] if self.walls.disturbance_hz else np.zeros(sensitivity.shape[:2])
         return Measures(
-            np.abs(images).max(axis=(1, 2)),
+            np.abs(z_poles).max(axis=(1, 2)),
             decay,
             sensitivity.max(axis=(1, 2)),
             at_disturbance.max(axis=1),
@@ -105,9 +107,9 @@ class Objective:
 
 def _slowest(constants: Real, sizes: Real, low: float, high: float) -> Real:
     """The largest of time constants (k, scenarios, n) whose poles lie in a band, of all where none does, (k,)."""
-    counted = (sizes >= low) & (sizes <= high)
-    counted |= ~counted.any(axis=2, keepdims=True)
-    return np.where(counted, constants, 0.0).max(axis=(1, 2))
+    is_counted = (sizes >= low) & (sizes <= high)
+    is_counted |= ~is_counted.any(axis=2, keepdims=True)
+    return np.where(is_counted, constants, 0.0).max(axis=(1, 2))
 
 
 def _alike(plants: Sequence[System]) -> tuple[Real, Real, Real]:

@@ -23,8 +23,10 @@ def picture(found: Shaped, subject: Subject, title: str) -> bytes:
     FigureCanvasAgg(figure)
     trade, position, command = figure.subplots(3, 1)
     if found.curve:
-        settling, least = np.array(found.curve).T
-        trade.semilogy(settling, 100 * np.maximum(least, 1e-6), color=RUN_TIME, marker="o", label="least overshoot")
+        settling, overshoots = np.array(found.curve).T
+        trade.semilogy(
+            settling, 100 * np.maximum(overshoots, 1e-6), color=RUN_TIME, marker="o", label="least overshoot"
+        )
     trade.axhline(100 * subject.overshoot, color=TEMPLATE, linestyle="--", label="overshoot, as specified")
     trade.axvline(found.settling_ms, color=PAPER_TIME, linestyle=":", label="chosen")
     trade.set_xlabel("settling time / ms, in every scenario")

@@ -71,17 +71,17 @@ class Programme:
         self.taps, self.points, self.band = taps, points, band
         self.ticks = found[0].command.shape[1]
         self.time = np.tile(np.arange(1, self.ticks * points + 1) / points, len(found))
-        position = np.vstack([self._rows(one.position, points) for one in found])
-        self.command = np.vstack([self._rows(one.command, 1) for one in found])
+        position = np.vstack([self._rows(response.position, points) for response in found])
+        self.command = np.vstack([self._rows(response.command, 1) for response in found])
         self.rows = np.vstack([position, self.command])
-        static = np.repeat([one.static_command for one in found], self.ticks)
+        static = np.repeat([response.static_command for response in found], self.ticks)
         self.low, self.high = bounds.command(static)
         self.undershoot = bounds.undershoot
         self.active = np.zeros(self.rows.shape[0], bool)
-        first = np.concatenate([self.time, np.tile(np.arange(self.ticks), len(found))]) <= taps
+        is_within_taps = np.concatenate([self.time, np.tile(np.arange(self.ticks), len(found))]) <= taps
         self.active[: self.time.size : EVERY * points] = True
         self.active[self.time.size :: EVERY] = True
-        self.active &= first
+        self.active &= is_within_taps
         self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
 
     def feasible(self, settling: float, overshoot: float) -> bool:
@@ -105,13 +105,13 @@ class Programme:
         return Taps(solved[: self.taps], solved[self.taps : 2 * self.taps], float(solved[2 * self.taps]))
 
     def _rows(self, steps: Real, points: int) -> Real:
-        return np.hstack([columns(one, self.taps, points) for one in steps])
+        return np.hstack([columns(step, self.taps, points) for step in steps])
 
     def _solved(self, settling: float, cost: Real, overshoot: float | None, sized: Real | None = None) -> Real | None:
         """Variables: taps, ε, and the absolute value of each row of `sized` times the taps."""
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
-        settled = self.time >= settling - 1e-9
-        low = np.concatenate([np.where(settled, 1 - INSIDE * self.band, -self.undershoot), self.low])
+        is_settled = self.time >= settling - 1e-9
+        low = np.concatenate([np.where(is_settled, 1 - INSIDE * self.band, -self.undershoot), self.low])
         high = np.concatenate([np.full(self.time.size, 1.0), self.high])
         slack = np.concatenate([np.ones(self.time.size), np.zeros(self.command.shape[0])])
         rows = self.rows
@@ -119,25 +119,25 @@ class Programme:
         limits += [(0.0, INSIDE * (self.band if overshoot is None else overshoot)), *[(0.0, None)] * extra]
         static = np.concatenate([self.static, np.zeros(1 + extra)])[None]
         while True:
-            chosen = np.flatnonzero(self.active)
-            above = [
-                np.hstack([rows[chosen], -slack[chosen, None]]),
-                np.hstack([-rows[chosen], np.zeros((chosen.size, 1))]),
+            rows_used = np.flatnonzero(self.active)
+            parts = [
+                np.hstack([rows[rows_used], -slack[rows_used, None]]),
+                np.hstack([-rows[rows_used], np.zeros((rows_used.size, 1))]),
             ]
-            limit = np.concatenate([high[chosen], -low[chosen], np.zeros(2 * extra)])
-            matrix = np.vstack([np.hstack([part, np.zeros((chosen.size, extra))]) for part in above])
+            limit = np.concatenate([high[rows_used], -low[rows_used], np.zeros(2 * extra)])
+            matrix = np.vstack([np.hstack([part, np.zeros((rows_used.size, extra))]) for part in parts])
             if sized is not None:
                 matrix = np.vstack([matrix, *_sizes(sized)])
-            found = _optimum(cost, matrix, limit, static, limits)
-            if found is None:
+            solution = _optimum(cost, matrix, limit, static, limits)
+            if solution is None:
                 return None
-            values = rows @ found[: count - 1]
-            broken = np.maximum(values - high - slack * found[count - 1], low - values)
-            broken[self.active] = 0.0
-            new = np.flatnonzero(broken > TOLERANCE)
-            if not new.size:
-                return found
-            self.active[_peaks(broken, new)] = True
+            values = rows @ solution[: count - 1]
+            violation = np.maximum(values - high - slack * solution[count - 1], low - values)
+            violation[self.active] = 0.0
+            new_rows = np.flatnonzero(violation > TOLERANCE)
+            if not new_rows.size:
+                return solution
+            self.active[_peaks(violation, new_rows)] = True
 
     def _judged_rows(self) -> Real:
         """What should be small, times the taps: the changes of v on the model, and the taps themselves."""
@@ -147,8 +147,8 @@ class Programme:
 
 def _sizes(rows: Real) -> tuple[Real, Real]:
     """Rows that say −s ≤ rows·taps ≤ s, of variables taps, ε, s."""
-    between, sizes = np.zeros((rows.shape[0], 1)), -np.eye(rows.shape[0])
-    return np.hstack([rows, between, sizes]), np.hstack([-rows, between, sizes])
+    overshoot_column, sizes = np.zeros((rows.shape[0], 1)), -np.eye(rows.shape[0])
+    return np.hstack([rows, overshoot_column, sizes]), np.hstack([-rows, overshoot_column, sizes])
 
 
 def _optimum(
@@ -161,7 +161,7 @@ def _optimum(
     part of a second for. A row may be missed at the price DEAREST, so that there always is an answer; where one is
     missed, no answer keeps them all.
     """
-    low, high = np.array([(least, np.inf if most is None else most) for least, most in limits]).T
+    low, high = np.array([(lower, np.inf if upper is None else upper) for lower, upper in limits]).T
     bounded, identity = np.isfinite(high), np.eye(cost.size)
     rows = np.vstack([above, identity[bounded], -identity])
     allowed = np.concatenate([limit, high[bounded], -low])
@@ -173,13 +173,13 @@ def _optimum(
             options={"presolve": presolve},
         )  # fmt: skip
         if result.status == 0:
-            found = np.asarray(result.eqlin.marginals, dtype=float)
-            return found if np.max(rows @ found - allowed) <= MISSED else None
+            multipliers = np.asarray(result.eqlin.marginals, dtype=float)
+            return multipliers if np.max(rows @ multipliers - allowed) <= MISSED else None
     raise ArithmeticError(f"the linear programme was not solved: {result.message}")
 
 
 def _peaks(broken: Real, new: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
     """Of rows that are broken, the worst of each run of neighbours, and not too many."""
-    before, after = np.r_[0.0, broken[:-1]], np.r_[broken[1:], 0.0]
-    peaks = new[(broken[new] >= before[new]) & (broken[new] >= after[new])]
+    previous, following = np.r_[0.0, broken[:-1]], np.r_[broken[1:], 0.0]
+    peaks = new[(broken[new] >= previous[new]) & (broken[new] >= following[new])]
     return peaks[np.argsort(-broken[peaks])[:MOST_NEW]]

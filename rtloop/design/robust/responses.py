@@ -52,8 +52,8 @@ def responses(
 def horizon(controller: DiscreteController | Sampled, family: Family, scenarios: list[Scenario], taps: int) -> int:
     """Ticks after which the slowest mode of all scenarios' loops has died away behind the last tap."""
     radius = 0.0
-    for one in scenarios:
-        a, *_ = _joined(controller, family.plant(one), one.delay_ticks, 1)
+    for scenario in scenarios:
+        a, *_ = _joined(controller, family.plant(scenario), scenario.delay_ticks, 1)
         radius = max(radius, float(np.max(np.abs(np.linalg.eigvals(a)))))
     decay = -1 / math.log(radius) if 0 < radius < 1 else 0.0
     return min(taps + 20 + math.ceil(TIME_CONSTANTS * decay), MOST_TICKS)
@@ -73,27 +73,27 @@ def _joined(
     States: controller, commands on their way, plant.
     """
     ac, bc, cc, dc = controller.system
-    fine = held(plant, controller.period_s / points)
-    nc, n = bc.size, fine.b.size
-    place, order = nc + delay_ticks, nc + delay_ticks + n
-    seen = np.zeros(order)
-    seen[place:] = fine.c
-    command = np.concatenate([cc, np.zeros(order - nc)]) - dc * seen
+    fine_plant = held(plant, controller.period_s / points)
+    nc, n = bc.size, fine_plant.b.size
+    plant_start, order = nc + delay_ticks, nc + delay_ticks + n
+    output_row = np.zeros(order)
+    output_row[plant_start:] = fine_plant.c
+    command = np.concatenate([cc, np.zeros(order - nc)]) - dc * output_row
     direct = np.array([dc, 1.0])
-    oldest = np.eye(order)[nc] if delay_ticks else command
+    oldest_command = np.eye(order)[nc] if delay_ticks else command
     oldest_direct = np.zeros(2) if delay_ticks else direct
-    within, within_direct = np.eye(n, order, place), np.zeros((n, 2))
+    plant_rows, plant_direct = np.eye(n, order, plant_start), np.zeros((n, 2))
     rows, rows_direct = [command], [direct]
     for _ in range(points):
-        within = fine.a @ within + np.outer(fine.b, oldest)
-        within_direct = fine.a @ within_direct + np.outer(fine.b, oldest_direct)
-        rows.append(fine.c @ within)
-        rows_direct.append(fine.c @ within_direct)
+        plant_rows = fine_plant.a @ plant_rows + np.outer(fine_plant.b, oldest_command)
+        plant_direct = fine_plant.a @ plant_direct + np.outer(fine_plant.b, oldest_direct)
+        rows.append(fine_plant.c @ plant_rows)
+        rows_direct.append(fine_plant.c @ plant_direct)
     a, b = np.zeros((order, order)), np.zeros((order, 2))
-    a[:nc, :nc], a[:nc, place:], b[:nc, 0] = ac, -np.outer(bc, fine.c), bc
+    a[:nc, :nc], a[:nc, plant_start:], b[:nc, 0] = ac, -np.outer(bc, fine_plant.c), bc
     for i in range(delay_ticks):
         last = i + 1 == delay_ticks
         a[nc + i] = command if last else np.eye(order)[nc + i + 1]
         b[nc + i] = direct if last else 0.0
-    a[place:], b[place:] = within, within_direct
+    a[plant_start:], b[plant_start:] = plant_rows, plant_direct
     return a, b, np.array(rows), np.array(rows_direct)

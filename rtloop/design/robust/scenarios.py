@@ -28,9 +28,9 @@ class Scenario(NamedTuple):
     delay_ticks: int
 
     def __str__(self) -> str:
-        moved = [f"resonance {'/'.join(f'{percent:+.3g}' for percent in self.resonance)} %"] if self.resonance else []
+        parts = [f"resonance {'/'.join(f'{percent:+.3g}' for percent in self.resonance)} %"] if self.resonance else []
         return ", ".join(
-            [*moved, f"damping × {self.damping:.3g}", f"gain {self.gain:+.3g} %", f"delay_ticks {self.delay_ticks}"]
+            [*parts, f"damping × {self.damping:.3g}", f"gain {self.gain:+.3g} %", f"delay_ticks {self.delay_ticks}"]
         )
 
 
@@ -59,8 +59,8 @@ class Family:
         poles, gain = self.model.poles.copy(), self.model.gain * (1 + scenario.gain / 100)
         for mode, percent in zip(self.modes, scenario.resonance, strict=True):
             size, ratio = abs(mode) * (1 + percent / 100), -mode.real / abs(mode) * scenario.damping
-            moved = size * complex(-ratio, np.sqrt(max(1 - ratio**2, 0.0)))
-            poles[self.model.poles == mode], poles[self.model.poles == np.conj(mode)] = moved, np.conj(moved)
+            shifted = size * complex(-ratio, np.sqrt(max(1 - ratio**2, 0.0)))
+            poles[self.model.poles == mode], poles[self.model.poles == np.conj(mode)] = shifted, np.conj(shifted)
             gain *= (size / abs(mode)) ** 2
         return Transfer(self.model.zeros, poles, gain)
 
@@ -79,22 +79,22 @@ class Family:
         dampings = sorted({ends[0], ends[-1]})
         shifts = self._shifts(-r, 0.0, r)
         halfway = self._shifts(-r / 2, r / 2) if self.modes.size else []
-        found = [self.nominal]
+        scenarios = [self.nominal]
         for ticks in self.delays:
-            found += [
-                Scenario(*one, ticks) for one in itertools.product(shifts, dampings, sorted({-g, g}))
+            scenarios += [
+                Scenario(*combination, ticks) for combination in itertools.product(shifts, dampings, sorted({-g, g}))
             ]  # fmt: skip
-            found += [Scenario(shift, ends[0], gain, ticks) for shift in halfway for gain in sorted({-g, g})]
-        return list(dict.fromkeys(found))
+            scenarios += [Scenario(shift, ends[0], gain, ticks) for shift in halfway for gain in sorted({-g, g})]
+        return list(dict.fromkeys(scenarios))
 
     def _shifts(self, *places: float) -> list[tuple[float, ...]]:
         """Every combination for the leading modes, the others as in the model; all modes moved together."""
-        found = []
-        for combined in itertools.product(sorted({*places}), repeat=len(self.leading)):
+        shifts = []
+        for percents in itertools.product(sorted({*places}), repeat=len(self.leading)):
             shift = np.zeros(self.modes.size)
-            shift[list(self.leading)] = combined
-            found.append(tuple(shift.tolist()))
-        return [*dict.fromkeys([*found, *((place,) * self.modes.size for place in sorted({*places}))])]
+            shift[list(self.leading)] = percents
+            shifts.append(tuple(shift.tolist()))
+        return [*dict.fromkeys([*shifts, *((place,) * self.modes.size for place in sorted({*places}))])]
 
     def swept(self, count: int) -> Iterator[Scenario]:
         """All light modes moved together, `count` places, at every corner of damping, gain and delay."""

@@ -57,36 +57,36 @@ def robust_controller(design: DesignOptions, progress: Progress = lambda _: None
         raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
     options, period_s = design.robust, 1 / design.controller.rate_hz
     family = Family(plant, design.plant.delay_ticks, design.scenarios, period_s)
-    walls = searched = walls_of(design)
+    walls = search_walls = walls_of(design)
     scenarios = family.corners()
     random = np.random.default_rng(options.seed)
-    best, rounds = None, 0
+    minimum, rounds = None, 0
     while True:
         rounds += 1
-        objective = Objective(family, scenarios, searched, options.biquads)
-        if best is None:
-            best = _searched(objective, design, random, progress)
+        objective = Objective(family, scenarios, search_walls, options.biquads)
+        if minimum is None:
+            minimum = _searched(objective, design, random, progress)
         else:
-            best = minimise(objective, best.point, 0.05, options.generations, random)
-        if best.cost >= FAR:
+            minimum = minimise(objective, minimum.point, 0.05, options.generations, random)
+        if minimum.cost >= FAR:
             raise NoController(
                 f"robust: no controller of order {1 + 2 * options.biquads} found that is stable in all of "
                 f"{len(scenarios)} scenarios; a smaller scenarios.resonance_percent, fewer delay_ticks, or more "
                 "robust.restarts would help"
             )
-        point = np.clip(best.point, *bounds(options.biquads))
+        point = np.clip(minimum.point, *bounds(options.biquads))
         controller = transfer_of(point, period_s)
         proof = certified(discretise(controller, period_s, "matched"), family, walls, options.seed)
-        missed = proof.missed(walls, options.decay_ms)
-        progress(f"proof over {proof.plants} plants: " + ("; ".join(missed) or "everything is kept"))
-        if not missed or rounds == ROUNDS:
+        violations = proof.missed(walls, options.decay_ms)
+        progress(f"proof over {proof.plants} plants: " + ("; ".join(violations) or "everything is kept"))
+        if not violations or rounds == ROUNDS:
             break
         scenarios = list(dict.fromkeys([*scenarios, *proof.worst()]))
-        searched = _tightened(searched, walls, proof)
-    if missed:
+        search_walls = _tightened(search_walls, walls, proof)
+    if violations:
         raise NoController(
             "robust: the best controller found misses: "
-            + "; ".join(missed)
+            + "; ".join(violations)
             + ". More room there, a smaller [scenarios], more robust.restarts or biquads would help"
         )
     return Robust(controller, family, walls, proof, len(scenarios))
@@ -122,23 +122,25 @@ def minimise(
 
 def walls_of(design: DesignOptions) -> Walls:
     """From [robust] and from the disturbance of a specification. Raises ValueError for one without up_to_hz."""
-    options, asked = design.robust, design.specification.disturbance
-    if asked is None:
+    options, disturbance = design.robust, design.specification.disturbance
+    if disturbance is None:
         return Walls(options.largest_sensitivity, options.noise_gain, 1.0, 0.0)
-    if asked.up_to_hz is None:
+    if disturbance.up_to_hz is None:
         raise ValueError("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
-    if asked.up_to_hz >= design.controller.rate_hz / 2:
-        raise ValueError(f"specification.disturbance.up_to_hz: {asked.up_to_hz:g} Hz; below half the rate is allowed")
+    if disturbance.up_to_hz >= design.controller.rate_hz / 2:
+        raise ValueError(
+            f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; below half the rate is allowed"
+        )
     return Walls(
-        options.largest_sensitivity, options.noise_gain, asked.error_um / asked.largest_um, asked.up_to_hz
+        options.largest_sensitivity, options.noise_gain, disturbance.error_um / disturbance.largest_um, disturbance.up_to_hz
     )  # fmt: skip
 
 
 def _tightened(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
     """Walls for another round, lower by what a proof found beyond them: a peak may stand between a search's points."""
-    found = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
+    cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
-    factors = [min(1.0, limit / worst.value) if math.isfinite(worst.value) else 1.0 for worst, limit in found]
+    factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
     sensitivity, noise, disturbance = (max(factor, LEAST_TIGHTENED) for factor in factors)
     return Walls(
         max(1.0, sensitivity * searched.sensitivity), noise * searched.noise_gain, disturbance * searched.disturbance,
@@ -148,17 +150,17 @@ def _tightened(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
 
 def _searched(objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress) -> Minimum:
     """The best of `restarts` short searches of which some go on."""
-    options, found = design.robust, list[Minimum]()
+    options, minima = design.robust, list[Minimum]()
     for number in range(options.restarts):
         points = _anywhere(objective, options.biquads, random)
         start = points[np.argmin(objective(points))]
-        found.append(minimise(objective, start, 0.3, max(1, options.generations // SHORT), random))
-        progress(f"search {number + 1} of {options.restarts}: {_words(objective, found[-1])}")
-    found.sort(key=lambda one: one.cost)
-    for number, one in enumerate(found[:TAKEN_ON]):
-        found.append(minimise(objective, one.point, 0.1, options.generations, random))
-        progress(f"continued {number + 1} of {min(TAKEN_ON, len(found))}: {_words(objective, found[-1])}")
-    return min(found, key=lambda one: one.cost)
+        minima.append(minimise(objective, start, 0.3, max(1, options.generations // SHORT), random))
+        progress(f"search {number + 1} of {options.restarts}: {_words(objective, minima[-1])}")
+    minima.sort(key=lambda minimum: minimum.cost)
+    for number, minimum in enumerate(minima[:TAKEN_ON]):
+        minima.append(minimise(objective, minimum.point, 0.1, options.generations, random))
+        progress(f"continued {number + 1} of {min(TAKEN_ON, len(minima))}: {_words(objective, minima[-1])}")
+    return min(minima, key=lambda minimum: minimum.cost)
 
 
 def _anywhere(objective: Objective, sections: int, random: np.random.Generator) -> Real:

@@ -25,9 +25,9 @@ def robust_configuration(
     found: Robust, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
     """A whole configuration, around a simulated rig of the plant."""
-    written = design.model_copy(update={"controller": _output(design)})
+    written_design = design.model_copy(update={"controller": _output(design)})
     lines = provenance(found, design, source, text)
-    return configuration_around(found.controller, written, lines, axis, specification)
+    return configuration_around(found.controller, written_design, lines, axis, specification)
 
 
 def with_controller(text: str, found: Robust, design: DesignOptions, source: str, spec_text: str, axis: str) -> str:
@@ -41,8 +41,8 @@ def with_controller(text: str, found: Robust, design: DesignOptions, source: str
 def with_taps(text: str, found: Shaped, subject: Subject, source: str, axis: str, specification: str | None) -> str:
     """A configuration's `text` with both rows of taps in its axis, whose specification stands at `specification`."""
     values = taps_values(found.taps)
-    beside = {} if specification is None else {"specification": specification}
-    return _with(text, axis, {"prefilter": values, **beside}, taps_provenance(found, subject, source))
+    reference = {} if specification is None else {"specification": specification}
+    return _with(text, axis, {"prefilter": values, **reference}, taps_provenance(found, subject, source))
 
 
 def taps_section(found: Shaped, subject: Subject, source: str) -> str:
@@ -57,10 +57,10 @@ def taps_values(taps: Taps) -> dict[str, Any]:
 
 def taps_provenance(found: Shaped, subject: Subject, source: str) -> list[str]:
     """Where taps come from, a line each."""
-    around, proof = subject.options.scenarios, found.proof
+    options, proof = subject.options.scenarios, found.proof
     return [
         f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
-        f"±{around.resonance_percent:g} %",
+        f"±{options.resonance_percent:g} %",
         f"on {found.proved} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ {100 * proof.overshoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
     ]
@@ -89,19 +89,19 @@ def provenance(found: Robust, design: DesignOptions, source: str, text: str) -> 
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
         f"plant: {formula(design.plant.transfer())}",
         f"worst of {found.certificate.plants} plants:",
-        *(f"  {name} {value:.4g} ({where})" for name, value, where in kept(found.certificate)),
+        *(f"  {name} {value:.4g} ({scenario})" for name, value, scenario in kept(found.certificate)),
     ]
 
 
 def _with(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
-    raw = tomllib.loads(text)
-    names = [one.get("name") for one in raw.get("axis", [])]
+    table = tomllib.loads(text)
+    names = [entry.get("name") for entry in table.get("axis", [])]
     if axis not in names:
         raise ValueError(
             f"axis: {axis!r} is not in the configuration, which has {', '.join(map(str, names)) or 'none'}"
         )
-    raw["axis"] = [{**one, **parts} if one.get("name") == axis else one for one in raw["axis"]]
-    return edited(_without(text, comments[0]), raw, comments)
+    table["axis"] = [{**entry, **parts} if entry.get("name") == axis else entry for entry in table["axis"]]
+    return edited(_without(text, comments[0]), table, comments)
 
 
 def _without(text: str, heading: str) -> str:

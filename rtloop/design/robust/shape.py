@@ -92,11 +92,11 @@ def shaped(
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.swept(PLACES)]))
-    fastest, rounds, aim = 0.0, 0, subject.overshoot
+    fastest, rounds, allowed_overshoot = 0.0, 0, subject.overshoot
     while True:
         rounds += 1
         programme = programme_of(subject, scenarios)
-        fastest = fastest_settling(programme, aim, fastest)
+        fastest = fastest_settling(programme, allowed_overshoot, fastest)
         if fastest is None:
             raise NoDesign(_no_taps(subject, programme))
         progress(
@@ -110,28 +110,38 @@ def shaped(
                 f"shape.settling_ms: {options.settling_ms:g} ms cannot be reached in all scenarios with overshoot ≤ "
                 f"{100 * subject.overshoot:g} %; the fastest is {fastest * tick_ms:.4g} ms. {_binding(subject)}"
             )
-        taps = programme.quietest(settling, aim)
+        taps = programme.quietest(settling, allowed_overshoot)
         if taps is None:
             raise NoDesign(
                 f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help"
             )
-        judged = {one: judged_of(subject, taps, one) for one in dict.fromkeys([*scenarios, *family.swept(PROVED)])}
-        worst = [max(judged, key=lambda one, i=i: judged[one][i]) for i in range(3)]
-        new = [one for one in dict.fromkeys(worst) if one not in scenarios]
-        kept = _worst(judged.values())
-        settled = kept.settling_ms <= (settling + 1 / options.points_per_tick) * tick_ms
-        if settled and kept.overshoot <= subject.overshoot and kept.excess <= EXCESS:
+        measures = {
+            scenario: judged_of(subject, taps, scenario)
+            for scenario in dict.fromkeys([*scenarios, *family.swept(PROVED)])
+        }
+        worst_scenarios = [max(measures, key=lambda scenario, i=i: measures[scenario][i]) for i in range(3)]
+        new_scenarios = [scenario for scenario in dict.fromkeys(worst_scenarios) if scenario not in scenarios]
+        proof = _worst(measures.values())
+        is_settled = proof.settling_ms <= (settling + 1 / options.points_per_tick) * tick_ms
+        if is_settled and proof.overshoot <= subject.overshoot and proof.excess <= EXCESS:
             break
         if rounds == ROUNDS:
-            raise NoDesign(_unproved(subject, settling * tick_ms, kept, len(judged)))
-        scenarios += new
-        if kept.overshoot > subject.overshoot:
-            aim *= INSIDE * subject.overshoot / kept.overshoot
+            raise NoDesign(_unproved(subject, settling * tick_ms, proof, len(measures)))
+        scenarios += new_scenarios
+        if proof.overshoot > subject.overshoot:
+            allowed_overshoot *= INSIDE * subject.overshoot / proof.overshoot
     time, position, command = _steps(subject, taps, family.nominal)
-    drawn = trade_off(programme, fastest, tick_ms) if curve else ()
+    curve_points = trade_off(programme, fastest, tick_ms) if curve else ()
     variation = float(np.sum(np.abs(np.diff(command, prepend=0.0))))
     return Shaped(
-        taps, settling * tick_ms, fastest * tick_ms, variation, kept, len(judged), (time, position, command), drawn
+        taps,
+        settling * tick_ms,
+        fastest * tick_ms,
+        variation,
+        proof,
+        len(measures),
+        (time, position, command),
+        curve_points,
     )
 
 
@@ -139,8 +149,12 @@ def programme_of(subject: Subject, scenarios: list[Scenario]) -> Programme:
     """The linear programme over scenarios, the model first. Raises NoDesign where a loop is not stable."""
     family, options = subject.family(), subject.options
     ticks = horizon(subject.controller, family, scenarios, options.taps)
-    found = [_answered(subject, family, one, options.points_per_tick, ticks) for one in scenarios]
-    return Programme(found, options.taps, options.points_per_tick, subject.bounds, options.band_percent / 100)
+    scenario_responses = [
+        _answered(subject, family, scenario, options.points_per_tick, ticks) for scenario in scenarios
+    ]
+    return Programme(
+        scenario_responses, options.taps, options.points_per_tick, subject.bounds, options.band_percent / 100
+    )
 
 
 def fastest_settling(programme: Programme, overshoot: float, at_least: float = 0.0) -> float | None:
@@ -169,18 +183,18 @@ def fastest_settling(programme: Programme, overshoot: float, at_least: float = 0
 
 def trade_off(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
     """Least ε for settling times around `fastest` ticks, from where it is the whole band."""
-    found: list[tuple[float, float]] = []
+    points: list[tuple[float, float]] = []
     for place in np.unique(np.round(np.linspace(*CURVE) * fastest * programme.points)):
         taps = programme.least_overshoot(place / programme.points)
         if taps is not None:
-            found.append((float(place) / programme.points * tick_ms, taps.overshoot))
-    return tuple(found)
+            points.append((float(place) / programme.points * tick_ms, taps.overshoot))
+    return tuple(points)
 
 
 def _worst(found: Iterable[Judged]) -> Judged:
     """Of each quantity."""
-    settling, over, excess, under, low, high = (np.array(values) for values in zip(*found, strict=True))
-    largest = (float(one.max()) for one in (settling, over, excess, under))
+    settling, overshoot, excess, undershoot, low, high = (np.array(values) for values in zip(*found, strict=True))
+    largest = (float(column.max()) for column in (settling, overshoot, excess, undershoot))
     return Judged(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
 
@@ -189,24 +203,24 @@ def judged_of(subject: Subject, taps: Taps, scenario: Scenario) -> Judged:
     time, position, command = _steps(subject, taps, scenario)
     low, high = subject.bounds.command(np.array(1 / subject.family().plant(scenario).dc_gain))
     excess = float(max(command.max() - high, low - command.min()))
-    outside = np.flatnonzero(np.abs(position - 1) > BAND)
-    settled = float(time[min(outside[-1] + 1, time.size - 1)]) if outside.size else 0.0
-    over, under = max(0.0, float(position.max()) - 1), max(0.0, -float(position.min()))
-    return Judged(1e3 * settled, over, excess, under, float(command.min()), float(command.max()))
+    unsettled = np.flatnonzero(np.abs(position - 1) > BAND)
+    settled_s = float(time[min(unsettled[-1] + 1, time.size - 1)]) if unsettled.size else 0.0
+    overshoot, undershoot = max(0.0, float(position.max()) - 1), max(0.0, -float(position.min()))
+    return Judged(1e3 * settled_s, overshoot, excess, undershoot, float(command.min()), float(command.max()))
 
 
 def _steps(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
     """Times in s, x at them, and v at the ticks after a unit step, PROOF_POINTS points a tick."""
     family, count = subject.family(), taps.reference.size
     ticks = horizon(subject.controller, family, [scenario], count)
-    found = _answered(subject, family, scenario, PROOF_POINTS, ticks)
+    loop_responses = _answered(subject, family, scenario, PROOF_POINTS, ticks)
     position: Real = np.zeros(ticks * PROOF_POINTS)
     command: Real = np.zeros(ticks)
     for part, row in enumerate((taps.reference, taps.command)):
         spread = np.zeros((count - 1) * PROOF_POINTS + 1)
         spread[::PROOF_POINTS] = row
-        position = position + np.convolve(spread, found.position[part])[: position.size].real
-        command = command + np.convolve(row, found.command[part])[: command.size].real
+        position = position + np.convolve(spread, loop_responses.position[part])[: position.size].real
+        command = command + np.convolve(row, loop_responses.command[part])[: command.size].real
     time = np.arange(1, position.size + 1) / PROOF_POINTS * subject.controller.period_s
     return time, position, command
 
@@ -221,11 +235,11 @@ def _answered(subject: Subject, family: Family, scenario: Scenario, points: int,
 def _no_taps(subject: Subject, programme: Programme) -> str:
     """Why no settling time will do."""
     longest = int(LONGEST * programme.taps)
-    tick_ms, found = 1e3 * subject.controller.period_s, programme.least_overshoot(longest)
-    if found is not None:
+    tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot(longest)
+    if best_taps is not None:
         return (
             f"specification.overshoot_percent: {100 * subject.overshoot:g} % cannot be kept in all scenarios with "
-            f"{programme.taps} taps; the least is {100 * found.overshoot:.4g} % at {longest * tick_ms:g} ms. "
+            f"{programme.taps} taps; the least is {100 * best_taps.overshoot:.4g} % at {longest * tick_ms:g} ms. "
             "More of it, a smaller [shape.scenarios] or more taps would help"
         )
     return f"shape: nothing settles within {longest * tick_ms:g} ms. {_binding(subject)}"
@@ -248,7 +262,7 @@ def _binding(subject: Subject) -> str:
     """What would be gained by relaxing each constraint alone."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
-    relaxed = {
+    variants = {
         "no limit on v": replace(subject, bounds=bounds._replace(low_um=-far, high_um=far)),
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
@@ -256,16 +270,16 @@ def _binding(subject: Subject) -> str:
             subject, options=options.model_copy(update={"scenarios": _alone(options.scenarios)})
         ),
     }  # fmt: skip
-    found = dict[str, float | None]()
-    for name, one in relaxed.items():
-        family = one.family()
+    fastest = dict[str, float | None]()
+    for name, subject_variant in variants.items():
+        family = subject_variant.family()
         scenarios = list(dict.fromkeys([family.nominal, *family.swept(3)]))
-        found[name] = fastest_settling(programme_of(one, scenarios), one.overshoot)
+        fastest[name] = fastest_settling(programme_of(subject_variant, scenarios), subject_variant.overshoot)
     listed = ", ".join(
-        f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in found.items()
+        f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in fastest.items()
     )
-    helps = min(found, key=lambda name: math.inf if (value := found[name]) is None else value)
-    return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {helps}"
+    best_relaxation = min(fastest, key=lambda name: math.inf if (value := fastest[name]) is None else value)
+    return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {best_relaxation}"
 
 
 def _alone(options: ScenarioOptions) -> ScenarioOptions:

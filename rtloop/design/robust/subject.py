@@ -21,13 +21,13 @@ def subject_in(configuration: Configuration, name: str, spec: Path | None) -> tu
 
     Raises ConfigError.
     """
-    axis = next((one for one in configuration.axes if one.name == name), None)
+    axis = next((entry for entry in configuration.axes if entry.name == name), None)
     if axis is None:
-        names = ", ".join(one.name for one in configuration.axes)
+        names = ", ".join(entry.name for entry in configuration.axes)
         fault = f"axis: {name!r} is not there; the configuration has {names}"
         raise ConfigError(configuration.source, [fault])
     findings = Findings()
-    check = next(one for one in check_axes(configuration, findings) if one.name == name)
+    check = next(entry for entry in check_axes(configuration, findings) if entry.name == name)
     if findings.faults:
         raise ConfigError(configuration.source, findings.faults)
     if spec is None and axis.specification is not None:
@@ -55,34 +55,34 @@ def lacking(asked: SpecificationOptions) -> list[str]:
 
 def subject_of(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
     """Of one axis. Raises ValueError, naming the key, for what is missing or cannot be."""
-    model, asked, options = axis.model or design.plant, design.specification, design.shape
+    model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
     if model is None:
         raise ValueError("model: missing; there is no plant to make taps for")
-    if faults := lacking(asked):
+    if faults := lacking(specification):
         raise ValueError(faults[0])
-    assert asked.overshoot_percent is not None
-    assert asked.command is not None
+    assert specification.overshoot_percent is not None
+    assert specification.command is not None
     if axis.prefilter.sections:
         raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
     if axis.limits.slew_v_per_s is not None:
         raise ValueError("limits.slew_v_per_s: a running slew limit is not linear; taps are made for loops without one")
     low_um, high_um = reach_um(axis)
-    step_um = asked.command.reference_um
+    step_um = specification.command.reference_um
     bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
     return Subject(
         check.linear, design.sensor.seen_through(model.transfer()), model.delay_ticks, bounds,
-        asked.overshoot_percent / 100, options,
+        specification.overshoot_percent / 100, options,
     )  # fmt: skip
 
 
 def reach_um(axis: AxisOptions) -> tuple[float, float]:
     """Least and largest v in µm: what the drive's limits reach on the initial loading curve, within `command_um`."""
     limits, law = axis.limits, axis.feedforward
-    largest = limits.command_um
+    limit_um = limits.command_um
     if not isinstance(law, PrandtlIshlinskiiOptions):
-        return (-largest if limits.lowest_v < 0 else 0.0), largest
+        return (-limit_um if limits.lowest_v < 0 else 0.0), limit_um
     model, _ = law.models()
     high, low = (float(loading_curve(model, volts)) for volts in (limits.drive_v, -limits.lowest_v))
-    return -min(low, largest), min(high, largest)
+    return -min(low, limit_um), min(high, limit_um)

@@ -42,15 +42,15 @@ def within_rate(transfer: Transfer, rate_hz: float) -> Transfer:
 
     Poles that are not stable stay, and so do as many poles as there are zeros left.
     """
-    far = FAR * math.pi * rate_hz
-    zeros, gone = _parted(transfer.zeros, np.abs(transfer.zeros) <= far)
-    poles, left_out = _parted(transfer.poles, (np.abs(transfer.poles) <= far) | (transfer.poles.real >= 0))
+    limit = FAR * math.pi * rate_hz
+    zeros, dropped_zeros = _parted(transfer.zeros, np.abs(transfer.zeros) <= limit)
+    poles, dropped_poles = _parted(transfer.poles, (np.abs(transfer.poles) <= limit) | (transfer.poles.real >= 0))
     if zeros.size > poles.size:
-        poles, left_out = transfer.poles, poles[:0]
+        poles, dropped_poles = transfer.poles, poles[:0]
     gain = complex(transfer.gain)
-    for zero in gone:
+    for zero in dropped_zeros:
         gain *= -zero
-    for pole in left_out:
+    for pole in dropped_poles:
         gain /= -pole
     return Transfer(zeros, poles, gain.real)
 

@@ -40,7 +40,7 @@ def real_modal_system(modal: Modal) -> System:
     """The real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, so that the two are alike."""
     upper = modal.poles.imag >= 0
     a, b, c = [], [], []
-    for pole, beta, gamma in zip(modal.poles[upper], *(part[upper] for part in modal_vectors(modal)), strict=True):
+    for pole, beta, gamma in zip(modal.poles[upper], *(vector[upper] for vector in modal_vectors(modal)), strict=True):
         if pole.imag == 0:
             a.append(np.array([[pole.real]]))
             b.append([beta.real])
@@ -63,23 +63,25 @@ def modal_vectors(modal: Modal) -> tuple[Complex, Complex]:
 
 def _cauchy_root(poles: Complex, inputs: Complex) -> Complex:
     """F (n, n) with F Fᴴ = P, by elimination with the largest pivot first; each step multiplies, none subtracts P's."""
-    left = inputs.astype(complex)
+    remaining = inputs.astype(complex)
     factor = np.zeros((poles.size, poles.size), dtype=complex)
     for k in range(poles.size):
-        diagonal = np.abs(left) ** 2 / (-2 * poles.real)
+        diagonal = np.abs(remaining) ** 2 / (-2 * poles.real)
         pivot = int(np.argmax(diagonal))
         if diagonal[pivot] == 0:
             break
-        factor[:, k] = -left * np.conj(left[pivot]) / (poles + np.conj(poles[pivot])) / np.sqrt(diagonal[pivot])
-        left = left * (poles - poles[pivot]) / (poles + np.conj(poles[pivot]))
-        left[pivot] = 0.0
+        factor[:, k] = (
+            -remaining * np.conj(remaining[pivot]) / (poles + np.conj(poles[pivot])) / np.sqrt(diagonal[pivot])
+        )
+        remaining = remaining * (poles - poles[pivot]) / (poles + np.conj(poles[pivot]))
+        remaining[pivot] = 0.0
     return factor
 
 
 def _to_real(poles: Complex) -> Complex:
     """Unitary (n, n) from modal to real coordinates."""
-    turn = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
-    blocks = [np.eye(1) if pole.imag == 0 else turn for pole in poles if pole.imag >= 0]
+    pair_block = np.array([[1, 1], [-1j, 1j]]) / np.sqrt(2)
+    blocks = [np.eye(1) if pole.imag == 0 else pair_block for pole in poles if pole.imag >= 0]
     return np.asarray(block_diag(*blocks), dtype=complex)
 
 

@@ -53,8 +53,8 @@ def hankel_singular_values(transfer: Transfer) -> Real:
 
 def order_for(hankel: Real, tolerance: float) -> int:
     """The smallest order whose error bound 2 Σ σ_k is at most `tolerance` of 2 Σ σ over all states."""
-    left_out = np.append(np.cumsum(hankel[::-1])[::-1], 0.0)
-    return int(np.argmax(left_out <= tolerance * left_out[0]))
+    tail_sums = np.append(np.cumsum(hankel[::-1])[::-1], 0.0)
+    return int(np.argmax(tail_sums <= tolerance * tail_sums[0]))
 
 
 def reduce_order(
@@ -70,17 +70,17 @@ def reduce_order(
     """
     stable, unstable = _parts(transfer)
     balanced = _balanced(stable)
-    kept_always = unstable.poles.size if unstable else 0
-    keep = order_for(balanced.hankel, tolerance) if order is None else order - kept_always
-    if not 0 <= keep <= transfer.order - kept_always:
+    unstable_count = unstable.poles.size if unstable else 0
+    stable_order = order_for(balanced.hankel, tolerance) if order is None else order - unstable_count
+    if not 0 <= stable_order <= transfer.order - unstable_count:
         raise ValueError(
-            f"order: {order} of a controller of order {transfer.order} with {kept_always} modes that are not stable; "
-            f"{kept_always} to {transfer.order} are allowed"
+            f"order: {order} of a controller of order {transfer.order} with {unstable_count} modes that are not stable; "
+            f"{unstable_count} to {transfer.order} are allowed"
         )
-    kept = min(keep, balanced.hankel.size)
-    bound = 2 * float(balanced.hankel[kept:].sum())
-    rest = _cut(balanced, kept, method)
-    return Reduced(_with_unstable(rest, unstable), balanced.hankel, bound)
+    order_kept = min(stable_order, balanced.hankel.size)
+    error_bound = 2 * float(balanced.hankel[order_kept:].sum())
+    reduced = _cut(balanced, order_kept, method)
+    return Reduced(_with_unstable(reduced, unstable), balanced.hankel, error_bound)
 
 
 def _parts(transfer: Transfer) -> tuple[Modal | System, Modal | None]:
@@ -91,8 +91,10 @@ def _parts(transfer: Transfer) -> tuple[Modal | System, Modal | None]:
         modal = None
     if modal is not None:
         stable = modal.poles.real < 0
-        rest = Modal(modal.poles[~stable], modal.residues[:, ~stable], np.zeros(1))
-        return Modal(modal.poles[stable], modal.residues[:, stable], modal.direct), rest if rest.poles.size else None
+        unstable = Modal(modal.poles[~stable], modal.residues[:, ~stable], np.zeros(1))
+        return Modal(
+            modal.poles[stable], modal.residues[:, stable], modal.direct
+        ), unstable if unstable.poles.size else None
     if not transfer.is_stable:
         raise ValueError("poles: repeated ones beside unstable ones; such a controller cannot be reduced")
     points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
@@ -104,14 +106,14 @@ def _balanced(part: Modal | System) -> _Balanced:
     if isinstance(part, Modal):
         beta, gamma = modal_vectors(part)
         system = real_modal_system(part)
-        left, right = modal_root(part.poles, beta), modal_root(np.conj(part.poles), np.conj(gamma))
+        input_root, output_root = modal_root(part.poles, beta), modal_root(np.conj(part.poles), np.conj(gamma))
     else:
         system = part
-        left, right = system_roots(part)
-    u, hankel, vh = np.linalg.svd(right.T @ left)
-    kept = int(np.sum(hankel > MINIMAL * hankel.max(initial=0.0)))
-    u, hankel, v = u[:, :kept], hankel[:kept], vh[:kept].T
-    forward, back = left @ v / np.sqrt(hankel), (right @ u / np.sqrt(hankel)).T
+        input_root, output_root = system_roots(part)
+    u, hankel, vh = np.linalg.svd(output_root.T @ input_root)
+    count = int(np.sum(hankel > MINIMAL * hankel.max(initial=0.0)))
+    u, hankel, v = u[:, :count], hankel[:count], vh[:count].T
+    forward, back = input_root @ v / np.sqrt(hankel), (output_root @ u / np.sqrt(hankel)).T
     return _Balanced(system, forward, back, hankel)
 
 
@@ -138,7 +140,9 @@ def _with_unstable(rest: System, unstable: Modal | None) -> Transfer:
     """Both parts side by side."""
     if unstable is None:
         return Transfer.from_state_space(*rest)
-    other = unstable.realise()
-    n, m = rest.b.size, other.b.size
-    a = np.block([[rest.a, np.zeros((n, m))], [np.zeros((m, n)), other.a]])
-    return Transfer.from_state_space(a, np.concatenate([rest.b, other.b]), np.concatenate([rest.c, other.c[0]]), rest.d)
+    unstable_system = unstable.realise()
+    n, m = rest.b.size, unstable_system.b.size
+    a = np.block([[rest.a, np.zeros((n, m))], [np.zeros((m, n)), unstable_system.a]])
+    return Transfer.from_state_space(
+        a, np.concatenate([rest.b, unstable_system.b]), np.concatenate([rest.c, unstable_system.c[0]]), rest.d
+    )

@@ -93,29 +93,31 @@ def _with_single_poles(plant: Transfer) -> Transfer:
         modal_sum(plant.zeros, plant.poles, plant.gain)
     except RepeatedPoles:
         reals = int(np.sum(plant.poles.imag == 0))
-        counted = np.concatenate([np.arange(reals), np.arange(plant.order - reals) // 2])  # pairs stand side by side
-        factors = 1 + PARTED * counted
+        root_numbers = np.concatenate(
+            [np.arange(reals), np.arange(plant.order - reals) // 2]
+        )  # pairs stand side by side
+        factors = 1 + PARTED * root_numbers
         return Transfer(plant.zeros, factors * plant.poles, plant.gain * float(np.prod(factors)))
     return plant
 
 
 def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
     """Where the controller comes from, a line each."""
-    hinf, w = found.hinf, found.weights
-    order, full = found.controller.order, found.full.order
+    hinf, weights = found.hinf, found.weights
+    order, full_order = found.controller.order, found.full.order
     digest = hashlib.sha256(text.encode()).hexdigest()
     lines = [
         f"Synthesised by rtloop {__version__} from {source} (SHA-256 {digest[:16]}…)",
         *(f"plant: {formula(plant.transfer())}" for plant in [design.plant] if plant),
-        f"W1 = {formula(w.tracking)}",
-        f"W2 = {formula(w.command)}",
-        f"W3 = {formula(w.disturbance)}",
+        f"W1 = {formula(weights.tracking)}",
+        f"W2 = {formula(weights.command)}",
+        f"W3 = {formula(weights.disturbance)}",
         f"H∞ (Glover & Doyle 1988): γ_opt = {hinf.gamma_opt:.6g}, γ = {hinf.gamma:.6g}, "
-        f"achieved {hinf.achieved:.6g} at order {full}",
+        f"achieved {hinf.achieved:.6g} at order {full_order}",
         "each specification is relaxed by up to γ",
         "Hankel singular values: " + ", ".join(f"{value:.4g}" for value in found.hankel),
     ]
-    if order < full:
+    if order < full_order:
         method = _METHODS[design.synthesis.reduction]
         lines.append(f"reduced to order {order} by {method}: achieved {found.achieved:.6g}")
     return lines
@@ -145,17 +147,17 @@ def _roots(roots: Complex) -> str:
 
 def formula(transfer: Transfer) -> str:
     """Gain and factors, short, for people."""
-    above = "".join(_factors(transfer.zeros)) or "1"
-    below = "".join(_factors(transfer.poles))
-    return f"{transfer.gain:.6g} {above}/{below}" if below else f"{transfer.gain:.6g}"
+    numerator = "".join(_factors(transfer.zeros)) or "1"
+    denominator = "".join(_factors(transfer.poles))
+    return f"{transfer.gain:.6g} {numerator}/{denominator}" if denominator else f"{transfer.gain:.6g}"
 
 
 def _factors(roots: Complex) -> list[str]:
-    found = []
+    factors = []
     for root in roots:
         if root.imag == 0:
-            found.append(f"(s {'−' if root.real > 0 else '+'} {abs(root.real):.6g})")
+            factors.append(f"(s {'−' if root.real > 0 else '+'} {abs(root.real):.6g})")
         elif root.imag > 0:
             middle = -2 * root.real
-            found.append(f"(s² {'−' if middle < 0 else '+'} {abs(middle):.6g} s + {abs(root) ** 2:.6g})")
-    return found
+            factors.append(f"(s² {'−' if middle < 0 else '+'} {abs(middle):.6g} s + {abs(root) ** 2:.6g})")
+    return factors

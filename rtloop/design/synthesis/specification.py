@@ -60,8 +60,8 @@ class ClaimOptions(Options):
 
     def borne_out(self, value: float) -> bool:
         """Whether `value` is as claimed."""
-        above = self.at_least is None or value >= self.at_least
-        return above and (self.at_most is None or value <= self.at_most)
+        is_above = self.at_least is None or value >= self.at_least
+        return is_above and (self.at_most is None or value <= self.at_most)
 
 
 class SpecificationOptions(Options):
@@ -262,19 +262,23 @@ class DesignOptions(Options):
 
 def weights_of(design: DesignOptions) -> Weights:
     """W1, W2, W3: given ones, else by the paper's rules. Raises ValueError naming what a rule lacks."""
-    given, asked = design.weights, design.specification
-    tracking = given.tracking.transfer() if given.tracking else _tracking(asked)
-    if given.command:
-        command = given.command.transfer()
+    own_weights, specification = design.weights, design.specification
+    tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking(specification)
+    if own_weights.command:
+        command = own_weights.command.transfer()
     else:
-        moderation = asked.command.command_um / asked.command.reference_um if asked.command else 1.0
+        moderation = (
+            specification.command.command_um / specification.command.reference_um if specification.command else 1.0
+        )
         command = command_weight(tracking, moderation)
-    if given.disturbance:
-        disturbance = given.disturbance.transfer()
+    if own_weights.disturbance:
+        disturbance = own_weights.disturbance.transfer()
     else:
-        wanted = asked.disturbance
-        ratio = wanted.error_um / wanted.largest_um if wanted else 1.0
-        disturbance = disturbance_weight(tracking, ratio, given.disturbance_rule if wanted else "none")
+        disturbance_options = specification.disturbance
+        ratio = disturbance_options.error_um / disturbance_options.largest_um if disturbance_options else 1.0
+        disturbance = disturbance_weight(
+            tracking, ratio, own_weights.disturbance_rule if disturbance_options else "none"
+        )
     return Weights(tracking, command, disturbance)
 
 

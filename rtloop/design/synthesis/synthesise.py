@@ -57,30 +57,30 @@ def synthesise(
     where it would not run. Raises NoController, also where γ_opt exceeds `largest_gamma`, and ValueError for an order
     that leaves no stable loop.
     """
-    standard = augmented(plant, weights)
-    found = synthesise_hinf(standard, backoff=backoff)
-    if found.gamma_opt > largest_gamma:
-        raise NoController(_contradiction(plant, weights, found.gamma_opt, largest_gamma))
-    full = Transfer.from_state_space(*found.controller)
-    allowed = np.inf if order is not None else (1 + largest_loss) * found.gamma
+    augmented_plant = augmented(plant, weights)
+    hinf = synthesise_hinf(augmented_plant, backoff=backoff)
+    if hinf.gamma_opt > largest_gamma:
+        raise NoController(_contradiction(plant, weights, hinf.gamma_opt, largest_gamma))
+    full = Transfer.from_state_space(*hinf.controller)
+    allowed = np.inf if order is not None else (1 + largest_loss) * hinf.gamma
     lowest = int(np.sum(full.poles.real >= 0))
-    tried: list[tuple[float, Transfer]] = []
-    for candidate in range(lowest, full.order + 1) if order is None else [order]:
-        controller, achieved = _reduced(standard, full, candidate, reduction, finish)
+    candidates: list[tuple[float, Transfer]] = []
+    for candidate_order in range(lowest, full.order + 1) if order is None else [order]:
+        controller, achieved = _reduced(augmented_plant, full, candidate_order, reduction, finish)
         if np.isfinite(achieved):
-            tried.append((achieved, controller))
+            candidates.append((achieved, controller))
         if achieved <= allowed:
             break
-    if tried:
-        achieved, controller = min(tried, key=lambda one: one[0])
-        return Synthesis(controller, full, achieved, weights, found, hankel_singular_values(full))
+    if candidates:
+        achieved, controller = min(candidates, key=lambda pair: pair[0])
+        return Synthesis(controller, full, achieved, weights, hinf, hankel_singular_values(full))
     if order is not None:
         raise ValueError(
             f"order: {order} leaves an unstable loop with method {reduction!r}; "
             "a higher one, or none so that the lowest good one is found, would help"
         )
     raise DoesNotRun(
-        f"specification: γ = {found.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
+        f"specification: γ = {hinf.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
         f"to {full.order} leaves a loop that is stable as it runs, with max |S| ≤ {LARGEST_SENSITIVITY:g}; a longer "
         "settling_ms (a smaller bandwidth_hz) or a higher rate would help"
     )
@@ -116,43 +116,43 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     """
     if design.plant is None:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant, weights, how = design.plant.transfer(), weights_of(design), design.synthesis
+    plant, weights, options = design.plant.transfer(), weights_of(design), design.synthesis
     _check(plant, design)
     ticks, output = design.plant.delay_ticks, design.controller
 
     def finish(controller: Transfer) -> Transfer | None:
-        written = within_rate(controller, output.rate_hz)
-        sensed = design.sensor.seen_through(plant)
-        return written if runs(written, sensed, output.rate_hz, output.method, output.prewarp_hz, ticks) else None
+        reduced = within_rate(controller, output.rate_hz)
+        sensed_plant = design.sensor.seen_through(plant)
+        return reduced if runs(reduced, sensed_plant, output.rate_hz, output.method, output.prewarp_hz, ticks) else None
 
     def designed_for(delay_s: float) -> Synthesis:
         return synthesise(
-            plant * dead_time(delay_s, ticks + 1), weights, order=how.order, reduction=how.reduction,
-            backoff=how.backoff_percent / 100, largest_loss=how.largest_loss_percent / 100,
-            largest_gamma=how.largest_gamma, finish=finish,
+            plant * dead_time(delay_s, ticks + 1), weights, order=options.order, reduction=options.reduction,
+            backoff=options.backoff_percent / 100, largest_loss=options.largest_loss_percent / 100,
+            largest_gamma=options.largest_gamma, finish=finish,
         )  # fmt: skip
 
-    behind_the_hold_s = (ticks + 0.5) / output.rate_hz
+    hold_delay_s = (ticks + 0.5) / output.rate_hz
     if ticks:
-        return designed_for(behind_the_hold_s)
+        return designed_for(hold_delay_s)
     try:
         return designed_for(0.0)
     except DoesNotRun:
-        return designed_for(behind_the_hold_s)
+        return designed_for(hold_delay_s)
 
 
 def _check(plant: Transfer, design: DesignOptions) -> None:
     """What no controller can do, before one is looked for. Raises NoController."""
-    asked, gain = design.specification, abs(plant.dc_gain)
-    if asked.static_error_percent is not None and gain == 0:
+    specification, gain = design.specification, abs(plant.dc_gain)
+    if specification.static_error_percent is not None and gain == 0:
         raise NoController("specification.static_error_percent: the plant's gain at 0 Hz is 0, so every error stays")
-    if asked.command is not None and asked.static_error_percent is not None:
-        held = asked.command.reference_um * (1 - asked.static_error_percent / 100) / gain
-        if asked.command.command_um < held:
+    if specification.command is not None and specification.static_error_percent is not None:
+        needed_um = specification.command.reference_um * (1 - specification.static_error_percent / 100) / gain
+        if specification.command.command_um < needed_um:
             raise NoController(
-                f"specification.command.command_um: {asked.command.command_um:g} µm cannot hold a reference of "
-                f"{asked.command.reference_um:g} µm within {asked.static_error_percent:g} % on a plant of static gain "
-                f"{gain:.6g}; at least {held:.6g} µm are needed, or a smaller reference_um"
+                f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold a reference of "
+                f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a plant of static gain "
+                f"{gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
             )
 
 
@@ -160,20 +160,20 @@ def _contradiction(plant: Transfer, weights: Weights, gamma: float, largest: flo
     """Which weight makes γ large: γ without each of them."""
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
-    without = {
+    relaxed_weights = {
         "disturbance": Weights(w1, w2, Transfer.from_zpk([], [], 0.0)),
         "command": Weights(w1, Transfer(w2.zeros, w2.poles, w2.gain / 100), w3),
         "tracking (ten times slower)": Weights(slower, w2, w3),
     }
-    gammas = {name: _gamma(plant, relaxed) for name, relaxed in without.items()}
-    worst = min(gammas, key=lambda name: gammas[name])
-    listed = ", ".join(f"{name} {value:.4g}" for name, value in gammas.items())
+    gammas = {name: _gamma(plant, relaxed) for name, relaxed in relaxed_weights.items()}
+    hardest = min(gammas, key=lambda name: gammas[name])
+    gamma_list = ", ".join(f"{name} {value:.4g}" for name, value in gammas.items())
     zeros = plant.zeros[plant.zeros.real > 0]
     nearest = f"; its zero at {zeros.real.min():.4g} rad/s allows about half of that as bandwidth" if zeros.size else ""
     return (
         f"specification: γ_opt = {gamma:.4g}, so each would be missed by up to that factor; synthesis.largest_gamma "
-        f"allows {largest:g}. They contradict each other or the plant. With one relaxed, γ_opt is: {listed}. "
-        f"The hardest is {worst}: relax it{nearest}"
+        f"allows {largest:g}. They contradict each other or the plant. With one relaxed, γ_opt is: {gamma_list}. "
+        f"The hardest is {hardest}: relax it{nearest}"
     )
 
 

@@ -60,11 +60,11 @@ class Bench:
         self.is_configured = configuration.driver_kind == "sim" or isinstance(
             configuration.driver_options, BoardOptions
         )
-        on_rig = _on_rig(configuration, stands, self.is_configured)
-        plan = prepare(on_rig, paced=False).plan
+        rig_configuration = _on_rig(configuration, stands, self.is_configured)
+        plan = prepare(rig_configuration, paced=False).plan
         self._plan = replace(plan, mode=Mode.CLOSED_LOOP)
-        assert isinstance(on_rig.driver_options, RigOptions)
-        self.rig, self.rate_hz = on_rig.driver_options, plan.pacing.rate_hz
+        assert isinstance(rig_configuration.driver_options, RigOptions)
+        self.rig, self.rate_hz = rig_configuration.driver_options, plan.pacing.rate_hz
 
     def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, draw: int = 0) -> dict[str, Real]:
         """Every column of a record, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`.
@@ -74,9 +74,9 @@ class Bench:
         table, generators = TableOfSamples(), self._plan.generators.copy()
         steps = StepsOptions(kind="steps", levels=tuple(levels_um), dwell_s=dwell_s, repeat=False)
         values = generator_values(steps, self.rate_hz, (), Path(), table)
-        number = self._plan.axes.index(axis)
-        generators["kind"][number] = values[0]
-        generators["parameters"][number, : len(values) - 1] = values[1:]
+        axis_index = self._plan.axes.index(axis)
+        generators["kind"][axis_index] = values[0]
+        generators["parameters"][axis_index, : len(values) - 1] = values[1:]
         ticks = round(dwell_s * self.rate_hz) * len(levels_um)
         plan = replace(
             self._plan,
@@ -96,13 +96,13 @@ def _records(plan: Plan, ticks: int) -> Real:
         ring = block.ring("ticks")
         clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
         assembly = Assembly(plan, block, driver.facts, driver.open(), clock, law_at_rest(plan))
-        found, room = np.empty((ticks, len(plan.columns))), len(ring.slots)
-        for first in range(0, ticks, room):
-            assembly.run(min(first + room, ticks))
+        records, ring_length = np.empty((ticks, len(plan.columns))), len(ring.slots)
+        for first in range(0, ticks, ring_length):
+            assembly.run(min(first + ring_length, ticks))
             count = int(assembly.loop.tick) - first
-            found[first : first + count] = ring.slots[:count]
+            records[first : first + count] = ring.slots[:count]
         driver.close()
-        return found[: int(assembly.loop.tick)]
+        return records[: int(assembly.loop.tick)]
     finally:
         os.close(block.fd)
 
@@ -116,13 +116,13 @@ def _on_rig(configuration: Configuration, stands: Mapping[str, Stand], is_config
         return changed
     if configuration.inputs or configuration.outputs:
         raise ValueError("it has channels beside those of its axes, and no rig answers them")
-    given: Any = configuration.driver_options
+    board: Any = configuration.driver_options
     channels = {}
     for number, axis in enumerate(axes):
         scale = abs(configuration.channels[axis.name].um_per_v)
         channels[axis.name] = ChannelOptions(input=f"adc{number}", output=f"dac{number}", um_per_v=scale)
     if is_configured:
-        rig = RigOptions(**{name: getattr(given, name) for name in RigOptions.model_fields})
+        rig = RigOptions(**{name: getattr(board, name) for name in RigOptions.model_fields})
     else:
         coupling = {axis.name: axis.model.coupling for axis in axes if axis.model and axis.model.coupling}
         rig = RigOptions(

@@ -29,17 +29,17 @@ class Limit(NamedTuple):
 
 def limits(asked: SpecificationOptions) -> dict[str, Limit]:
     """What is required, by the name of the quantity (`rtloop.design.synthesis.specification.QUANTITIES`)."""
-    found: dict[str, Limit] = {}
+    required: dict[str, Limit] = {}
     for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
                           ("bandwidth_hz", False), ("modulus_margin", False), ("resonance_decay_ms", True),
                           ("resonance_shift_percent", False)):  # fmt: skip
         if (value := getattr(asked, name)) is not None:
-            found[name] = Limit(value, at_most)
+            required[name] = Limit(value, at_most)
     if asked.command is not None:
-        found["peak_command"] = Limit(asked.command.command_um / asked.command.reference_um, True)
+        required["peak_command"] = Limit(asked.command.command_um / asked.command.reference_um, True)
     if asked.disturbance is not None:
-        found["disturbance_hz"] = Limit(asked.disturbance.up_to_hz or math.inf, False)
-    return found
+        required["disturbance_hz"] = Limit(asked.disturbance.up_to_hz or math.inf, False)
+    return required
 
 
 def specified(loop: Loop, asked: SpecificationOptions, resonance: float | None = None) -> dict[str, float]:
@@ -47,15 +47,15 @@ def specified(loop: Loop, asked: SpecificationOptions, resonance: float | None =
 
     `resonance` is that of the model in rad/s, None where it has none.
     """
-    more = {
+    conditions = {
         "disturbance_hz": asked.disturbance,
         "modulus_margin": asked.modulus_margin,
         "resonance_decay_ms": resonance,
     }
     if not loop.is_stable:
-        return dict.fromkeys((*SPECIFIED, *(name for name, wanted in more.items() if wanted)), math.nan)
+        return dict.fromkeys((*SPECIFIED, *(name for name, condition in conditions.items() if condition)), math.nan)
     step = step_metrics(loop, ())
-    found = {
+    quantities = {
         "static_error_percent": step.static_error_percent,
         "settling_ms": 1e3 * step.settling_time_s,
         "overshoot_percent": step.overshoot_percent,
@@ -63,12 +63,12 @@ def specified(loop: Loop, asked: SpecificationOptions, resonance: float | None =
         "bandwidth_hz": held_up_to(loop, math.sqrt(0.5)),
     }
     if asked.disturbance is not None:
-        found["disturbance_hz"] = held_up_to(loop, asked.disturbance.error_um / asked.disturbance.largest_um)
+        quantities["disturbance_hz"] = held_up_to(loop, asked.disturbance.error_um / asked.disturbance.largest_um)
     if asked.modulus_margin is not None:
-        found["modulus_margin"] = 1 / margins(loop).max_sensitivity
+        quantities["modulus_margin"] = 1 / margins(loop).max_sensitivity
     if resonance is not None:
-        found["resonance_decay_ms"] = 1e3 * slowest_near(loop, resonance)
-    return found
+        quantities["resonance_decay_ms"] = 1e3 * slowest_near(loop, resonance)
+    return quantities
 
 
 SPECIFIED = ("static_error_percent", "settling_ms", "overshoot_percent", "peak_command", "bandwidth_hz")
@@ -81,21 +81,23 @@ NEAR_RESONANCE = (0.55, 1.85)
 def slowest_near(loop: Loop, resonance: float) -> float:
     """Time constant in s of the slowest mode whose frequency is near one in rad/s; 0 where there is none."""
     frequencies, (low, high) = np.abs(loop.rates.imag), NEAR_RESONANCE
-    near = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]
-    return float(np.max(-1 / near.real, initial=0.0))
+    nearby = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]
+    return float(np.max(-1 / nearby.real, initial=0.0))
 
 
 def described(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
     """What else there is to know: poles, margins, what the sensor's noise does."""
-    found = margins(loop)
-    name, worst = ("max_re_pole", loop.poles.real) if loop.period_s is None else ("max_abs_pole", np.abs(loop.poles))
+    loop_margins = margins(loop)
+    name, magnitudes = (
+        ("max_re_pole", loop.poles.real) if loop.period_s is None else ("max_abs_pole", np.abs(loop.poles))
+    )
     return {
-        name: float(worst.max(initial=-math.inf)),
-        "crossover_hz": found.crossover_hz,
-        "phase_margin_deg": found.phase_margin_deg,
-        "gain_margin": found.gain_margin,
-        "modulus_margin": 1 / found.max_sensitivity,
-        "max_sensitivity": found.max_sensitivity,
+        name: float(magnitudes.max(initial=-math.inf)),
+        "crossover_hz": loop_margins.crossover_hz,
+        "phase_margin_deg": loop_margins.phase_margin_deg,
+        "gain_margin": loop_margins.gain_margin,
+        "modulus_margin": 1 / loop_margins.max_sensitivity,
+        "max_sensitivity": loop_margins.max_sensitivity,
         "sensitivity_1hz": float(loop.sensitivity(1.0)[0]),
         **_noise(loop, sensor),
     }
@@ -106,12 +108,12 @@ def held_up_to(loop: Loop, level: float) -> float:
     if abs(1 / (1 + loop.static_gain)) > level:
         return 0.0
     hz = loop.frequencies
-    above = np.flatnonzero(loop.sensitivity(hz) > level)
-    if not above.size:
+    exceeding = np.flatnonzero(loop.sensitivity(hz) > level)
+    if not exceeding.size:
         return math.inf
-    if above[0] == 0:
+    if exceeding[0] == 0:
         return float(hz[0])
-    return zero_between(lambda f: loop.sensitivity(f) - level, float(hz[above[0] - 1]), float(hz[above[0]]))
+    return zero_between(lambda f: loop.sensitivity(f) - level, float(hz[exceeding[0] - 1]), float(hz[exceeding[0]]))
 
 
 def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:

@@ -12,7 +12,7 @@ from rtloop.design.verification.verify import Row, Scenarios, Verification
 
 def as_dict(found: Verification) -> dict[str, Any]:
     """Null for what is not defined or has no limit."""
-    robust = found.robustness
+    robustness = found.robustness
     return {
         "meets": found.meets,
         "stable": {
@@ -22,13 +22,13 @@ def as_dict(found: Verification) -> dict[str, Any]:
         "delay_ticks": found.delay_ticks,
         "rate_hz": 1 / found.running.period_s if found.running.period_s else None,
         "rows": [_row(row) for row in found.rows],
-        "resonance_shift_percent": {name: _percent(value) for name, value in robust.shifts.items()},
+        "resonance_shift_percent": {name: _percent(value) for name, value in robustness.shifts.items()},
         "robustness_percent": {
-            name: {which: value and _percent(value) for which, value in ranges.items()}
-            for name, ranges in robust.ranges.items()
+            name: {limit_kind: value and _percent(value) for limit_kind, value in ranges.items()}
+            for name, ranges in robustness.ranges.items()
         },
-        "delay_margin_us": _number(robust.delay_us),
-        "more_delay_ticks": robust.delay_ticks,
+        "delay_margin_us": _number(robustness.delay_us),
+        "more_delay_ticks": robustness.delay_ticks,
         "together": None if found.together is None else found.together.as_dict(),
         "scenarios": None if found.scenarios is None else _scenarios(found.scenarios),
         "host_delay": None if found.host is None else asdict(found.host),

@@ -30,7 +30,7 @@ def pictures(found: Verification, asked: SpecificationOptions, title: str) -> di
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtra("pictures need matplotlib: pip install 'rtloop[plot]'") from None
-    drawn: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     for name, draw in (("bode", _bode), ("sensitivity", _sensitivity), ("step", _step)):
         figure = Figure(figsize=(10, 7), layout="constrained")
         FigureCanvasAgg(figure)
@@ -42,15 +42,15 @@ def pictures(found: Verification, asked: SpecificationOptions, title: str) -> di
         figure.suptitle(f"{title}: {name}", fontsize=11)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=110)
-        drawn[name] = file.getvalue()
-    return drawn
+        files[name] = file.getvalue()
+    return files
 
 
 def _loops(found: Verification) -> list[tuple[str, Loop, str]]:
     rate = 1 / found.running.period_s if found.running.period_s else math.nan
-    runs = f"as it runs: {rate:g} Hz, {found.delay_ticks} samples of delay"
-    on_paper = [] if found.continuous is None else [("continuous", found.continuous, PAPER_TIME)]
-    return [*on_paper, (runs, found.running, RUN_TIME)]
+    running_label = f"as it runs: {rate:g} Hz, {found.delay_ticks} samples of delay"
+    continuous_rows = [] if found.continuous is None else [("continuous", found.continuous, PAPER_TIME)]
+    return [*continuous_rows, (running_label, found.running, RUN_TIME)]
 
 
 def _frequencies(loop: Loop, found: Verification) -> Real:
@@ -95,13 +95,13 @@ def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | 
 
 
 def _step(panels: Any, found: Verification, asked: SpecificationOptions) -> None:
-    shown_s = 4e-3 * (asked.settling_ms or 5.0)
+    duration_s = 4e-3 * (asked.settling_ms or 5.0)
     for label, loop, color in _loops(found):
         if not loop.is_stable:
             panels[0].plot([], [], color=color, label=f"{label}: unstable")
             panels[1].plot([], [], color=color, label=f"{label}: unstable")
             continue
-        response = step_response(loop, shown_s)
+        response = step_response(loop, duration_s)
         style = {"color": color} if loop.period_s is None else {"color": color, "drawstyle": "steps-post"}
         panels[0].plot(1e3 * response.time_s, response.position, label=f"x {label}", color=color)
         panels[1].plot(1e3 * response.time_s, response.command, label=f"v {label}", **style)
@@ -109,9 +109,9 @@ def _step(panels: Any, found: Verification, asked: SpecificationOptions) -> None
     if asked.settling_ms is not None:
         panels[0].axvline(asked.settling_ms, color=TEMPLATE, linestyle="--", label="settled by, as specified")
     if asked.command is not None:
-        most = asked.command.command_um / asked.command.reference_um
-        panels[1].axhline(most, color=TEMPLATE, linestyle="--", label="largest v, as specified")
+        largest_command = asked.command.command_um / asked.command.reference_um
+        panels[1].axhline(largest_command, color=TEMPLATE, linestyle="--", label="largest v, as specified")
     panels[0].set_ylabel("x per unit step")
     panels[1].set_ylabel("v per unit step")
     panels[1].set_xlabel("time / ms")
-    panels[1].set_xlim(0, 1e3 * shown_s)
+    panels[1].set_xlim(0, 1e3 * duration_s)

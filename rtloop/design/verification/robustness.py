@@ -24,8 +24,8 @@ def resonance_of(plant: Transfer) -> float | None:
 def shift_tolerated(make: Maker, plant: Transfer) -> float:
     """Percent by which the resonance may move up and down and the loop stays stable; infinite where none was found."""
     resonance = changes(plant).get("resonance")
-    found = Range(None, None) if resonance is None else until_unstable(make, plant, resonance)
-    return min((end for end in found if end is not None), default=math.inf)
+    tolerated = Range(None, None) if resonance is None else until_unstable(make, plant, resonance)
+    return min((end for end in tolerated if end is not None), default=math.inf)
 
 
 class Worst(NamedTuple):
@@ -44,13 +44,13 @@ def worst_of(
     make: Callable[[Transfer, int], Loop], plants: Plants, asked: SpecificationOptions, resonance: float | None
 ) -> dict[str, Worst]:
     """Of every quantity that a specification is about. NaN, where a loop is unstable, is worst of all."""
-    found = dict[str, Worst]()
+    worst = dict[str, Worst]()
     for name, plant, delay_ticks in plants:
         for quantity, value in specified(make(plant, delay_ticks), asked, resonance).items():
-            before = found.get(quantity)
-            if before is None or _is_worse(value, before.value, quantity in LARGER_IS_BETTER):
-                found[quantity] = Worst(value, name)
-    return found
+            previous = worst.get(quantity)
+            if previous is None or _is_worse(value, previous.value, quantity in LARGER_IS_BETTER):
+                worst[quantity] = Worst(value, name)
+    return worst
 
 
 def _is_worse(value: float, than: float, larger_is_better: bool) -> bool:

@@ -61,8 +61,8 @@ class SimulatedStep(NamedTuple):
 
     def alike(self, name: str) -> bool:
         """Whether one step is like another in `name`, of JUDGED."""
-        kept, half = getattr(self, name), self.typical[JUDGED.index(name)]
-        return kept - half <= (SPREAD_PERCENT if name.endswith("percent") else SPREAD * kept)
+        quantile, median = getattr(self, name), self.typical[JUDGED.index(name)]
+        return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else SPREAD * quantile)
 
 
 @dataclass(frozen=True)
@@ -112,33 +112,33 @@ class Simulated:
 
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> Simulated:
     """Steps of an axis whose linear loop has `slowest_s` as its slowest time constant."""
-    heights_um, judged = design.step_heights_um, design.judges_simulated_steps
+    heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
-    reach_um, downwards = _reach(axis)
-    possible = sorted(height for height in set(heights_um) if height <= reach_um)
-    found = []
-    for height in possible:
-        levels = (height, 0.0, -height, 0.0) if downwards else (height, 0.0, height, 0.0)
+    reach_um, to_both = _reach(axis)
+    allowed_heights = sorted(height for height in set(heights_um) if height <= reach_um)
+    simulated_steps = []
+    for height in allowed_heights:
+        levels = (height, 0.0, -height, 0.0) if to_both else (height, 0.0, height, 0.0)
         steps = [_run(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS)]
         step = _summary(height, steps)
         if not all(step.alike(name) for name in JUDGED):
             steps += [_run(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
             step = _summary(height, steps)
-        found.append(step)
+        simulated_steps.append(step)
     truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
-    left_out = tuple(sorted(set(heights_um) - set(possible)))
+    omitted = tuple(sorted(set(heights_um) - set(allowed_heights)))
     noise_x_nm, noise_v_nm = _at_rest(bench, axis.name, reach_um)
     required = limits(design.specification)
-    return Simulated(truth, tuple(found), left_out, reach_um, noise_x_nm, noise_v_nm, required, judged)
+    return Simulated(truth, tuple(simulated_steps), omitted, reach_um, noise_x_nm, noise_v_nm, required, is_judged)
 
 
 def _at_rest(bench: Bench, axis: str, reach_um: float) -> list[float]:
     """Position and command in nm rms, about their means, at some places: a loop hunts where a dead band lets it."""
     squares = []
-    for part in RESTS:
-        rest = bench.run(axis, (part * reach_um,), SETTLES_S + REST_S)
-        last = slice(round(SETTLES_S * bench.rate_hz), None)
-        squares.append([rest[f"{axis}_{name}"][last].var() for name in ("true_position_um", "command_um")])
+    for place in RESTS:
+        record = bench.run(axis, (place * reach_um,), SETTLES_S + REST_S)
+        settled = slice(round(SETTLES_S * bench.rate_hz), None)
+        squares.append([record[f"{axis}_{name}"][settled].var() for name in ("true_position_um", "command_um")])
     return [float(1e3 * np.sqrt(mean)) for mean in np.mean(squares, axis=0)]
 
 
@@ -158,17 +158,17 @@ class _Run(NamedTuple):
 
 def _run(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _Run:
     """What came of each step, (steps, 3) as `every_step` has it, and of all."""
-    run = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
-    reference = np.repeat(run[f"{axis}_reference_um"], POINTS)
-    steps = every_step(reference, between_ticks(bench.rig, run, axis, bench.rate_hz), POINTS * bench.rate_hz)
+    record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
+    reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
+    steps = every_step(reference, between_ticks(bench.rig, record, axis, bench.rate_hz), POINTS * bench.rate_hz)
     assert steps is not None
-    flags = int(np.bitwise_or.reduce(run["flags"].astype(np.int64)))
-    return _Run(steps, float(np.abs(run[f"{axis}_drive_v"]).max()), flags)
+    flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
+    return _Run(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
 
 
 def _summary(height_um: float, runs: Sequence[_Run]) -> SimulatedStep:
     steps = np.vstack([run.steps for run in runs])
-    ever = reduce(or_, (run.flags for run in runs))
+    all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = kept_by_most(steps)
     return SimulatedStep(
         height_um,
@@ -177,8 +177,8 @@ def _summary(height_um: float, runs: Sequence[_Run]) -> SimulatedStep:
         static_error_percent,
         tuple(np.median(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist()),
         max(run.peak_drive_v for run in runs),
-        tuple(name for flag, name in LIMITED.items() if ever & flag),
-        tuple(trip_causes(ever)),
+        tuple(name for flag, name in LIMITED.items() if all_flags & flag),
+        tuple(trip_causes(all_flags)),
     )
 
 
@@ -200,15 +200,17 @@ def between_ticks(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: 
     disturbance, or memory from before the run, is taken to be straight between ticks.
     """
     dynamics = rig.plants.get(axis, rig.plant).dynamics
-    held = held_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)
-    moved = run[f"{axis}_hysteresis_um"].copy()
-    for other, share in rig.coupling.get(axis, {}).items():
-        moved += share * run[f"{other}_hysteresis_um"]
-    inputs = np.append(moved[1:], moved[-1])  # a record has what the period before it did
-    positions = held.between.rows @ held.system.driven(inputs).T + np.outer(held.between.direct, inputs)
-    besides = run[f"{axis}_true_position_um"] - positions[0]
-    slopes = np.append(np.diff(besides), 0.0)  # after the last tick it stands still
-    straight = slopes[:, None] * (np.arange(POINTS) / POINTS)
-    straight += besides[:, None]
-    straight += positions.T
-    return straight.ravel()
+    sampled_plant = held_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)
+    actuator_um = run[f"{axis}_hysteresis_um"].copy()
+    for other_axis, share in rig.coupling.get(axis, {}).items():
+        actuator_um += share * run[f"{other_axis}_hysteresis_um"]
+    inputs = np.append(actuator_um[1:], actuator_um[-1])  # a record has what the period before it did
+    positions = sampled_plant.between.rows @ sampled_plant.system.driven(inputs).T + np.outer(
+        sampled_plant.between.direct, inputs
+    )
+    remainder = run[f"{axis}_true_position_um"] - positions[0]
+    slopes = np.append(np.diff(remainder), 0.0)  # after the last tick it stands still
+    positions_um = slopes[:, None] * (np.arange(POINTS) / POINTS)
+    positions_um += remainder[:, None]
+    positions_um += positions.T
+    return positions_um.ravel()

@@ -27,7 +27,7 @@ def table(found: Verification) -> list[tuple[str, ...]]:
     columns = [ON_PAPER, RUNS][-len(loops) :]
     stable = ["yes" if loop.is_stable else "NO" for loop in loops]
     rows = [(LINEAR, "required", *_twos((column, "") for column in columns), "its source says")]
-    rows.append(("stable", "yes", *_twos((one, verdict(one == "yes")) for one in stable), ""))
+    rows.append(("stable", "yes", *_twos((stability, verdict(stability == "yes")) for stability in stable), ""))
     for row in found.rows:
         values = [row.continuous, row.running][-len(loops) :]
         cells = _twos((_with_unit(row, value), verdict(row.met(value))) for value in values)
@@ -71,16 +71,17 @@ def _with_unit(row: Row, value: float | None) -> str:
 def robustness(found: Verification) -> list[tuple[str, ...]]:
     """Headings, then a row for each thing that may move: until unstable (twice where it is on paper), until missed."""
     on_paper = found.continuous is not None
-    which = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
+    limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
     headings = ("continuous, until unstable", "as it runs, until unstable", "until what is met is missed")
-    rows = [("may move by", *headings[-len(which) :])]
+    rows = [("may move by", *headings[-len(limit_kinds) :])]
     rows += [
-        (SHIFT_NAMES[name], *(span(ranges[one]) for one in which)) for name, ranges in found.robustness.ranges.items()
+        (SHIFT_NAMES[name], *(span(ranges[kind]) for kind in limit_kinds))
+        for name, ranges in found.robustness.ranges.items()
     ]
-    judged = found.continuous or found.running
-    more = [f"+{number(found.robustness.delay_us)} µs", f"+{found.robustness.delay_ticks} samples"]
-    more = more if on_paper else [" or ".join(more)]
-    return [*rows, ("delay", *(more if judged.is_stable else ["–"] * len(more)), "")]
+    loop = found.continuous or found.running
+    delays = [f"+{number(found.robustness.delay_us)} µs", f"+{found.robustness.delay_ticks} samples"]
+    delays = delays if on_paper else [" or ".join(delays)]
+    return [*rows, ("delay", *(delays if loop.is_stable else ["–"] * len(delays)), "")]
 
 
 def scenarios(found: Verification) -> list[tuple[str, ...]]:
@@ -101,38 +102,38 @@ def simulated(found: Verification) -> list[tuple[str, ...]]:
     rows = [
         (
             f"{100 * KEPT:g} of 100 simulated steps",
-            *(part for name in JUDGED for part in (QUANTITIES[name][0], "")),
+            *(cell for name in JUDGED for cell in (QUANTITIES[name][0], "")),
             "peak |u|",
             "",
         )
     ]
     for step in found.simulated.steps:
-        cells = [part for name in JUDGED for part in (_kept(step, name), verdict(found.simulated.met(step, name)))]
-        stopped = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
-        stopped += [f"limited: {', '.join(step.limited)}"] if step.limited else []
-        rows.append((f"{step.height_um:g} µm", *cells, f"{step.peak_drive_v:.4g} V", "; ".join(stopped)))
+        cells = [cell for name in JUDGED for cell in (_kept(step, name), verdict(found.simulated.met(step, name)))]
+        notes = ["TRIPS: " + ", ".join(step.trips)] if step.trips else []
+        notes += [f"limited: {', '.join(step.limited)}"] if step.limited else []
+        rows.append((f"{step.height_um:g} µm", *cells, f"{step.peak_drive_v:.4g} V", "; ".join(notes)))
     return rows
 
 
 def _kept(step: SimulatedStep, name: str) -> str:
     """What is kept; and what half of the steps do, where noise makes that another figure."""
-    kept, half, unit = getattr(step, name), step.typical[JUDGED.index(name)], QUANTITIES[name][1]
-    return f"{kept:.4g} {unit}" if step.alike(name) else f"{kept:.3g} (half: {half:.3g}) {unit}"
+    quantile, median, unit = getattr(step, name), step.typical[JUDGED.index(name)], QUANTITIES[name][1]
+    return f"{quantile:.4g} {unit}" if step.alike(name) else f"{quantile:.3g} (half: {median:.3g}) {unit}"
 
 
 def simulation_notes(found: Verification) -> list[str]:
     """What was simulated, what was left out, and what the loop does at rest."""
     if found.simulated is None:
         return []
-    of = found.simulated
+    result = found.simulated
     notes = [
-        f"Simulated by the law itself on {of.truth}, with hysteresis, limits, rounding and noise; at rest x moves by "
-        f"{of.noise_x_nm:.3g} nm rms, v by {of.noise_v_nm:.3g} nm rms."
+        f"Simulated by the law itself on {result.truth}, with hysteresis, limits, rounding and noise; at rest x moves by "
+        f"{result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
     ]
-    if of.left_out_um:
-        heights = ", ".join(f"{height:g}" for height in of.left_out_um)
-        notes.append(f"Left out: steps of {heights} µm; the command's range ends at {of.reach_um:.4g} µm.")
-    if of.required and not of.judged:
+    if result.left_out_um:
+        heights = ", ".join(f"{height:g}" for height in result.left_out_um)
+        notes.append(f"Left out: steps of {heights} µm; the command's range ends at {result.reach_um:.4g} µm.")
+    if result.required and not result.judged:
         notes.append("These verdicts are no part of the answer below; [simulation] judged = true makes them.")
     return notes
 
@@ -188,13 +189,13 @@ def answer(found: Verification) -> str:
         return "as it will run, the loop is UNSTABLE"
     if found.host is not None and found.host.is_spent:
         return "the delay of this host takes all that the loop bears"
-    missed = [row.label for row in found.missed]
+    violations = [row.label for row in found.missed]
     if found.scenarios is not None:
-        missed += [
+        violations += [
             f"{row.label} with {worst.plant}" for row, worst in found.scenarios.missed if row not in found.missed
         ]
-    missed += [] if found.simulated is None else [f"simulated, {words}" for words in found.simulated.missed]
-    if missed:
-        return f"as it will run, the loop misses {', '.join(missed)}"
-    asked = any(row.limit is not None for row in found.rows)
-    return "as it will run, the loop meets its specification" if asked else "stable; nothing is specified"
+    violations += [] if found.simulated is None else [f"simulated, {violation}" for violation in found.simulated.missed]
+    if violations:
+        return f"as it will run, the loop misses {', '.join(violations)}"
+    is_specified = any(row.limit is not None for row in found.rows)
+    return "as it will run, the loop meets its specification" if is_specified else "stable; nothing is specified"

@@ -140,10 +140,10 @@ class Verification:
     def meets(self) -> bool:
         """Stable as it will run, and on this host as far as it was measured, with every requirement met, in every
         scenario and simulation that is judged, too."""
-        in_scenarios = self.scenarios is None or not self.scenarios.missed
-        simulated = self.simulated is None or not self.simulated.missed
-        here = self.host is None or not self.host.is_spent
-        return self.running.is_stable and not self.missed and in_scenarios and simulated and here
+        scenarios_hold = self.scenarios is None or not self.scenarios.missed
+        simulation_holds = self.simulated is None or not self.simulated.missed
+        host_holds = self.host is None or not self.host.is_spent
+        return self.running.is_stable and not self.missed and scenarios_hold and simulation_holds and host_holds
 
 
 def verify(
@@ -159,40 +159,46 @@ def verify(
     `plants` are others on which it must keep its specification as well.
     Raises ValueError for a plant with direct feedthrough.
     """
-    asked, sensed, controller = design.specification, design.sensor.seen_through(plant), subject.controller
+    specification, sensed_plant, controller = (
+        design.specification,
+        design.sensor.seen_through(plant),
+        subject.controller,
+    )
     continuous = None if controller is None else continuous_loop(controller, plant)
-    running = subject.running(sensed, delay_ticks)
+    running = subject.running(sensed_plant, delay_ticks)
     weights = None if controller is None else _weights(design)
     gamma = None
     if weights is not None and controller is not None:
         gamma = weighted_norm(augmented(plant, weights), controller)
     resonance = resonance_of(plant)
     columns = [
-        {} if loop is None else specified(loop, asked, resonance) | described(loop, design.sensor)
+        {} if loop is None else specified(loop, specification, resonance) | described(loop, design.sensor)
         for loop in (continuous, running)
     ]
-    if asked.resonance_shift_percent is not None:
+    if specification.resonance_shift_percent is not None:
         columns[1]["resonance_shift_percent"] = shift_tolerated(
-            lambda moved: subject.running(moved, delay_ticks), sensed
+            lambda changed_plant: subject.running(changed_plant, delay_ticks), sensed_plant
         )
     if gamma is not None:
         columns[0]["gamma"] = gamma
-    required = limits(asked)
+    required = limits(specification)
     rows = tuple(
-        Row(name, required.get(name), columns[0].get(name), columns[1].get(name), asked.claimed(name))
+        Row(name, required.get(name), columns[0].get(name), columns[1].get(name), specification.claimed(name))
         for name in QUANTITIES
         if any(name in column for column in columns)
     )
     scenarios = None
     if plants:
-        seen = [(name, design.sensor.seen_through(one), ticks) for name, one, ticks in plants]
-        worst = worst_of(subject.running, seen, asked, resonance)
-        scenarios = Scenarios(len(plants), tuple((row, worst[row.name]) for row in rows if row.name in worst))
+        sensed_plants = [(name, design.sensor.seen_through(dynamics), ticks) for name, dynamics, ticks in plants]
+        worst_by_name = worst_of(subject.running, sensed_plants, specification, resonance)
+        scenarios = Scenarios(
+            len(plants), tuple((row, worst_by_name[row.name]) for row in rows if row.name in worst_by_name)
+        )
     warnings: tuple[str, ...] = ()
     if controller is not None and subject.discrete is not None:
         warnings = tuple(compare(controller, subject.discrete, up_to_hz=0.2 / subject.discrete.period_s).warnings)
     return Verification(
-        rows, lambda: _robustness(subject, plant, sensed, design, delay_ticks, rows), warnings,
+        rows, lambda: _robustness(subject, plant, sensed_plant, design, delay_ticks, rows), warnings,
         continuous, running, delay_ticks, weights, gamma, together, scenarios,
     )  # fmt: skip
 
@@ -212,28 +218,32 @@ def _robustness(
     delay_ticks: int,
     rows: tuple[Row, ...],
 ) -> Robustness:
-    on_paper = None if subject.controller is None else maker(subject.controller)
+    make_continuous = None if subject.controller is None else maker(subject.controller)
 
     def runs(moved: Transfer) -> Loop:
         return subject.running(moved, delay_ticks)
 
-    of_one_loop = [row for row in rows if row.name != "resonance_shift_percent"]
-    met = {row.name: row.limit for row in of_one_loop if row.limit is not None and row.met(row.running)}
+    loop_rows = [row for row in rows if row.name != "resonance_shift_percent"]
+    met_limits = {row.name: row.limit for row in loop_rows if row.limit is not None and row.met(row.running)}
     ranges: dict[str, dict[str, Range | None]] = {}
     shifts: dict[str, Range] = {}
     for name, change in changes(plant).items():
-        modelled = {} if on_paper is None else {"continuous": until_unstable(on_paper, plant, change)}
+        continuous_range = (
+            {} if make_continuous is None else {"continuous": until_unstable(make_continuous, plant, change)}
+        )
         ranges[name] = {
-            **modelled,
+            **continuous_range,
             "running": until_unstable(runs, sensed, change),
-            "running_missed": until_missed(runs, sensed, change, design.specification, met) if met else None,
+            "running_missed": until_missed(runs, sensed, change, design.specification, met_limits)
+            if met_limits
+            else None,
         }
         if name == "resonance":
-            delayed = {
+            delayed_ranges = {
                 str(ticks): until_unstable(lambda moved, ticks=ticks: subject.running(moved, ticks), sensed, change)
                 for ticks in DELAYS
             }
-            shifts = {**modelled, **delayed}
-    more = delay_ticks_tolerated(lambda ticks: subject.running(sensed, ticks)) - delay_ticks
-    judged = runs(sensed) if on_paper is None else on_paper(plant)
-    return Robustness(ranges, shifts, delay_margin_us(judged), more)
+            shifts = {**continuous_range, **delayed_ranges}
+    extra_ticks = delay_ticks_tolerated(lambda ticks: subject.running(sensed, ticks)) - delay_ticks
+    loop = runs(sensed) if make_continuous is None else make_continuous(plant)
+    return Robustness(ranges, shifts, delay_margin_us(loop), extra_ticks)

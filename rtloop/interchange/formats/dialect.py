@@ -62,11 +62,11 @@ class Dialect(NamedTuple):
 
 def dialect_of(path: Path) -> Dialect:
     """How the lines of a file are written. Raises UnreadableData where there are no rows of numbers."""
-    encoding, head, rest = _sample(path)
-    lines = [*head, *rest]
+    encoding, head, later_lines = _sample(path)
+    lines = [*head, *later_lines]
     lines = lines[:: -(-len(lines) // SAMPLE_LINES)]
-    fits = [(_fit(lines, *manner), -place) for place, manner in enumerate(_MANNERS)]
-    (score, place) = max(fits)
+    scores = [(_fit(lines, *notation), -place) for place, notation in enumerate(_MANNERS)]
+    (score, place) = max(scores)
     delimiter, decimal = _MANNERS[-place]
     rows = [split(line, delimiter) for line in lines]
     width = _width(rows)
@@ -77,8 +77,8 @@ def dialect_of(path: Path) -> Dialect:
     if first is None:
         raise UnreadableData(f"{path}: no row of numbers in its first {SAMPLE_BYTES >> 10} KiB")
     names, units, has_header = _header(head[:first], delimiter, width)
-    behind = [_UNIT_BEHIND.search(field) for field in split(head[first], delimiter)]
-    units = tuple(found[1] if found else unit for found, unit in zip(behind, units, strict=True))
+    unit_matches = [_UNIT_BEHIND.search(field) for field in split(head[first], delimiter)]
+    units = tuple(match[1] if match else unit for match, unit in zip(unit_matches, units, strict=True))
     return Dialect(encoding, delimiter, decimal, first, names, units, numbers, _dates(rows, width), has_header)
 
 
@@ -117,8 +117,8 @@ def _sample(path: Path) -> tuple[str, list[str], list[str]]:
     texts = [block.decode(encoding if k == 0 else plain, "replace") for k, block in enumerate(blocks)]
     if any("\0" in text for text in texts):
         raise UnreadableData(f"{path}: no text, and no other kind of file that is known")
-    whole = len(blocks[0]) == size
-    head = texts[0].splitlines()[: None if whole else -1]
+    is_complete = len(blocks[0]) == size
+    head = texts[0].splitlines()[: None if is_complete else -1]
     if not head:
         raise UnreadableData(
             f"{path}: {'empty' if not size else f'its first line is longer than {SAMPLE_BYTES} bytes'}"
@@ -138,8 +138,8 @@ def _fit(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
     """Numbers among the fields of the usual lines, times the part of all lines that such lines are."""
     rows = [split(line, delimiter) for line in lines if line.strip()]
     width = _width(rows)
-    usual = [row for row in rows if len(row) == width]
-    numbers = sum(bool(field) and is_number(field, decimal) for row in usual for field in row)
+    regular_rows = [row for row in rows if len(row) == width]
+    numbers = sum(bool(field) and is_number(field, decimal) for row in regular_rows for field in row)
     return numbers / max(width, 1) / max(len(rows), 1)
 
 
@@ -170,27 +170,31 @@ def _dates(rows: Sequence[Sequence[str]], width: int) -> tuple[int, ...]:
 def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int], decimal: str) -> int | None:
     """The first of the rows that has numbers where numbers are."""
     for number, row in enumerate(rows):
-        whole = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
-        if whole and any(row[column] for column in numbers):
+        is_data_row = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
+        if is_data_row and any(row[column] for column in numbers):
             return number
     return None
 
 
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Names and units by the lines above the numbers, and whether there are names."""
-    above = [split(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
-    named = [[*row, *[""] * (width - len(row))] for row in above if width - 1 <= len(row) <= width and any(row)]
+    header_rows = [split(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
+    candidates = [
+        [*row, *[""] * (width - len(row))] for row in header_rows if width - 1 <= len(row) <= width and any(row)
+    ]
     units = [""] * width
-    if len(named) > 1 and _are_units(named[-1]):
-        units = [field.strip("[]() ") for field in named.pop()]
-    if not named:
+    if len(candidates) > 1 and _are_units(candidates[-1]):
+        units = [field.strip("[]() ") for field in candidates.pop()]
+    if not candidates:
         return tuple(f"column_{number}" for number in range(1, width + 1)), tuple(units), False
-    names = [name or f"column_{number}" for number, name in enumerate(named[-1], start=1)]
+    names = [name or f"column_{number}" for number, name in enumerate(candidates[-1], start=1)]
     return tuple(names), tuple(units), True
 
 
 def _are_units(fields: Sequence[str]) -> bool:
     """Whether a row below the names is one of units: most of it is understood as such, or stands in brackets."""
-    said = [field for field in fields if field]
-    bracketed = sum(field[0] + field[-1] in ("[]", "()") for field in said)
-    return bool(said) and max(sum(is_unit(field.strip("[]()")) for field in said), bracketed) * 2 >= len(said)
+    nonempty_fields = [field for field in fields if field]
+    bracketed_count = sum(field[0] + field[-1] in ("[]", "()") for field in nonempty_fields)
+    return bool(nonempty_fields) and max(
+        sum(is_unit(field.strip("[]()")) for field in nonempty_fields), bracketed_count
+    ) * 2 >= len(nonempty_fields)

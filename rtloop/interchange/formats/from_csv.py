@@ -30,20 +30,20 @@ def read_csv(path: Path) -> Table:
         raise UnreadableData(f"{path}: more than {COLUMNS_AT_MOST} columns")
     blocks = _numbers(path, dialect)
     names: list[str] = []
-    wanted = (*dialect.dates, *dialect.numbers)
-    for column in wanted:
+    used_columns = (*dialect.dates, *dialect.numbers)
+    for column in used_columns:
         names.append(unique(dialect.names[column], names))
     columns = {name: np.concatenate([block[k] for block in blocks]) for k, name in enumerate(names)}
-    units = {name: dialect.units[column] for name, column in zip(names, wanted, strict=True)}
+    units = {name: dialect.units[column] for name, column in zip(names, used_columns, strict=True)}
     for name in names[: len(dialect.dates)]:
         columns[name], units[name] = (columns[name] - columns[name][:1]) * 1e-9, "s"
-    sign = SIGNS.get(dialect.delimiter, repr(dialect.delimiter))
+    delimiter_name = SIGNS.get(dialect.delimiter, repr(dialect.delimiter))
     about = {
-        "table": f"columns divided by {sign}, decimal {dialect.decimal!r}, "
+        "table": f"columns divided by {delimiter_name}, decimal {dialect.decimal!r}, "
         f"{dialect.encoding.removesuffix('-sig')}, numbers from line {dialect.first + 1} on"
         + ("" if dialect.has_header else ", no names")
     }
-    text = [name for k, name in enumerate(dialect.names) if k not in wanted and not name.startswith("column_")]
+    text = [name for k, name in enumerate(dialect.names) if k not in used_columns and not name.startswith("column_")]
     if text:
         about["left out"] = ", ".join(f"{name} (text)" for name in text)
     return Table(
@@ -69,8 +69,8 @@ class _Lines(io.TextIOBase):
         text = self._file.read(size)
         self._since = len(text) - text.rfind("\n") - 1 if "\n" in text else self._since + len(text)
         if "\0" in text or self._since > LONGEST_LINE:
-            what = "zeros, which are no text" if "\0" in text else f"a line longer than {LONGEST_LINE >> 20} MiB"
-            raise UnreadableData(f"{self._path}: damaged: holds {what}")
+            fault = "zeros, which are no text" if "\0" in text else f"a line longer than {LONGEST_LINE >> 20} MiB"
+            raise UnreadableData(f"{self._path}: damaged: holds {fault}")
         return text
 
     def __iter__(self) -> Any:
@@ -89,7 +89,7 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         raise MissingExtra("CSV needs pandas: pip install 'rtloop[data]'") from None
     blocks: list[list[np.ndarray[Any, Any]]] = []
     without_last: list[np.ndarray[Any, Any]] = []
-    rows, most = 0, min(ROWS_AT_MOST, BYTES_AT_MOST // (8 * len(dialect.numbers)))
+    rows, max_rows = 0, min(ROWS_AT_MOST, BYTES_AT_MOST // (8 * len(dialect.numbers)))
     lines = _Lines(path, dialect)
     try:
         with pandas.read_csv(
@@ -105,13 +105,13 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         ) as reader:
             for block in reader:
                 dates = [_dates_ns(path, dialect, block[column]) for column in dialect.dates]
-                lacking = block.iloc[:, -1].isna().to_numpy()
+                lacks_last = block.iloc[:, -1].isna().to_numpy()
                 # where all rows lack it, the column is empty, or all are as short as the first one
-                without_last.append(rows + np.flatnonzero(lacking)[: 1 if lacking.all() else None])
+                without_last.append(rows + np.flatnonzero(lacks_last)[: 1 if lacks_last.all() else None])
                 blocks.append([*dates, *(_column(path, dialect, block[column]) for column in dialect.numbers)])
                 rows += len(block)
-                if rows > most:
-                    raise UnreadableData(f"{path}: more than {most} rows; cut it, or write fewer columns")
+                if rows > max_rows:
+                    raise UnreadableData(f"{path}: more than {max_rows} rows; cut it, or write fewer columns")
     except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeError) as fault:
         raise UnreadableData(f"{path}: {_where(str(fault), dialect)}") from None
     finally:
@@ -125,18 +125,18 @@ def _require_whole_rows(path: Path, dialect: Dialect, without_last: np.ndarray[A
 
     `without_last` (rows,) are rows without a number in their last column; the last row of a file may be cut off.
     """
-    looked_at, short = 0, None
+    checked_count, short_row = 0, None
     with contextlib.closing(_Lines(path, dialect)) as lines:
         for row, line in enumerate(lines):
-            if short is not None:
-                raise UnreadableData(f"{path}: {_uneven(*short, dialect)}")
-            if looked_at == without_last.size:
+            if short_row is not None:
+                raise UnreadableData(f"{path}: {_uneven(*short_row, dialect)}")
+            if checked_count == without_last.size:
                 return
-            if row == without_last[looked_at]:
-                looked_at += 1
-                sign = dialect.delimiter
-                fields = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
-                short = (dialect.first + row + 1, len(fields)) if 0 < len(fields) < len(dialect.names) else None
+            if row == without_last[checked_count]:
+                checked_count += 1
+                delimiter = dialect.delimiter
+                fields = line.split() if delimiter is None else next(csv.reader([line], delimiter=delimiter), [])
+                short_row = (dialect.first + row + 1, len(fields)) if 0 < len(fields) < len(dialect.names) else None
 
 
 def _uneven(line: int, columns: int, dialect: Dialect) -> str:
@@ -155,11 +155,11 @@ def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
     if dialect.decimal == ",":
         text = text.str.replace(",", ".")
     numbers = np.asarray(pandas.to_numeric(text, errors="coerce"), np.float64)
-    wrong = np.flatnonzero(np.isnan(numbers) & ~text.str.lower().isin(NO_NUMBER).to_numpy())
-    if wrong.size:
-        row = int(values.index[wrong[0]])
+    invalid_rows = np.flatnonzero(np.isnan(numbers) & ~text.str.lower().isin(NO_NUMBER).to_numpy())
+    if invalid_rows.size:
+        row = int(values.index[invalid_rows[0]])
         raise UnreadableData(
-            f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[wrong[0]])[:60]!r} is no number "
+            f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[invalid_rows[0]])[:60]!r} is no number "
             f"(row {row + 1} of the numbers, about line {dialect.first + row + 1})"
         )
     return numbers
@@ -181,6 +181,6 @@ def _dates_ns(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]
 def _where(fault: str, dialect: Dialect) -> str:
     """pandas counts lines from the first numbers on."""
     words = fault.removeprefix("Error tokenizing data. C error: ").strip()
-    if found := re.fullmatch(r"Expected (\d+) fields in line (\d+), saw (\d+)", words):
-        return _uneven(int(found[2]) + dialect.first, int(found[3]), dialect)
-    return "damaged: " + re.sub(r"line (\d+)", lambda found: f"line {int(found[1]) + dialect.first}", words)
+    if match := re.fullmatch(r"Expected (\d+) fields in line (\d+), saw (\d+)", words):
+        return _uneven(int(match[2]) + dialect.first, int(match[3]), dialect)
+    return "damaged: " + re.sub(r"line (\d+)", lambda match: f"line {int(match[1]) + dialect.first}", words)

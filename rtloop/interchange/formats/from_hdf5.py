@@ -11,6 +11,6 @@ from rtloop.interchange.formats.table import Table
 
 def read_hdf5(path: Path, group: str | None = None) -> Table:
     """What was sampled together: `group`, else the only or the longest. Raises UnreadableData, MissingExtra."""
-    found = Found(path)
-    collect(found)
-    return one_of(path, found.tables(), group, found.in_other_files)
+    columns = Found(path)
+    collect(columns)
+    return one_of(path, columns.tables(), group, columns.in_other_files)

@@ -34,16 +34,16 @@ def read_mat(path: Path, group: str | None = None) -> Table:
     """The signals of one raster or structure: `group`, else the only or the longest one. Raises UnreadableData."""
     with os.fdopen(open_named(path), "rb") as file:
         head = file.read(HDF5_AT + len(HDF5_MAGIC))
-    found = Found(path)
-    variables = matlab_variables(found) if head[HDF5_AT:] == HDF5_MAGIC else _variables(path, head)
+    columns = Found(path)
+    variables = matlab_variables(columns) if head[HDF5_AT:] == HDF5_MAGIC else _variables(path, head)
     tables: dict[str, Table] = {}
     for name, value in variables.items():
         if _is_controldesk(value):
             for raster, table in _rasters(path, value).items():
                 tables[unique(raster or name, tables)] = table
         else:
-            _walk(found, name, value, 0)
-    return one_of(path, tables | found.tables(), group, found.in_other_files)
+            _walk(columns, name, value, 0)
+    return one_of(path, tables | columns.tables(), group, columns.in_other_files)
 
 
 def _variables(path: Path, head: bytes) -> dict[str, Any]:
@@ -58,10 +58,10 @@ def _variables(path: Path, head: bytes) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with os.fdopen(open_named(path), "rb") as file:
-                found = loadmat(file, simplify_cells=True)
+                variables = loadmat(file, simplify_cells=True)
     except Exception as fault:  # scipy lets through whatever a damaged element leads to
         raise UnreadableData(f"{path}: not a MAT file, or damaged ({_first_line(fault)})") from None
-    return {name: value for name, value in found.items() if not name.startswith("__")}
+    return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
 def _require_bounded(path: Path, order: str) -> None:
@@ -85,11 +85,11 @@ def _require_bounded(path: Path, order: str) -> None:
 
 def _expanded(path: Path, file: Any, length: int, limit: int) -> int:
     """Bytes of a compressed element, as far as they are no more than `limit` and a block."""
-    stream, total, left = zlib.decompressobj(), 0, length
+    stream, total, remaining = zlib.decompressobj(), 0, length
     try:
-        while (left or stream.unconsumed_tail) and not stream.eof and total <= limit:
-            block = stream.unconsumed_tail or file.read(min(left, BLOCK))
-            left -= 0 if stream.unconsumed_tail else len(block)
+        while (remaining or stream.unconsumed_tail) and not stream.eof and total <= limit:
+            block = stream.unconsumed_tail or file.read(min(remaining, BLOCK))
+            remaining -= 0 if stream.unconsumed_tail else len(block)
             total += len(stream.decompress(block, BLOCK * 16))
     except zlib.error as fault:
         raise UnreadableData(f"{path}: damaged: {fault}") from None
@@ -100,7 +100,7 @@ def _is_controldesk(value: Any) -> bool:
     """Whether this is a structure with X.Data and Y(k).Data."""
     if not isinstance(value, dict) or not {"X", "Y"} <= value.keys():
         return False
-    return all(isinstance(one, dict) and "Data" in one for key in "XY" for one in _each(value[key]))
+    return all(isinstance(structure, dict) and "Data" in structure for key in "XY" for structure in _each(value[key]))
 
 
 def _rasters(path: Path, value: dict[str, Any]) -> dict[str, Table]:
@@ -108,35 +108,35 @@ def _rasters(path: Path, value: dict[str, Any]) -> dict[str, Table]:
     times, tables = _each(value["X"]), dict[str, Table]()
     about = {"layout": "ControlDesk", **_described(value)}
     for number, x in enumerate(times, start=1):
-        found = Found(path)
+        columns = Found(path)
         name = unique(_text(x.get("Name")) or "Time", ())
-        found.add(name, x["Data"], _text(x.get("Unit")) or "s")
+        columns.add(name, x["Data"], _text(x.get("Unit")) or "s")
         rows = np.size(x["Data"])
         for y in _each(value["Y"]):
             if _index(y) in (None, number) and np.size(y["Data"]) == rows and _of_raster(y, x):
                 label = _text(y.get("Name")) or "Y"
-                found.add(unique(label, found.columns), y["Data"], _text(y.get("Unit")))
+                columns.add(unique(label, columns.columns), y["Data"], _text(y.get("Unit")))
         raster = _text(x.get("Raster")) if len(times) > 1 else ""
-        if found.columns:
+        if columns.columns:
             tables[unique(raster or (f"X({number})" if len(times) > 1 else ""), tables)] = Table(
-                found.columns, found.units, name, about
+                columns.columns, columns.units, name, about
             )
     return tables
 
 
 def _of_raster(y: dict[str, Any], x: dict[str, Any]) -> bool:
-    mine, other = _text(y.get("Raster")), _text(x.get("Raster"))
-    return not mine or not other or mine == other
+    y_raster, x_raster = _text(y.get("Raster")), _text(x.get("Raster"))
+    return not y_raster or not x_raster or y_raster == x_raster
 
 
 def _index(y: dict[str, Any]) -> int | None:
-    found = y.get("XIndex", y.get("Xindex"))
-    return int(found) if found is not None and np.size(found) == 1 else None
+    number = y.get("XIndex", y.get("Xindex"))
+    return int(number) if number is not None and np.size(number) == 1 else None
 
 
 def _described(value: dict[str, Any]) -> dict[str, str]:
     text = value.get("Description")
-    text = next((one for one in text.values() if isinstance(one, str)), "") if isinstance(text, dict) else text
+    text = next((entry for entry in text.values() if isinstance(entry, str)), "") if isinstance(text, dict) else text
     return {"description": text[:200]} if isinstance(text, str) and text else {}
 
 
@@ -145,19 +145,19 @@ def _walk(found: Found, path: str, value: Any, depth: int, unit: str | None = No
     if depth > DEEPEST:
         raise UnreadableData(f"{found.path}: {path}: nested more than {DEEPEST} deep")
     if isinstance(value, dict):
-        said = {key.casefold(): one for key, one in {**_fields(value.get("DataInfo")), **value}.items()}
-        unit, name = _text(said.get("unit")) or _text(said.get("units")), _text(said.get("name"))
-        for key, one in value.items():
+        properties = {key.casefold(): element for key, element in {**_fields(value.get("DataInfo")), **value}.items()}
+        unit, name = _text(properties.get("unit")) or _text(properties.get("units")), _text(properties.get("name"))
+        for key, element in value.items():
             if key == "signals":
-                _signals(found, path, one, depth)
+                _signals(found, path, element, depth)
             elif key.casefold() in VALUES:
-                _walk(found, f"{path}/{name or key}", one, depth + 1, unit)
+                _walk(found, f"{path}/{name or key}", element, depth + 1, unit)
             else:
-                _walk(found, f"{path}/{key}", one, depth + 1)
+                _walk(found, f"{path}/{key}", element, depth + 1)
     elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype.kind == "O"):
-        for number, one in enumerate(_each(value), start=1):
-            name = _text(one.get("Name", one.get("name"))) if isinstance(one, dict) else ""
-            _walk(found, f"{path}/{name or number}", one, depth + 1)
+        for number, element in enumerate(_each(value), start=1):
+            name = _text(element.get("Name", element.get("name"))) if isinstance(element, dict) else ""
+            _walk(found, f"{path}/{name or number}", element, depth + 1)
     elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
         found.left_out.append(f"{path} (an object, which only MATLAB can read: save it as a structure or an array)")
     elif isinstance(value, np.ndarray):
@@ -166,17 +166,20 @@ def _walk(found: Found, path: str, value: Any, depth: int, unit: str | None = No
 
 def _signals(found: Found, path: str, signals: Any, depth: int) -> None:
     """Simulink's signals(k): values under their label; values of several dimensions have the time as the last one."""
-    for number, one in enumerate(_each(signals), start=1):
-        if isinstance(one, dict) and "values" in one:
-            values = np.asarray(one["values"])
+    for number, signal in enumerate(_each(signals), start=1):
+        if isinstance(signal, dict) and "values" in signal:
+            values = np.asarray(signal["values"])
             if values.ndim > 2:
                 values = values.reshape(-1, values.shape[-1])
             label = (
-                _text(one.get("label")) or _text(one.get("title")) or _text(one.get("blockName")) or f"signal_{number}"
+                _text(signal.get("label"))
+                or _text(signal.get("title"))
+                or _text(signal.get("blockName"))
+                or f"signal_{number}"
             )
             found.add(unique(f"{path}/{label.replace('/', '.')}", found.columns), values)
         else:
-            _walk(found, f"{path}/signals/{number}", one, depth + 1)
+            _walk(found, f"{path}/signals/{number}", signal, depth + 1)
 
 
 def _each(value: Any) -> list[Any]:

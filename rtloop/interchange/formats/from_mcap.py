@@ -50,18 +50,18 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
     except RecordingError as error:
         raise UnreadableData(str(error)) from None
     with closing(source):
-        found = _contents(source)
-        name = _chosen(path, found, topic)
-        return _Reading(source, found, name).table()
+        mcap_contents = _contents(source)
+        name = _chosen(path, mcap_contents, topic)
+        return _Reading(source, mcap_contents, name).table()
 
 
 def _contents(source: Source) -> Contents:
     """Every message counted."""
-    found = Contents(Counter(), Counter(), [])
-    for schema, channel, message in _whole(source, found.problems):
-        found.counts[channel.topic, encoding(channel, schema)] += 1
-        found.bytes[channel.topic] += MESSAGE_HEAD.size + len(message.data)
-    return found
+    message_runs = Contents(Counter(), Counter(), [])
+    for schema, channel, message in _whole(source, message_runs.problems):
+        message_runs.counts[channel.topic, encoding(channel, schema)] += 1
+        message_runs.bytes[channel.topic] += MESSAGE_HEAD.size + len(message.data)
+    return message_runs
 
 
 def _whole(source: Source, problems: list[str]) -> Iterator[Item]:
@@ -74,18 +74,18 @@ def _whole(source: Source, problems: list[str]) -> Iterator[Item]:
 
 def _chosen(path: Path, found: Contents, topic: str | None) -> str:
     """The topic that is meant. Raises UnreadableData where nobody knows which."""
-    there = set(found.bytes)
-    if topic is not None and topic in there:
+    topics = set(found.bytes)
+    if topic is not None and topic in topics:
         return topic
-    if not there:
+    if not topics:
         raise UnreadableData(
-            f"{path}: an MCAP file without messages" + "".join(f"; {one}" for one in found.problems[:1])
+            f"{path}: an MCAP file without messages" + "".join(f"; {problem}" for problem in found.problems[:1])
         )
     if topic is not None:
         raise UnreadableData(f"{path}: no topic {topic[:SHOWN]!r}; there are {described(found.counts)}")
-    if len(there) > 1:
+    if len(topics) > 1:
         raise UnreadableData(f"{path}: holds several topics, of which one is to be named: {described(found.counts)}")
-    return there.pop()
+    return topics.pop()
 
 
 class _Reading:
@@ -105,7 +105,10 @@ class _Reading:
 
     def table(self) -> Table:
         """All of it."""
-        problems, own = self._found.problems, (one for one in _whole(self._source, []) if one[1].topic == self._topic)
+        problems, own = (
+            self._found.problems,
+            (values for values in _whole(self._source, []) if values[1].topic == self._topic),
+        )
         for row, item in enumerate(own):
             self._take(item, row)
         if not self._columns:
@@ -114,7 +117,7 @@ class _Reading:
         in_order = bool(np.all(np.diff(order) > 0))
         log_times = self._log_times if in_order else self._log_times[order]
         elapsed_ns = (log_times - log_times[0]).astype(np.float64)
-        columns = {name: one if in_order else one[order] for name, one in self._columns.items()}
+        columns = {name: values if in_order else values[order] for name, values in self._columns.items()}
         about = {
             "topic": self._topic,
             "first_log_time_ns": str(int(log_times[0])),
@@ -142,7 +145,7 @@ class _Reading:
     def _new(self, name: str) -> Real:
         """A column, of NaN."""
         if (len(self._columns) + 1) * self._rows * 8 > MOST_TIMES * self._found.bytes[self._topic] + SPARE_BYTES:
-            much = f"{len(self._columns)} fields and more in {self._rows} messages, each of which has few of them"
-            raise UnreadableData(f"{self._where}: {much}: that is no table")
+            reason = f"{len(self._columns)} fields and more in {self._rows} messages, each of which has few of them"
+            raise UnreadableData(f"{self._where}: {reason}: that is no table")
         self._columns[name] = np.full(self._rows, np.nan)
         return self._columns[name]

@@ -17,20 +17,20 @@ WORKBOOK = "xl/workbook.xml"
 
 def read_npz(path: Path, group: str | None = None) -> Table:
     """The arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
-    found = Found(path)
+    columns = Found(path)
     try:
         with os.fdopen(open_named(path), "rb") as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
         if any(member.filename == WORKBOOK for member in members):
             raise UnreadableData(f"{path}: an Excel workbook; save its sheet as CSV")
         for member in members:
-            found.room(member.filename, (-(-member.file_size // 8),))
+            columns.room(member.filename, (-(-member.file_size // 8),))
         with os.fdopen(open_named(path), "rb") as file, np.load(file, allow_pickle=False) as arrays:
             for name in arrays:
-                _add(found, name, arrays)
+                _add(columns, name, arrays)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError) as fault:
         raise UnreadableData(f"{path}: not an npz file, or damaged ({fault})") from None
-    return one_of(path, found.tables(), group)
+    return one_of(path, columns.tables(), group)
 
 
 def _add(found: Found, name: str, arrays: np.lib.npyio.NpzFile) -> None:

@@ -22,18 +22,18 @@ def read_parquet(path: Path) -> Table:
         import pyarrow.parquet
     except ImportError:
         raise MissingExtra("Parquet needs pyarrow: pip install 'rtloop[data]'") from None
-    found = Found(path)
+    columns = Found(path)
     try:
-        with os.fdopen(open_named(path), "rb") as opened, pyarrow.parquet.ParquetFile(opened) as file:
+        with os.fdopen(open_named(path), "rb") as stream, pyarrow.parquet.ParquetFile(stream) as file:
             schema = file.schema_arrow
             for field in schema:
-                found.room(field.name, (file.metadata.num_rows,))
-                _add(found, field, file.read(columns=[field.name]).column(0))
+                columns.room(field.name, (file.metadata.num_rows,))
+                _add(columns, field, file.read(columns=[field.name]).column(0))
     except (pyarrow.ArrowException, OSError) as fault:
         raise UnreadableData(f"{path}: not a Parquet file, or damaged ({str(fault).splitlines()[0]})") from None
-    table = one_of(path, found.tables(), None)
-    dated = next((field.name for field in schema if pyarrow.types.is_timestamp(field.type)), None)
-    return replace(table, time=table.time or dated)
+    table = one_of(path, columns.tables(), None)
+    time_column = next((field.name for field in schema if pyarrow.types.is_timestamp(field.type)), None)
+    return replace(table, time=table.time or time_column)
 
 
 def _add(found: Found, field: Any, column: Any) -> None:

@@ -57,8 +57,8 @@ class Found:
             return
         array = np.squeeze(array) if array.ndim > 1 else array
         if array.ndim == 2 and min(array.shape) <= MATRIX_COLUMNS:
-            lying = array.shape[0] < array.shape[1]
-            for number, column in enumerate(array if lying else array.T, start=1):
+            is_row_wise = array.shape[0] < array.shape[1]
+            for number, column in enumerate(array if is_row_wise else array.T, start=1):
                 self.add(f"{name}_{number}", column, unit)
         elif array.ndim != 1 or array.size < 2:
             if array.size > 1:
@@ -77,19 +77,19 @@ class Found:
         times.sort(key=lambda name: TIMES.index(_last(name).casefold()))
         members: dict[tuple[int, str | None], list[str]] = {}
         for name, values in self.columns.items():
-            near = [time for time in times if self.columns[time].size == values.size]
-            best = max(near, key=lambda time: _common(time, name), default=None)
-            members.setdefault((values.size, best), []).append(name)
+            time_candidates = [time for time in times if self.columns[time].size == values.size]
+            nearest_time = max(time_candidates, key=lambda time: _common(time, name), default=None)
+            members.setdefault((values.size, nearest_time), []).append(name)
         about = {"left out": ", ".join(self.left_out[:SHOWN])} if self.left_out else {}
         tables: dict[str, Table] = {}
         for (rows, time), names in members.items():
             begin = len(_shared(names))
-            short = {name: name[begin:] for name in names}
+            short_names = {name: name[begin:] for name in names}
             group = _shared(names).strip("/") or _parent(time or "") or counted(rows, "row")
             tables[unique(group, tables)] = Table(
-                {short[name]: self.columns[name] for name in names},
-                {short[name]: self.units[name] for name in names if name in self.units},
-                None if time is None else short[time],
+                {short_names[name]: self.columns[name] for name in names},
+                {short_names[name]: self.units[name] for name in names if name in self.units},
+                None if time is None else short_names[time],
                 about,
             )
         return tables
@@ -101,25 +101,25 @@ def one_of(path: Path, tables: Mapping[str, Table], group: str | None, in_other_
     `in_other_files` of the table is the one given. Raises UnreadableData where there is none.
     """
     if not tables:
-        left = f"; in other files, and left out: {', '.join(in_other_files[:SHOWN])}" if in_other_files else ""
-        raise UnreadableData(f"{path}: holds no column of numbers{left}")
+        hint = f"; in other files, and left out: {', '.join(in_other_files[:SHOWN])}" if in_other_files else ""
+        raise UnreadableData(f"{path}: holds no column of numbers{hint}")
     if group is not None and group not in tables:
         raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
     name = (
         group
         if group is not None
-        else max(tables, key=lambda one: (len(tables[one].columns) > 1, rows_of(tables[one])))
+        else max(tables, key=lambda key: (len(tables[key].columns) > 1, rows_of(tables[key])))
     )
-    others = [
-        f"{other!r} ({counted(rows_of(table), 'row')}, {counted(len(table.columns), 'column')})"
-        for other, table in tables.items()
-        if other != name
+    other_groups = [
+        f"{other_name!r} ({counted(rows_of(table), 'row')}, {counted(len(table.columns), 'column')})"
+        for other_name, table in tables.items()
+        if other_name != name
     ]
     table = replace(tables[name], in_other_files=tuple(in_other_files))
-    if not others:
+    if not other_groups:
         return table
-    said = {"group": name, "other groups": ", ".join(others[:SHOWN]) + ", …" * (len(others) > SHOWN)}
-    return replace(table, about={**table.about, **said})
+    group_notes = {"group": name, "other groups": ", ".join(other_groups[:SHOWN]) + ", …" * (len(other_groups) > SHOWN)}
+    return replace(table, about={**table.about, **group_notes})
 
 
 def rows_of(table: Table) -> int:
@@ -129,12 +129,12 @@ def rows_of(table: Table) -> int:
 
 def unique(name: str, taken: Iterable[str]) -> str:
     """The name, or with a number behind it where it is taken."""
-    known = set(taken)
-    found, number = name, 1
-    while found in known:
+    used_names = set(taken)
+    candidate, number = name, 1
+    while candidate in used_names:
         number += 1
-        found = f"{name} ({number})"
-    return found
+        candidate = f"{name} ({number})"
+    return candidate
 
 
 def _last(name: str) -> str:
@@ -148,18 +148,18 @@ def _parent(name: str) -> str:
 def _shared(names: Sequence[str]) -> str:
     """The folder that all of the paths begin with, with its slash; empty where there is none."""
     folders = [name.split("/")[:-1] for name in names]
-    same = takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))
-    return "".join(f"{parts[0]}/" for parts in same)
+    shared_parts = takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))
+    return "".join(f"{parts[0]}/" for parts in shared_parts)
 
 
 def _common(one: str, other: str) -> int:
     """Parts of the path that two columns share."""
-    same = 0
+    depth = 0
     for first, second in zip(one.split("/")[:-1], other.split("/")[:-1], strict=False):
         if first != second:
             break
-        same += 1
-    return same
+        depth += 1
+    return depth
 
 
 def _kind(array: np.ndarray[Any, Any]) -> str:

@@ -62,20 +62,20 @@ def _collect(found: Found, datasets: dict[str, Any], group: Any, path: str, seen
     _see(group, seen)
     for key in group:
         name = f"{path}/{key}".lstrip("/")
-        one = _member(found, group, key, name)
-        if one is None:
+        member = _member(found, group, key, name)
+        if member is None:
             continue
-        if not _see(one, seen):
+        if not _see(member, seen):
             found.left_out.append(f"{name} (a link back to what is there already)")
-        elif isinstance(one, h5py.Group):
-            _collect(found, datasets, one, name, seen, depth + 1)
+        elif isinstance(member, h5py.Group):
+            _collect(found, datasets, member, name, seen, depth + 1)
         elif (
-            isinstance(one, h5py.Dataset)
-            and not _is_elsewhere(found, one, name)
-            and one.shape is not None
-            and one.dtype.kind not in "OSU"
+            isinstance(member, h5py.Dataset)
+            and not _is_elsewhere(found, member, name)
+            and member.shape is not None
+            and member.dtype.kind not in "OSU"
         ):
-            datasets[name] = one
+            datasets[name] = member
 
 
 def _member(found: Found, group: Any, key: str, name: str) -> Any:
@@ -97,31 +97,31 @@ def _within(group: Any, path: str, links: int) -> Any:
     import h5py
 
     h5l = h5py.h5l  # type: ignore[attr-defined]
-    place = group.file["/"] if path.startswith("/") else group
+    member = group.file["/"] if path.startswith("/") else group
     for part in filter(lambda part: part not in ("", "."), path.split("/")):
-        if not isinstance(place, h5py.Group):
+        if not isinstance(member, h5py.Group):
             raise KeyError(part)
         key = part.encode("utf-8", "surrogateescape")
-        kind = place.id.links.get_info(key).type
+        kind = member.id.links.get_info(key).type
         if kind == h5l.TYPE_HARD:
-            place = place[part]
+            member = member[part]
         elif kind == h5l.TYPE_SOFT and links > 0:
-            place = _within(place, place.id.links.get_val(key).decode("utf-8", "surrogateescape"), links - 1)
+            member = _within(member, member.id.links.get_val(key).decode("utf-8", "surrogateescape"), links - 1)
         elif kind == h5l.TYPE_SOFT:
             raise KeyError(part)
         else:
             raise _OtherFile(part)
-    return place
+    return member
 
 
 def _is_elsewhere(found: Found, dataset: Any, name: str) -> bool:
     """Whether the values of a dataset are in other files; it is left out as `name` then."""
     import h5py
 
-    made = dataset.id.get_create_plist()
-    if made.get_layout() == h5py.h5d.VIRTUAL:
+    creation = dataset.id.get_create_plist()
+    if creation.get_layout() == h5py.h5d.VIRTUAL:
         _name_elsewhere(found, name, "a virtual dataset, made of others")
-    elif made.get_external_count():
+    elif creation.get_external_count():
         _name_elsewhere(found, name, "values stored in another file")
     else:
         return False
@@ -151,10 +151,10 @@ def _see(one: Any, seen: set[Any]) -> bool:
     import h5py
 
     info = h5py.h5o.get_info(one.id)  # type: ignore[attr-defined]
-    place = (info.fileno, info.addr)
-    new = place not in seen
-    seen.add(place)
-    return new
+    address = (info.fileno, info.addr)
+    is_new = address not in seen
+    seen.add(address)
+    return is_new
 
 
 def _word(value: Any) -> str:
@@ -170,7 +170,9 @@ def matlab_variables(found: Found) -> dict[str, Any]:
 def _values(found: Found, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
     """The members of a group by key, for those of `names` (full name by key) that lie in the file."""
     members = {key: _member(found, group, key, name) for key, name in names.items()}
-    return {key: _value(found, file, one, names[key], depth) for key, one in members.items() if one is not None}
+    return {
+        key: _value(found, file, member, names[key], depth) for key, member in members.items() if member is not None
+    }
 
 
 def _value(found: Found, file: Any, one: Any, name: str, depth: int) -> Any:

@@ -178,9 +178,9 @@ def _leftover(threads: int, streams: list[tuple[int, Any]]) -> str | None:
 def main() -> None:
     """Work with the pipes on stdin and stdout; the law's code gets neither."""
     jobs, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb", buffering=0)
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, 0)
-    os.close(nothing)
+    null_fd = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null_fd, 0)
+    os.close(null_fd)
     os.dup2(2, 1)
     try:
         Worker(jobs, answers).work()

@@ -118,15 +118,18 @@ class Coupled(CoupledController):
         options: CoupledOptions = self.options
         decoupling = np.array(options.decoupling) if options.decoupling else np.eye(self.count)
         if options.loops:
-            loops = [discretise(one.transfer(), self.period_s, one.method, one.prewarp_hz) for one in options.loops]
+            loops = [
+                discretise(loop_options.transfer(), self.period_s, loop_options.method, loop_options.prewarp_hz)
+                for loop_options in options.loops
+            ]
             system = beside_each_other([loop.system for loop in loops])
-            own = beside_each_other([loop.system._replace(b=loop.antiwindup) for loop in loops]).b
-            tracking = own @ np.linalg.inv(decoupling)
+            loop_tracking = beside_each_other([loop.system._replace(b=loop.antiwindup) for loop in loops]).b
+            tracking = loop_tracking @ np.linalg.inv(decoupling)
         else:
             order = len(options.a)
-            given = [np.array(getattr(options, name), float) for name in "abcd"]
+            arrays = [np.array(getattr(options, name), float) for name in "abcd"]
             shapes = ((order, order), (order, self.count), (self.count, order), (self.count, self.count))
-            matrices = [matrix.reshape(shape) for matrix, shape in zip(given, shapes, strict=True)]
+            matrices = [matrix.reshape(shape) for matrix, shape in zip(arrays, shapes, strict=True)]
             system = tustin(SystemTogether(*matrices), self.period_s, options.prewarp_hz)
             tracking = antiwindup_together(system.a, system.b, decoupling @ system.c)
         return SampledTogether(system.mixed(after=decoupling), self.period_s), tracking
@@ -135,13 +138,13 @@ class Coupled(CoupledController):
         """Matrices with room behind them. Raises ValueError for too high an order and an unstable anti-windup."""
         from rtloop.linear.antiwindup import tracking_share
 
-        found, tracking = self._built
-        a, b, c, d = found.system
-        if found.order > MAX_ORDER:
-            raise ValueError(f"controller: order {found.order}; at most {MAX_ORDER} is allowed")
+        controller, tracking = self._built
+        a, b, c, d = controller.system
+        if controller.order > MAX_ORDER:
+            raise ValueError(f"controller: order {controller.order}; at most {MAX_ORDER} is allowed")
         bands = row_bands(a)
         return {
-            "order": found.order,
+            "order": controller.order,
             "count": self.count,
             "a": a,
             "b": b,
@@ -150,7 +153,7 @@ class Coupled(CoupledController):
             "row_start": bands[:, 0],
             "row_stop": bands[:, 1],
             "tracking": tracking,
-            "steady_state": np.linalg.pinv(np.eye(found.order) - a, rcond=1e-9) @ b,
+            "steady_state": np.linalg.pinv(np.eye(controller.order) - a, rcond=1e-9) @ b,
             "share": tracking_share(a, tracking, c, self.options.tracking_s, self.period_s),
         }
 

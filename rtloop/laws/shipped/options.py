@@ -59,8 +59,8 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
                 raise ValueError(f"inverse_thresholds_um: the first, {inverse.thresholds[0]:g}, must be 0")
             return inverse.inverse(), inverse
         forward = play_model("forward model", self.thresholds_v, self.weights_um_per_v)
-        behind = forward.without_dead_band()
-        return (forward if self.dead_band == "exact" else behind), behind.inverse()
+        lowered = forward.without_dead_band()
+        return (forward if self.dead_band == "exact" else lowered), lowered.inverse()
 
 
 class SampledTransferOptions(TransferOptions):

@@ -81,9 +81,9 @@ class PositivePosition(Controller):
 
 def held_resonance(omega: float, damping: float, period_s: float) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²) behind a hold; the states are its output, and its rate over ω."""
-    decay, moved = math.exp(-damping * omega * period_s), omega * math.sqrt(1 - damping**2) * period_s
+    decay, angle = math.exp(-damping * omega * period_s), omega * math.sqrt(1 - damping**2) * period_s
     share = damping / math.sqrt(1 - damping**2)
-    cosine, sine = decay * math.cos(moved), decay * math.sin(moved)
+    cosine, sine = decay * math.cos(angle), decay * math.sin(angle)
     a = np.array([
         [cosine + share * sine, sine / math.sqrt(1 - damping**2)],
         [-sine / math.sqrt(1 - damping**2), cosine - share * sine],

@@ -72,11 +72,11 @@ def plays_sum(value, thresholds, weights, plays, count, sums):
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
         i = block * LANES
-        one, two, three, four = four_plays(value, thresholds, plays, i)
-        first += weights[i] * one
-        second += weights[i + 1] * two
-        third += weights[i + 2] * three
-        fourth += weights[i + 3] * four
+        first_play, second_play, third_play, fourth_play = four_plays(value, thresholds, plays, i)
+        first += weights[i] * first_play
+        second += weights[i + 1] * second_play
+        third += weights[i + 2] * third_play
+        fourth += weights[i + 3] * fourth_play
     return total(sums, first, second, third, fourth)
 
 
@@ -86,12 +86,12 @@ def moved_plays_sum(value, thresholds, weights, plays, count, sums):
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
         i = block * LANES
-        one, two, three, four = four_plays(value, thresholds, plays, i)
-        first += weights[i] * one
-        second += weights[i + 1] * two
-        third += weights[i + 2] * three
-        fourth += weights[i + 3] * four
-        plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = one, two, three, four
+        first_play, second_play, third_play, fourth_play = four_plays(value, thresholds, plays, i)
+        first += weights[i] * first_play
+        second += weights[i + 1] * second_play
+        third += weights[i + 2] * third_play
+        fourth += weights[i + 3] * fourth_play
+        plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = first_play, second_play, third_play, fourth_play
     return total(sums, first, second, third, fourth)
 
 

@@ -92,11 +92,11 @@ class Repetitive(Controller):
         loop = self.options.ki_per_s * self.period_s / (z - 1) * plant
         width = weights.size // 2
         smoothed = np.sum(weights * np.cos(2 * np.pi * np.outer(turns, np.arange(-width, width + 1))), axis=1)
-        left = np.abs(smoothed * (1 - z**self.options.lead_ticks * loop / (1 + loop)))
-        if left.max() >= 1:
-            hz = turns[np.argmax(left)] / self.period_s
+        error_growth = np.abs(smoothed * (1 - z**self.options.lead_ticks * loop / (1 + loop)))
+        if error_growth.max() >= 1:
+            hz = turns[np.argmax(error_growth)] / self.period_s
             raise ValueError(
-                f"gain: at {hz:.4g} Hz an error grows to {left.max():.3g} of itself from one period to the next; a "
+                f"gain: at {hz:.4g} Hz an error grows to {error_growth.max():.3g} of itself from one period to the next; a "
                 "smaller gain, more smooth_ticks or another lead_ticks is needed (or allow_unstable)"
             )
 

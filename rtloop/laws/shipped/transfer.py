@@ -79,12 +79,12 @@ def advance(c, s, told):
     x = s.controller
     for block in range(c.order // BLOCK):
         i = block * BLOCK
-        one, partner_of_one = _moved_pair(c, s, i, error_um, shortfall_um)
-        two, partner_of_two = _moved_pair(c, s, i + 1, error_um, shortfall_um)
-        three, partner_of_three = _moved_pair(c, s, i + 2, error_um, shortfall_um)
-        four, partner_of_four = _moved_pair(c, s, i + 3, error_um, shortfall_um)
-        x[i], x[i + 1], x[i + 2], x[i + 3] = one, two, three, four
-        x[i + 4], x[i + 5], x[i + 6], x[i + 7] = partner_of_one, partner_of_two, partner_of_three, partner_of_four
+        state_0, partner_0 = _moved_pair(c, s, i, error_um, shortfall_um)
+        state_1, partner_1 = _moved_pair(c, s, i + 1, error_um, shortfall_um)
+        state_2, partner_2 = _moved_pair(c, s, i + 2, error_um, shortfall_um)
+        state_3, partner_3 = _moved_pair(c, s, i + 3, error_um, shortfall_um)
+        x[i], x[i + 1], x[i + 2], x[i + 3] = state_0, state_1, state_2, state_3
+        x[i + 4], x[i + 5], x[i + 6], x[i + 7] = partner_0, partner_1, partner_2, partner_3
     if c.coupled != 0:
         for i in range(c.order):
             for j in range(c.row_start[i], c.row_stop[i]):
@@ -153,12 +153,12 @@ class TransferController(Controller):
         a[np.ix_(places, places)] = controller.a
         states = np.arange(MAX_ORDER)
         partners = states ^ LANES
-        own, partner = a[states, states], a[states, partners]
+        diagonal, partner = a[states, states], a[states, partners]
         a[states, states] = a[states, partners] = 0.0
         bands = row_bands(a)
         return {
             "order": -(-(int(places.max(initial=-1)) + 1) // BLOCK) * BLOCK,
-            "own": own,
+            "own": diagonal,
             "partner": partner,
             "coupling": a,
             "coupled": bool(a.any()),
@@ -188,9 +188,9 @@ def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
 
     The two states of a 2×2 block of A make a pair, and so do the other states, two by two.
     """
-    found = blocks(a)
-    pairs = [(block.start, block.start + 1) for block in found if block.stop - block.start == 2]
-    single = [block.start for block in found if block.stop - block.start == 1]
+    diagonal_blocks = blocks(a)
+    pairs = [(block.start, block.start + 1) for block in diagonal_blocks if block.stop - block.start == 2]
+    single = [block.start for block in diagonal_blocks if block.stop - block.start == 1]
     pairs += [tuple(single[i : i + 2]) for i in range(0, len(single), 2)]
     places = np.zeros(a.shape[0], np.int64)
     for number, pair in enumerate(pairs):

@@ -43,7 +43,7 @@ class Spans:
         begins, ends = self._first[:, TICK], np.concatenate([[expected], self._last[:-1, TICK] + 1])
         if self._first is self._last:
             return missing(begins, expected) if len(begins) else []
-        return [(int(ends[one]), int(begins[one] - ends[one])) for one in np.flatnonzero(begins != ends[: len(begins)])]
+        return [(int(ends[row]), int(begins[row] - ends[row])) for row in np.flatnonzero(begins != ends[: len(begins)])]
 
     def place(self, tick: int, rate_hz: float) -> Place:
         """A tick behind some of them, and its time by the last one before it."""
@@ -90,9 +90,9 @@ class TickBuffer:
         """Forget the first `count` rows; those behind them move to the front."""
         if count:
             self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
-        rest = self._fill - count
-        self._rows[:rest] = self._rows[count : self._fill].copy()
-        self._fill = rest
+        remaining = self._fill - count
+        self._rows[:remaining] = self._rows[count : self._fill].copy()
+        self._fill = remaining
 
     def time_ns(self, tick: int) -> int:
         """When `tick` was due, since the start: from its row or the last one before it, else by the period."""

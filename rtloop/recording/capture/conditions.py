@@ -49,23 +49,23 @@ def comparison_of(text: str) -> Comparison | None:
     """What a condition compares; None for one of WORDS. Raises ValueError for anything else."""
     if text in WORDS:
         return None
-    found = _COMPARISON.fullmatch(text)
-    if found is None:
-        words = ", ".join(WORDS)
-        raise ValueError(f"no condition; {words}, or a comparison such as \"x_error_um > 0.5\" or "
+    match = _COMPARISON.fullmatch(text)
+    if match is None:
+        names = ", ".join(WORDS)
+        raise ValueError(f"no condition; {names}, or a comparison such as \"x_error_um > 0.5\" or "
                          '"abs(x_drive_v) >= 9.5" is allowed')  # fmt: skip
-    absolute, within, signal, sign, level = found.groups()
-    return Comparison(within or signal, bool(absolute), sign, float(level))
+    absolute, absolute_signal, signal, sign, level = match.groups()
+    return Comparison(absolute_signal or signal, bool(absolute), sign, float(level))
 
 
 def unknown_signal(text: str, columns: Sequence[str]) -> str | None:
     """What is wrong with the signal of a condition where it is none of `columns`."""
-    compared = comparison_of(text)
-    if compared is None or compared.signal in columns:
+    comparison = comparison_of(text)
+    if comparison is None or comparison.signal in columns:
         return None
-    near = get_close_matches(compared.signal, columns, n=1)
-    meant = f"; did you mean {near[0]}?" if near else ""
-    return f"{text!r}: no signal {compared.signal!r}{meant}; there are {', '.join(columns)}"
+    suggestions = get_close_matches(comparison.signal, columns, n=1)
+    hint = f"; did you mean {suggestions[0]}?" if suggestions else ""
+    return f"{text!r}: no signal {comparison.signal!r}{hint}; there are {', '.join(columns)}"
 
 
 class Conditions:
@@ -74,8 +74,8 @@ class Conditions:
     def __init__(self, texts: Sequence[str], columns: Sequence[str]) -> None:
         self._kinds = {text: OF_EVENTS[text] for text in texts if text in OF_EVENTS}
         self._late = LATE in texts
-        compared = [(text, one) for text in texts if (one := comparison_of(text)) is not None]
-        self._compared = [(text, columns.index(one.signal), one) for text, one in compared]
+        comparisons = [(text, comparison) for text in texts if (comparison := comparison_of(text)) is not None]
+        self._compared = [(text, columns.index(comparison.signal), comparison) for text, comparison in comparisons]
 
     def find(self, rows: np.ndarray[Any, Any], events: Sequence[tuple[int, str]]) -> list[Hit]:
         """Where they hold in rows (n, columns) and among events (tick, kind), by their first ticks."""
@@ -85,12 +85,12 @@ class Conditions:
             hits += [Hit(min(ticks), max(ticks), text)] if ticks else []
         if self._late:
             hits += _hit(rows, rows[:, PERIODS_MISSED] > 0, LATE)
-        for text, column, one in self._compared:
-            values = np.abs(rows[:, column]) if one.absolute else rows[:, column]
-            hits += _hit(rows, COMPARISONS[one.sign](values, one.level) & ~np.isnan(values), text)
+        for text, column, comparison in self._compared:
+            values = np.abs(rows[:, column]) if comparison.absolute else rows[:, column]
+            hits += _hit(rows, COMPARISONS[comparison.sign](values, comparison.level) & ~np.isnan(values), text)
         return sorted(hits)
 
 
 def _hit(rows: np.ndarray[Any, Any], holds: np.ndarray[Any, Any], text: str) -> list[Hit]:
-    places = np.flatnonzero(holds)
-    return [Hit(int(rows[places[0], TICK]), int(rows[places[-1], TICK]), text)] if places.size else []
+    indices = np.flatnonzero(holds)
+    return [Hit(int(rows[indices[0], TICK]), int(rows[indices[-1], TICK]), text)] if indices.size else []

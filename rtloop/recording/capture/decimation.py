@@ -49,8 +49,8 @@ class Decimation:
     def close(self) -> Intervals:
         """All intervals so far (n, columns, 3); the next one begins anew."""
         self._end()
-        found, self._done = self._done, []
-        return np.stack(found) if found else np.empty((0, self._columns, len(PARTS)))
+        intervals, self._done = self._done, []
+        return np.stack(intervals) if intervals else np.empty((0, self._columns, len(PARTS)))
 
     def put_back(self, intervals: Intervals) -> None:
         """Those that could not be written, in front of all others."""
@@ -59,17 +59,17 @@ class Decimation:
     def _add(self, run: Rows) -> None:
         while len(run):
             part, run = run[: self._every - self._count], run[self._every - self._count :]
-            known = ~np.isnan(part)
-            least, most = np.fmin.reduce(part, axis=0), np.fmax.reduce(part, axis=0)
+            is_number = ~np.isnan(part)
+            minimum, maximum = np.fmin.reduce(part, axis=0), np.fmax.reduce(part, axis=0)
             with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a record
-                total = np.add.reduce(part, axis=0, where=known)
+                total = np.add.reduce(part, axis=0, where=is_number)
             if self._count == 0:
-                self._least, self._most = least, most
+                self._least, self._most = minimum, maximum
                 self._total, self._known = total, np.zeros(self._columns)
             else:
-                self._least, self._most = np.fmin(self._least, least), np.fmax(self._most, most)
+                self._least, self._most = np.fmin(self._least, minimum), np.fmax(self._most, maximum)
                 self._total = self._total + total
-            self._known += np.count_nonzero(known, axis=0)
+            self._known += np.count_nonzero(is_number, axis=0)
             self._count, self._next = self._count + len(part), int(part[-1, TICK]) + 1
             if self._count == self._every:
                 self._end()

@@ -34,8 +34,8 @@ def numbered(path: Path, sequence: int) -> Path:
 
 def left_by_another(path: Path, sequence: int) -> Path | None:
     """The unfinished file of the recorder that died before file number `sequence` was begun."""
-    names = [numbered(path, sequence - 1), *([path] if sequence == 2 else [])]
-    parts = [name.with_name(f"{name.name}.part") for name in names]
+    paths = [numbered(path, sequence - 1), *([path] if sequence == 2 else [])]
+    parts = [name.with_name(f"{name.name}.part") for name in paths]
     return next((part for part in parts if part.exists()), None)
 
 
@@ -94,9 +94,11 @@ class Files:
             header = {**header, "sequence": sequence, "first_tick": self.next.tick}
         if self._repeats_before is not None and self.next.tick <= self._repeats_before.tick:
             header["repeats_before"] = self._repeats_before.tick
-        index, least = options.message_index, options.min_free_bytes
+        index, min_free_bytes = options.message_index, options.min_free_bytes
         room_bytes += self.writer.end_bytes if room_bytes and self.writer else 0
-        writer = Writer(path, header, log_time, message_index=index, min_free_bytes=least, room_bytes=room_bytes)
+        writer = Writer(
+            path, header, log_time, message_index=index, min_free_bytes=min_free_bytes, room_bytes=room_bytes
+        )
         self._opened.append(path)
         return writer
 
@@ -126,7 +128,7 @@ class Files:
         writer, self.writer = self.writer, None
         if writer is None:
             return None
-        written, problem = writer.ticks + writer.skipped, None
+        expected_ticks, problem = writer.ticks + writer.skipped, None
         try:
             writer.finish(final)
         except NotOnDisk as error:
@@ -137,7 +139,7 @@ class Files:
                 self._lose(writer)
                 return problem
             writer.close()
-        self.next = Place(self.next.tick - written + writer.ticks + writer.skipped, self.next.time_ns)
+        self.next = Place(self.next.tick - expected_ticks + writer.ticks + writer.skipped, self.next.time_ns)
         self._closed_ticks += writer.ticks
         self._closed_skipped += writer.skipped
         self.closed_bytes += writer.size_bytes

@@ -72,8 +72,8 @@ class Memory:
         self._segments = deque([Segment(begin, kept=True, asked=True)])
         self._until, self._newest = keep_until, begin - 1
         self._none = np.empty((0, len(columns))), np.empty((0, len(columns), 3))
-        usual = self._before + round(2 * SNAPSHOT_S * rate_hz)
-        self._most = usual + min(self._after, MOST_BYTES // (8 * len(columns)))
+        usual_ticks = self._before + round(2 * SNAPSHOT_S * rate_hz)
+        self._most = usual_ticks + min(self._after, MOST_BYTES // (8 * len(columns)))
 
     @property
     def begin(self) -> int:
@@ -89,14 +89,14 @@ class Memory:
     def find(self, entries: list[Entry], rows: Rows) -> list[Hit]:
         """What makes new ticks, and those that wait, worth keeping; those of it that begin a stretch are returned."""
         events = [(entry.tick, kind) for entry in entries if (kind := _kind(entry))]
-        begun = []
+        new_hits = []
         for hit in self._conditions.find(rows, events):
             if hit.first > self._until:
-                begun.append(hit)
+                new_hits.append(hit)
             self._until = max(self._until, hit.last + self._after)
             for segment in self._segments:
                 segment.kept = segment.kept or segment.end is None or segment.end > hit.first - self._before
-        return begun
+        return new_hits
 
     def add(self, entries: list[Entry], rows: Rows) -> None:
         """What follows in the present segment."""
@@ -124,10 +124,10 @@ class Memory:
         """What is decided, in order; `end` decides everything. `file_is_due(tick)`: whether one is to begin there."""
         while self._segments:
             head = self._segments[0]
-            decided = end or (head.end is not None and head.end <= self._newest - self._before)
-            if not (head.kept or decided):
+            is_decided = end or (head.end is not None and head.end <= self._newest - self._before)
+            if not (head.kept or is_decided):
                 break
-            if not head.asked and any(len(part.rows) for part in head.parts):
+            if not head.asked and any(len(batch.rows) for batch in head.parts):
                 head.asked, due = True, file_is_due(head.begin)
                 if due:
                     head.kept = True
@@ -138,10 +138,10 @@ class Memory:
             if head.kept and not self._left_empty:
                 return self._left_out()
             if head.parts:
-                part = head.parts.popleft()
+                batch = head.parts.popleft()
                 if head.kept:
-                    return Batch(part.entries, part.rows, self._none[1])
-                self._leave_out(part)
+                    return Batch(batch.entries, batch.rows, self._none[1])
+                self._leave_out(batch)
             elif head.end is None and not end:
                 return None
             else:
@@ -163,17 +163,23 @@ class Memory:
 
         What is worth keeping is given up last.
         """
-        while sum(len(part.rows) for part in self._parts()) > self._most:
-            closed = [one for one in self._segments if one.parts and one.end is not None]
-            if not closed:
+        while sum(len(batch.rows) for batch in self._parts()) > self._most:
+            complete_segments = [
+                candidate for candidate in self._segments if candidate.parts and candidate.end is not None
+            ]
+            if not complete_segments:
                 break
-            segment = next((one for one in closed if not one.kept), closed[0])
-            part = segment.parts.popleft()
-            if segment is closed[0] and not segment.kept and self._decimation.pending < MOST_INTERVALS:
-                self._leave_out(part)
+            segment = next((candidate for candidate in complete_segments if not candidate.kept), complete_segments[0])
+            batch = segment.parts.popleft()
+            if segment is complete_segments[0] and not segment.kept and self._decimation.pending < MOST_INTERVALS:
+                self._leave_out(batch)
             else:
-                behind = next(one.parts[0] for one in self._segments if one.begin >= segment.begin and one.parts)
-                behind.entries[:0] = [entry for entry in part.entries if entry.message.channel == format.EVENTS]
+                next_batch = next(
+                    candidate.parts[0]
+                    for candidate in self._segments
+                    if candidate.begin >= segment.begin and candidate.parts
+                )
+                next_batch.entries[:0] = [entry for entry in batch.entries if entry.message.channel == format.EVENTS]
         events = [(entries, entry) for entries in self._lists() for entry in entries if entry.of_loop]
         for entries, entry in events[KEPT_EVENTS:]:
             entries.remove(entry)

@@ -62,9 +62,9 @@ class Pending:
 
     def take(self, before: float = float("inf")) -> list[Entry]:
         """Those that belong to ticks before `before`, and wait no longer."""
-        taken = [entry for entry in self._entries if entry.tick < before]
+        entries = [entry for entry in self._entries if entry.tick < before]
         self._entries = [entry for entry in self._entries if entry.tick >= before]
-        return taken
+        return entries
 
     def keep_events(self, entries: list[Entry]) -> None:
         """Put back what could not be written: events only, and of these the first KEPT_EVENTS."""

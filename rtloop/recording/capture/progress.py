@@ -58,25 +58,25 @@ class Progress:
     @contextmanager
     def writing(self, byte: int, reached: Position) -> Iterator[None]:
         """A write that begins at `byte` of the file and gets to `reached`, or raises and leaves the file as it was."""
-        before = self.written
+        previous = self.written
         self._block.store(Word.ANNOUNCED_BYTE, byte)  # first: behind it there is nothing yet, whatever is announced
         self._store(ANNOUNCED, reached)
         try:
             yield
         except BaseException:
-            self._store(ANNOUNCED, before)
+            self._store(ANNOUNCED, previous)
             raise
         self._store(FLUSHED, reached)
 
     def found(self, part: Path | None) -> Position:
         """Where the recorder before this one came to, whose unfinished file is `part`."""
-        written, announced = self.written, self._load(ANNOUNCED)
+        position, announced = self.written, self._load(ANNOUNCED)
         for content in _contents_behind(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
             if tells_of_ticks(content):
-                written = written._replace(ticks=announced.ticks, lost=announced.lost)
+                position = position._replace(ticks=announced.ticks, lost=announced.lost)
             if not is_ticks(content):
-                written = written._replace(snapshots=announced.snapshots, events=announced.events)
-        return written
+                position = position._replace(snapshots=announced.snapshots, events=announced.events)
+        return position
 
     def _load(self, words: Sequence[Word]) -> Position:
         return Position(*map(self._block.load, words))

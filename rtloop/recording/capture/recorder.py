@@ -50,9 +50,9 @@ class Orders:
         while b"\n" not in self._read:
             if self.closed or not select.select([0], [], [], wait_s)[0]:
                 return None
-            part = os.read(0, 1 << 16)
-            self.closed = not part
-            self._read += part
+            data = os.read(0, 1 << 16)
+            self.closed = not data
+            self._read += data
         line, _, self._read = self._read.partition(b"\n")
         return json.loads(line)
 
@@ -74,20 +74,20 @@ class Recorder:
         last_tick_s = time.monotonic()
         while True:
             state = self.block.load(Word.LOOP_STATE)
-            alone = orders.closed and self.block.driven_by() is None
-            drained = session.drain()
+            is_orphaned = orders.closed and self.block.driven_by() is None
+            drained_count = session.drain()
             while (order := orders.next()) is not None:
                 session.note_removed(order["removed"])
             self.block.store(Word.RECORDER_CURSOR, session.cursor)
             session.write_due()
             self.block.store(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
-            if drained:
+            if drained_count:
                 last_tick_s = time.monotonic()
             elif ProcessState.ended(state):
                 return ProcessState(state).name.lower()
-            elif alone or (orders.closed and time.monotonic() - last_tick_s > ABANDONED_S):
+            elif is_orphaned or (orders.closed and time.monotonic() - last_tick_s > ABANDONED_S):
                 return "abandoned"
-            if drained < session.room:
+            if drained_count < session.room:
                 time.sleep(pause_s)
 
 
@@ -112,19 +112,19 @@ def run(fd: int, names: Names | None = None) -> int:
         if (command := orders.next(None)) is None:
             raise RecordingError("the recorder was given no file to write")
         header = command["header"]
-        kind = SelectiveSession if header.get("around") else Session
-        session = kind(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
+        session_class = SelectiveSession if header.get("around") else Session
+        session = session_class(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
         block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
         result = recorder.record(session, orders, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)
     except RtloopError as error:
         totals = {"complete": False, "error": str(error)}
     totals["cpu_s"] = round(time.process_time(), 3)
-    good = totals["error"] is None
-    block.store(Word.RECORDER_STATE, ProcessState.FINISHED if good else ProcessState.FAILED)
+    succeeded = totals["error"] is None
+    block.store(Word.RECORDER_STATE, ProcessState.FINISHED if succeeded else ProcessState.FAILED)
     with contextlib.suppress(BrokenPipeError):
         print(json.dumps(totals), flush=True)
-    return 0 if good else 1
+    return 0 if succeeded else 1
 
 
 def main() -> int:

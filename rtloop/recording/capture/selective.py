@@ -28,11 +28,11 @@ class SelectiveSession(Session):
         self, block: SharedBlock, path: Path, header: dict[str, Any], options: Options, names: Names | None = None
     ) -> None:
         super().__init__(block, path, header, options, names)
-        around, rate_hz = Around.of(header), header["rate_hz"]
-        assert around is not None
+        window, rate_hz = Around.of(header), header["rate_hz"]
+        assert window is not None
         # nobody knows how long the one before was to go on
-        keep_until = -1 if options.sequence == 1 else self._reached.ticks + round(around.after_s * rate_hz)
-        self._memory = Memory(around, header["columns"], rate_hz, self.cursor, keep_until)
+        retain_until = -1 if options.sequence == 1 else self._reached.ticks + round(window.after_s * rate_hz)
+        self._memory = Memory(window, header["columns"], rate_hz, self.cursor, retain_until)
 
     def _meet_snapshot(self, tick: int) -> None:
         self._write(self._buffer.before(tick), self._pending.take(before=tick))

@@ -79,8 +79,8 @@ class Session:
         self._snapshots = RingReader(self._block, "snapshots", position.snapshots)
         self._events = RingReader(self._block, "events", position.events)
         begin, end = (self._buffer.place(tick) for tick in (position.ticks, self._reached.ticks))
-        logged = position.ticks - position.lost
-        self._files = Files(self._path, self._header, self._options, begin, logged, end if repeats else None)
+        ticks_logged = position.ticks - position.lost
+        self._files = Files(self._path, self._header, self._options, begin, ticks_logged, end if repeats else None)
         self._cut_tick = position.ticks
 
     @property
@@ -161,9 +161,9 @@ class Session:
     def _file_is_due(self, tick: int) -> bool:
         """Whether the present file is large enough, where a snapshot of `tick` follows."""
         options, age_s = self._options, (tick - self._cut_tick) / self._header["rate_hz"]
-        large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
-        long = options.rotate_s is not None and age_s >= options.rotate_s
-        return (large or long) and tick > self._cut_tick
+        is_large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
+        is_old = options.rotate_s is not None and age_s >= options.rotate_s
+        return (is_large or is_old) and tick > self._cut_tick
 
     def _rotate(self, tick: int) -> None:
         """Go on in another file; all before `tick` is written.
@@ -188,14 +188,14 @@ class Session:
         writer = self._files.writer
 
         def final(logged: int) -> Message:
-            skipped = writer.skipped if writer else 0
-            lost = end_tick - self._files.first.tick - logged - skipped
+            ticks_skipped = writer.skipped if writer else 0
+            lost = end_tick - self._files.first.tick - logged - ticks_skipped
             totals = {"ticks_executed": end_tick, "ticks_logged": logged, "ticks_lost": lost}
             totals |= {"events_lost": self._events_lost, "snapshots_lost": self._snapshots.lost, "result": result}
-            what = {**totals, "complete": self._complete(lost, result), "error": self.error}
-            what |= {"ticks_skipped": skipped} if self._header.get("around") else {}
-            what |= {"driver_error": self._block.fault} if kind == FINISHED else {}
-            return self._pending.own(kind, self._place(said_tick), what)
+            details = {**totals, "complete": self._complete(lost, result), "error": self.error}
+            details |= {"ticks_skipped": ticks_skipped} if self._header.get("around") else {}
+            details |= {"driver_error": self._block.fault} if kind == FINISHED else {}
+            return self._pending.own(kind, self._place(said_tick), details)
 
         if problem := self._files.finish(final):
             self.error = self.error or str(problem)
@@ -267,18 +267,18 @@ class Session:
         spans, rate_hz = Spans(rows, intervals), self._header["rate_hz"]
         if gaps := spans.gaps(end.tick):
             for first, missing in gaps:
-                place = end if first == end.tick else spans.place(first, rate_hz)
-                messages.append(self._pending.own(GAP, place, {"first_tick": first, "count": missing}))
+                tick_time = end if first == end.tick else spans.place(first, rate_hz)
+                messages.append(self._pending.own(GAP, tick_time, {"first_tick": first, "count": missing}))
             messages.sort(key=lambda message: message.log_time)
         if spans.ticks:
             end = spans.place(spans.end, rate_hz)
-        reached = Position(
+        position = Position(
             end.tick,
             self._snapshots.position - len(self._ahead) - self._waiting(format.LAW),
             self._events.position - self._waiting(format.EVENTS),
             end.tick - self._files.logged - self._files.skipped - spans.ticks,
         )
-        with self._progress.writing(self._files.size_bytes, reached.at_least(self._reached)):
+        with self._progress.writing(self._files.size_bytes, position.at_least(self._reached)):
             if intervals is None:
                 self._files.write(messages, rows, self._start_unix_ns(), end)
             else:

@@ -24,16 +24,16 @@ def snapshot_before(block: SharedBlock, reached: Position) -> Position | None:
     """
     snapshots, events = RingReader(block, "snapshots"), RingReader(block, "events")
     ticks = [tick_of(bytes(snapshot)) for snapshot in snapshots.take()]
-    places = [place for place, tick in enumerate(ticks) if tick <= reached.ticks]
-    if not places:
+    indices = [place for place, tick in enumerate(ticks) if tick <= reached.ticks]
+    if not indices:
         return None
-    tick, slots = ticks[places[-1]], len(block["ticks_slots"])
+    tick, slots = ticks[indices[-1]], len(block["ticks_slots"])
     if int(block["ticks_head"][0]) - tick > slots - slots // SPARE:
         return None
-    held = events.take()["tick"]
-    earlier, oldest = np.flatnonzero(held < tick), events.position - len(held)
-    if oldest and not len(earlier):
+    event_ticks = events.take()["tick"]
+    earlier_events, oldest = np.flatnonzero(event_ticks < tick), events.position - len(event_ticks)
+    if oldest and not len(earlier_events):
         return None
-    event = oldest + int(earlier[-1]) + 1 if len(earlier) else 0
-    snapshot = snapshots.position - len(ticks) + places[-1]
+    event = oldest + int(earlier_events[-1]) + 1 if len(earlier_events) else 0
+    snapshot = snapshots.position - len(ticks) + indices[-1]
     return Position(tick, snapshot, min(event, reached.events), reached.lost)

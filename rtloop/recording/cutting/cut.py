@@ -52,7 +52,7 @@ class Copy:
                 progress(self._writer.ticks)
         if self._next < self._stretch.end:
             self.gaps.append((self._next, self._stretch.end - self._next))
-        self.gaps = [one for first, count in self.gaps for one in uncovered(first, first + count, self._skipped)]
+        self.gaps = [piece for first, count in self.gaps for piece in uncovered(first, first + count, self._skipped)]
 
     @property
     def unexplained(self) -> int:
@@ -70,8 +70,8 @@ class Copy:
         totals = {"ticks_executed": self._stretch.end, "ticks_logged": logged, "ticks_lost": lost, "events_lost": 0}
         totals |= {"ticks_skipped": skipped} if self._source.header.get("around") else {}
         problems = self._source.problems
-        what = totals | {"result": CUT, "complete": lost == 0 and not problems, "problems": problems}
-        event = recorder_event(CUT, self._stretch.end, round(self._end_ns), what)
+        details = totals | {"result": CUT, "complete": lost == 0 and not problems, "problems": problems}
+        event = recorder_event(CUT, self._stretch.end, round(self._end_ns), details)
         return Message(format.EVENTS, self._writer.start_unix_ns + round(self._end_ns), json.dumps(event).encode())
 
     def _note(self, rows: Rows) -> None:
@@ -104,24 +104,24 @@ def cut(
     """
     with Parts(find_files(files)) as readers:
         source = Source([Seeker(reader) for reader in readers])
-        asked = _asked(source, first, end, from_s, until_s)
-        stretch = source.kept(asked)
-        output = output or cut_path(source.path, asked.first)
+        requested_range = _asked(source, first, end, from_s, until_s)
+        copied_range = source.kept(requested_range)
+        output = output or cut_path(source.path, requested_range.first)
         header = source.header | {
-            "first_tick": stretch.first,
-            "ticks_expected": stretch.end - stretch.first,
-            "cut": {"first": asked.first, "end": asked.end, "files": source.files(stretch)},
+            "first_tick": copied_range.first,
+            "ticks_expected": copied_range.end - copied_range.first,
+            "cut": {"first": requested_range.first, "end": requested_range.end, "files": source.files(copied_range)},
         }
-        copy, ticks = _write(source, stretch, header, output, min_free_bytes, progress)
+        copy, ticks = _write(source, copied_range, header, output, min_free_bytes, progress)
         problems = [*source.problems]
         if copy.unexplained:
             problems.append(f"{copy.unexplained} of its ticks are not in the recording, and no gap says why")
         return {
             "recording": str(source.path),
             "output": str(output),
-            "first": asked.first,
-            "end": asked.end,
-            "begin": stretch.first,
+            "first": requested_range.first,
+            "end": requested_range.end,
+            "begin": copied_range.first,
             "ticks": ticks,
             "gaps": copy.gaps,
             "problems": problems,
@@ -136,28 +136,28 @@ def cut_path(path: Path, tick: int, kind: str = "cut") -> Path:
 
 def _asked(source: Source, first: int | None, end: int | None, from_s: float | None, until_s: float | None) -> Stretch:
     """The stretch that is meant. Raises RecordingError."""
-    whole = source.whole
+    full_range = source.whole
     if from_s is not None:
         first = source.due(from_s)
     if until_s is not None:
         end = source.due_or_skipped(until_s)
-    asked = Stretch(whole.first if first is None else first, whole.end if end is None else end)
-    named = f"{source.path}: ticks from {asked.first} to before {asked.end}"
-    if not asked.first < asked.end:
-        raise RecordingError(f"{named}: no stretch; the end comes behind the beginning")
-    if asked.first < whole.first or asked.end > whole.end:
-        raise RecordingError(f"{named}: not in the recording; ticks {whole.first} to {whole.end - 1} are")
-    return asked
+    requested = Stretch(full_range.first if first is None else first, full_range.end if end is None else end)
+    label = f"{source.path}: ticks from {requested.first} to before {requested.end}"
+    if not requested.first < requested.end:
+        raise RecordingError(f"{label}: no stretch; the end comes behind the beginning")
+    if requested.first < full_range.first or requested.end > full_range.end:
+        raise RecordingError(f"{label}: not in the recording; ticks {full_range.first} to {full_range.end - 1} are")
+    return requested
 
 
 def _write(
     source: Source, stretch: Stretch, header: dict[str, Any], output: Path, least: int, progress: Progress | None
 ) -> tuple[Copy, int]:
     """The copy, and the ticks in it. Raises OutputError, RecordingError; nothing of the output is left then."""
-    left = output.with_name(output.name + UNFINISHED)
+    unfinished_path = output.with_name(output.name + UNFINISHED)
     with writing(output):
-        if left.exists() and not grows(left):
-            left.unlink()
+        if unfinished_path.exists() and not grows(unfinished_path):
+            unfinished_path.unlink()
     log_time = header["created_unix_ns"] if header["paced"] else 0
     writer = Writer(output, header, log_time, message_index=True, min_free_bytes=least, suffix=UNFINISHED)
     try:

@@ -53,8 +53,12 @@ class Seeker:
 
     def final(self) -> dict[str, Any] | None:
         """What was counted at the end of the file; None where it was not finished."""
-        found = self.chunk(self.end - 1)
-        events = [json.loads(one.payload) for one in found if one.channel == EVENTS] if isinstance(found, list) else []
+        content = self.chunk(self.end - 1)
+        events = (
+            [json.loads(message.payload) for message in content if message.channel == EVENTS]
+            if isinstance(content, list)
+            else []
+        )
         return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
 
     def reaching(self, tick: int) -> int:
@@ -69,8 +73,8 @@ class Seeker:
         """The first tick that was due at `time_ns` since the start, or later; None where all were due before."""
         place = self._first_place(lambda span: span.last_ns >= time_ns)
         rows = self._rows(place)
-        behind = rows[rows[:, DEADLINE] >= time_ns] if len(rows) else rows
-        return int(behind[0, TICK]) if len(behind) else None
+        due_rows = rows[rows[:, DEADLINE] >= time_ns] if len(rows) else rows
+        return int(due_rows[0, TICK]) if len(due_rows) else None
 
     def rows(self, place: int, first: int, end: int) -> Rows:
         """The ticks from `first` to before `end` (n, columns) of the chunk at a place; (0, 0) where it holds none."""
@@ -78,20 +82,20 @@ class Seeker:
         if span is None or span.last < first or span.first >= end:
             return np.empty((0, 0))
         rows = self._rows(place)
-        begin, behind = np.searchsorted(rows[:, TICK], [first, end])
-        return rows[begin:behind]
+        begin, stop = np.searchsorted(rows[:, TICK], [first, end])
+        return rows[begin:stop]
 
     def _rows(self, place: int) -> Rows:
-        found = self.chunk(place) if place < self.end else None
-        return found.rows if isinstance(found, Ticks) else np.empty((0, 0))
+        content = self.chunk(place) if place < self.end else None
+        return content.rows if isinstance(content, Ticks) else np.empty((0, 0))
 
     def _chunk(self, place: int) -> Ticks | list[Message] | None:
         """What the chunk at a place holds; None where it is damaged."""
-        before = len(self.reader.left_out)
-        found = self.reader.chunk(self.reader.entries[place])
+        problem_count = len(self.reader.left_out)
+        content = self.reader.chunk(self.reader.entries[place])
         if place not in self.damage:
-            self.damage[place] = self.reader.left_out[before:]
-        return found
+            self.damage[place] = self.reader.left_out[problem_count:]
+        return content
 
     def _span(self, place: int) -> Span | None:
         """Of the chunk at a place; None where it holds no ticks."""
@@ -102,15 +106,15 @@ class Seeker:
 
     def _first_place(self, met: Callable[[Span], bool]) -> int:
         """The first place whose span meets a condition that all behind it meet as well."""
-        low, high, found = 0, self.end, self.end
+        low, high, first_place = 0, self.end, self.end
         while low < high:
             middle = (low + high) // 2
-            place = next((at for at in range(middle, high) if self.span(at)), None)
+            place = next((candidate for candidate in range(middle, high) if self.span(candidate)), None)
             span = None if place is None else self.span(place)
             if place is None or span is None:
                 high = middle
             elif met(span):
-                high, found = middle, place
+                high, first_place = middle, place
             else:
                 low = place + 1
-        return found
+        return first_place

@@ -48,7 +48,7 @@ class Source:
     @property
     def start_unix_ns(self) -> int:
         """When the run started, by the first file that has a tick."""
-        return next((one for one in self._seekers if one.first()), self._seekers[0]).reader.start_unix_ns
+        return next((seeker for seeker in self._seekers if seeker.first()), self._seekers[0]).reader.start_unix_ns
 
     @property
     def whole(self) -> Stretch:
@@ -62,19 +62,21 @@ class Source:
 
     def due(self, time_s: float) -> int:
         """The first tick that was due `time_s` after the start or later. Raises RecordingError where there is none."""
-        found = self._next_due(time_s)
-        if found is None:
+        tick = self._next_due(time_s)
+        if tick is None:
             last = next(filter(None, (seeker.last() for seeker in reversed(self._seekers))), None)
             end = "it holds no ticks" if last is None else f"its last tick was due at {last.last_ns / 1e9:g} s"
             raise RecordingError(f"{self.path}: {time_s:g} s: not in the recording; {end}")
-        return found
+        return tick
 
     def due_or_skipped(self, time_s: float) -> int:
         """As `due`; where that tick was left out by intention, the first one of the interval that it was in."""
         for overview in (seeker.reader.overview for seeker in self._seekers):
-            within = (overview[:, DEADLINE, LEAST] <= time_s * 1e9) & (time_s * 1e9 <= overview[:, DEADLINE, MOST])
-            if within.any():
-                return int(overview[within][0, TICK, LEAST])
+            includes_time = (overview[:, DEADLINE, LEAST] <= time_s * 1e9) & (
+                time_s * 1e9 <= overview[:, DEADLINE, MOST]
+            )
+            if includes_time.any():
+                return int(overview[includes_time][0, TICK, LEAST])
         return self.due(time_s)
 
     def _next_due(self, time_s: float) -> int | None:
@@ -89,9 +91,11 @@ class Source:
             return tick
         for seeker in reversed(self._seekers):
             for place in reversed(range(min(seeker.reaching(tick) + 1, seeker.end))):
-                found = [tick_of(one) for one in self._slow(seeker, place) if one.channel == format.LAW]
-                for begin in sorted((one for one in found if one <= tick), reverse=True):
-                    if any(one.has(begin) for one in self._seekers):
+                snapshot_ticks = [
+                    tick_of(message) for message in self._slow(seeker, place) if message.channel == format.LAW
+                ]
+                for begin in sorted((message for message in snapshot_ticks if message <= tick), reverse=True):
+                    if any(message.has(begin) for message in self._seekers):
                         return begin
         raise RecordingError(f"{self.path}: tick {tick}: no state of the law to begin from stands at it or before it")
 
@@ -114,7 +118,9 @@ class Source:
 
     def skipped(self, messages: Sequence[Message]) -> list[Range]:
         """What messages of a stretch say that was left out."""
-        return ranges(self._layout.intervals([one.payload for one in messages if one.channel == format.OVERVIEW]))
+        return ranges(
+            self._layout.intervals([message.payload for message in messages if message.channel == format.OVERVIEW])
+        )
 
     def files(self, stretch: Stretch) -> list[str]:
         """The names of the files that hold ticks of it."""
@@ -126,27 +132,29 @@ class Source:
 
     def contents(self, stretch: Stretch) -> Iterator[tuple[list[Message], Rows]]:
         """Messages of the slow topics and ticks of a stretch: chunk by chunk, in the order of the files."""
-        begin = stretch.first
+        next_tick = stretch.first
         for seeker in self._seekers:
             # a message stands before the tick that it precedes, by no more ticks than the ring holds
             first, ticks = seeker.reaching(stretch.first - self._reach) - 1, seeker.reaching(stretch.first)
             for place in range(max(first, 0), min(seeker.reaching(stretch.end - 1) + 1, seeker.end)):
                 if place < ticks and not _may_be_slow(seeker, place):
                     continue
-                rows = seeker.rows(place, begin, stretch.end)
+                rows = seeker.rows(place, next_tick, stretch.end)
                 messages = [
-                    one for one in self._slow(seeker, place) if self._belongs(one, stretch) and _is_taken(one, seeker)
+                    message
+                    for message in self._slow(seeker, place)
+                    if self._belongs(message, stretch) and _is_taken(message, seeker)
                 ]
                 self.problems += seeker.damage.get(place, [])
                 if len(rows):
-                    begin = int(rows[-1, TICK]) + 1
+                    next_tick = int(rows[-1, TICK]) + 1
                 if len(rows) or messages:
                     yield messages, rows
 
     def _slow(self, seeker: Seeker, place: int) -> list[Message]:
         """The messages of the slow topics in a chunk."""
-        found = seeker.chunk(place) if _may_be_slow(seeker, place) else None
-        return found if isinstance(found, list) else []
+        content = seeker.chunk(place) if _may_be_slow(seeker, place) else None
+        return content if isinstance(content, list) else []
 
     def _belongs(self, message: Message, stretch: Stretch) -> bool:
         """Whether an event, a snapshot or an overview is of a stretch; the end of the file is not."""

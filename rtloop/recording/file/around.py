@@ -27,8 +27,8 @@ class Around(NamedTuple):
     @classmethod
     def of(cls, header: Mapping[str, Any]) -> Self | None:
         """As a header has it; None for a recording of every tick."""
-        found = header.get("around")
-        return found and cls(found["before_s"], found["after_s"], tuple(found["on"]), found["every_s"])
+        fields = header.get("around")
+        return fields and cls(fields["before_s"], fields["after_s"], tuple(fields["on"]), fields["every_s"])
 
     @property
     def behind_s(self) -> float:

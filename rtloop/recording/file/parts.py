@@ -23,10 +23,10 @@ def find_files(given: Files) -> list[Path]:
     paths: list[Path] = []
     for item in items:
         if glob.has_magic(str(item)) and not Path(item).exists():
-            found = sorted(glob.glob(str(item)))
-            if not found:
+            matches = sorted(glob.glob(str(item)))
+            if not matches:
                 raise RecordingError(f"{item}: no such file")
-            paths += map(Path, found)
+            paths += map(Path, matches)
         else:
             paths.append(Path(item))
     if not paths:
@@ -65,8 +65,8 @@ class Parts(ExitStack):
 def absent_parts(readers: Sequence[Reader]) -> list[str]:
     """What is missing before, between or behind the files of a rotated run. One file alone is a whole recording."""
     numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
-    goes_on = len(readers) > 1 and last is not None and last["result"] == ROTATED
-    return [*absent(numbers), *([absent_part(numbers[-1] + 1)] if goes_on else [])]
+    is_continued = len(readers) > 1 and last is not None and last["result"] == ROTATED
+    return [*absent(numbers), *([absent_part(numbers[-1] + 1)] if is_continued else [])]
 
 
 def _sequence(reader: Reader) -> int:
@@ -78,15 +78,15 @@ def _take_each_tick_once(readers: Sequence[Reader]) -> None:
 
     A part that was not finished ends, by what the next one says, where that one's repetition does.
     """
-    reached = 0
-    for number, (before, reader) in enumerate(pairwise(readers), start=1):
-        follows = _sequence(reader) == _sequence(before) + 1
-        repeats_before = reader.header.get("repeats_before") if follows else None
-        reached = max(reached, before.totals["ticks_executed"] if before.totals else repeats_before or 0)
-        reader.begin_at(reached)
-        if repeats_before is not None and (reader.totals is None or reader.totals["ticks_executed"] > reached):
-            for one in readers[:number]:
-                one.end_at(min(repeats_before, reached))
+    end_tick = 0
+    for number, (previous, reader) in enumerate(pairwise(readers), start=1):
+        is_next = _sequence(reader) == _sequence(previous) + 1
+        repeats_before = reader.header.get("repeats_before") if is_next else None
+        end_tick = max(end_tick, previous.totals["ticks_executed"] if previous.totals else repeats_before or 0)
+        reader.begin_at(end_tick)
+        if repeats_before is not None and (reader.totals is None or reader.totals["ticks_executed"] > end_tick):
+            for earlier_reader in readers[:number]:
+                earlier_reader.end_at(min(repeats_before, end_tick))
 
 
 def _require_one_run(readers: Sequence[Reader]) -> None:

@@ -153,9 +153,9 @@ class Reader:
 
         `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
         """
-        wanted = self._known(self.columns if names is None else names)
+        columns = self._known(self.columns if names is None else names)
         account = Account(self.first_tick, self.totals, self._repeated_before)
-        for entry, future in self._ahead(self.tick_chunks if entries is None else entries, wanted):
+        for entry, future in self._ahead(self.tick_chunks if entries is None else entries, columns):
             try:
                 ticks = future.result()
                 if ticks is not None and (ticks := account.add(ticks)) is not None:
@@ -206,15 +206,15 @@ class Reader:
     @cached_property
     def overview(self) -> Intervals:
         """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.topics.overview`."""
-        found = self.intervals_of(self._messages(format.OVERVIEW))
-        good = plausible(found)
-        if not good.all():
+        intervals = self.intervals_of(self._messages(format.OVERVIEW))
+        is_plausible = plausible(intervals)
+        if not is_plausible.all():
             self._report("an overview is about no ticks, or about some that another one is about")
-        return found[good]
+        return intervals[is_plausible]
 
     def intervals_of(self, messages: Iterable[Message]) -> Intervals:
         """What those of `/overview` among messages of this recording say."""
-        return self._overview.intervals([one.payload for one in messages if one.channel == format.OVERVIEW])
+        return self._overview.intervals([message.payload for message in messages if message.channel == format.OVERVIEW])
 
     @cached_property
     def skipped(self) -> list[Range]:
@@ -228,8 +228,8 @@ class Reader:
     @property
     def totals(self) -> dict[str, Any] | None:
         """What the recorder counted when it finished the file; None where it did not."""
-        last = [event for event in self._events if event["kind"] in FINAL]
-        return last[-1]["what"] if last else None
+        final_events = [event for event in self._events if event["kind"] in FINAL]
+        return final_events[-1]["what"] if final_events else None
 
     def _known(self, names: Sequence[str]) -> Sequence[str]:
         unknown = [name for name in names if name not in self.columns]
@@ -242,14 +242,14 @@ class Reader:
 
     def _ahead(self, entries: Iterable[Entry], names: Sequence[str]) -> Iterator[tuple[Entry, Future[Ticks | None]]]:
         """The entries with what comes of decompressing them."""
-        waiting: deque[tuple[Entry, Future[Ticks | None]]] = deque()
+        queue: deque[tuple[Entry, Future[Ticks | None]]] = deque()
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
-                waiting.append((entry, pool.submit(self._ticks_of, entry, names)))
-                if len(waiting) >= AHEAD:
-                    yield waiting.popleft()
-            while waiting:
-                yield waiting.popleft()
+                queue.append((entry, pool.submit(self._ticks_of, entry, names)))
+                if len(queue) >= AHEAD:
+                    yield queue.popleft()
+            while queue:
+                yield queue.popleft()
 
     def _ticks_of(self, entry: Entry, names: Sequence[str]) -> Ticks | None:
         """The ticks of a chunk; None if it holds something else. Raises DamagedChunk."""
@@ -273,7 +273,7 @@ class Reader:
 
     def _checked(self, messages: list[Message]) -> list[Message]:
         """Those of the messages that say something; of the others it is reported what is wrong."""
-        good = []
+        valid = []
         for message in messages:
             try:
                 if message.channel == format.EVENTS:
@@ -282,11 +282,11 @@ class Reader:
                     _require_digest(message)
                 elif message.channel == format.OVERVIEW:
                     self._overview.require(message.payload)
-                good.append(message)
+                valid.append(message)
             except ValueError as reason:
-                of_event = message.channel == format.EVENTS
-                self._report(f"an event is malformed: {reason}" if of_event else str(reason))
-        return good
+                is_event = message.channel == format.EVENTS
+                self._report(f"an event is malformed: {reason}" if is_event else str(reason))
+        return valid
 
     def _leave_out(self, entry: Entry, reason: DamagedChunk) -> None:
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")

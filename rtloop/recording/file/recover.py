@@ -66,9 +66,9 @@ class Recovery:
                 self._note_gaps(rows)
                 self._writer.write_ticks(rows)
             else:
-                kept = [message for message in messages if self._is_content(message)]
-                self._note_skipped(kept)
-                self._writer.write_messages(kept)
+                copied = [message for message in messages if self._is_content(message)]
+                self._note_skipped(copied)
+                self._writer.write_messages(copied)
             if progress:
                 progress(self._writer.ticks)
 
@@ -76,7 +76,7 @@ class Recovery:
         """The event that ends the recovered file: the original one if nothing is missing, else what is."""
         if self._final and not self._reader.problems and not self.gaps:
             return self._final
-        what = {
+        details = {
             "ticks_executed": self.next_tick,
             "ticks_logged": logged,
             "ticks_lost": sum(count for _, count in self.gaps),
@@ -87,7 +87,7 @@ class Recovery:
             "gaps": self.gaps,
             "problems": self._reader.problems,
         }
-        event = recorder_event(RECOVERED, self.next_tick, round(self._end_ns), what)
+        event = recorder_event(RECOVERED, self.next_tick, round(self._end_ns), details)
         return Message(format.EVENTS, self._writer.start_unix_ns + round(self._end_ns), json.dumps(event).encode())
 
     def _is_content(self, message: Message) -> bool:
@@ -138,19 +138,19 @@ def recover(
             writer.start_unix_ns = reader.start_unix_ns
             recovery = Recovery(reader, writer)
             recovery.copy(progress)
-            final = recovery.final(writer.ticks)
+            final_message = recovery.final(writer.ticks)
             writer.finish(recovery.final, whole=True)
         except BaseException:
             writer.discard()
             raise
-        what = json.loads(final.payload)
+        final_event = json.loads(final_message.payload)
         return {
             "recording": str(path),
             "output": str(output),
             "ticks": writer.ticks,
             "gaps": recovery.gaps,
             "problems": reader.problems,
-            "complete": what["kind"] == FINISHED and what["what"]["complete"],
+            "complete": final_event["kind"] == FINISHED and final_event["what"]["complete"],
         }
 
 

@@ -130,11 +130,11 @@ class Writer:
 
         Where that does not fit on the disk, the last chunks make room for it; with `whole` OutputError is raised.
         """
-        kept = len(self._file)
+        max_chunks = len(self._file)
         while not self._end_fits(final, whole):
-            while len(self._file) >= kept:
+            while len(self._file) >= max_chunks:
                 self._drop_last()
-            kept -= 1
+            max_chunks -= 1
         self._file.publish()
 
     def close(self) -> None:
@@ -180,25 +180,25 @@ class Writer:
         self._check_space()
 
     def _check_space(self, room_bytes: int = 0) -> None:
-        least = self._min_free_bytes + room_bytes
-        if least == 0:
+        required_bytes = self._min_free_bytes + room_bytes
+        if required_bytes == 0:
             return
         with writing(self.path):
             status = os.statvfs(self.path.parent)
-        free = status.f_bavail * status.f_frsize
-        if free >= least:
+        free_bytes = status.f_bavail * status.f_frsize
+        if free_bytes >= required_bytes:
             return
         if self._min_free_bytes == 0:
             raise OutputError(f"{self.path}: {os.strerror(errno.ENOSPC)}", errno.ENOSPC)
-        stay = f"at least {self._min_free_bytes >> 20} MiB are to stay free"
-        raise OutputError(f"{self.path}: {free >> 20} MiB are free, {stay}", LOW_SPACE)
+        requirement = f"at least {self._min_free_bytes >> 20} MiB are to stay free"
+        raise OutputError(f"{self.path}: {free_bytes >> 20} MiB are free, {requirement}", LOW_SPACE)
 
 
 def _content(messages: Sequence[Message], before: bytes = b"") -> Content:
     """A chunk of `before` (records) and the messages, each in the index of its channel."""
-    records, places = bytearray(before), {}
+    records, index_entries = bytearray(before), {}
     for message in messages:
-        times, offsets = places.setdefault(message.channel, ([], []))
+        times, offsets = index_entries.setdefault(message.channel, ([], []))
         times.append(message.log_time)
         offsets.append(len(records))
         records += pack_message(*message)
@@ -206,8 +206,8 @@ def _content(messages: Sequence[Message], before: bytes = b"") -> Content:
         bytes(records),
         min(message.log_time for message in messages),
         max(message.log_time for message in messages),
-        {channel: len(place[0]) for channel, place in places.items()},
-        {channel: _index_record(channel, *place) for channel, place in places.items()},
+        {channel: len(place[0]) for channel, place in index_entries.items()},
+        {channel: _index_record(channel, *place) for channel, place in index_entries.items()},
     )
 
 

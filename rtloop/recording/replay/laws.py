@@ -76,10 +76,10 @@ def _law(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawRef
 
 def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
-    where = f"{recording.paths[0]}: law {name!r}"
+    location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
         if name not in BUILT_IN:
-            raise RecordingError(f"{where}: is not one of this version's, {', '.join(BUILT_IN)}")
+            raise RecordingError(f"{location}: is not one of this version's, {', '.join(BUILT_IN)}")
         return LawReference(name)
     for law in (*trust.files, *_installed(name)):
         if law.kind == name and law.sha256 == digest:
@@ -90,16 +90,16 @@ def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawR
     except ValueError as error:
         if not trust.recorded:
             raise RecordingError(
-                f"{where}: is not installed here as it ran there (sha256 {str(digest)[:12]}…), and {error}; --law FILE "
+                f"{location}: is not installed here as it ran there (sha256 {str(digest)[:12]}…), and {error}; --law FILE "
                 "names the file, and --trust-recorded-law runs the text that the recording holds"
             ) from None
     if law.sha256 != digest:
-        raise RecordingError(f"{where}: its recorded text is not the one that ran: the sha256 differs")
+        raise RecordingError(f"{location}: its recorded text is not the one that ran: the sha256 differs")
     try_first(law.file, law_class, law)
     try:
         layout_of([law])
     except (ValueError, KeyError) as error:
-        raise RecordingError(f"{where}: {error}") from None
+        raise RecordingError(f"{location}: {error}") from None
     return law
 
 

@@ -38,9 +38,9 @@ class Differences:
         finite = np.isfinite(difference)
         difference[~finite] = 0.0
         rows, places = difference.argmax(axis=0), np.arange(len(self._columns))
-        larger = difference[rows, places] > self._largest
-        self._largest[larger] = difference[rows, places][larger]
-        self._at_tick[larger] = recorded[rows[larger], signals.TICK].astype(np.int64)
+        is_larger = difference[rows, places] > self._largest
+        self._largest[is_larger] = difference[rows, places][is_larger]
+        self._at_tick[is_larger] = recorded[rows[is_larger], signals.TICK].astype(np.int64)
         self._square_sum += np.einsum("ij,ij->j", difference, difference)
         self._count += finite.sum(axis=0)
         self._trip = self._trip or first_trip(replayed)
@@ -70,8 +70,8 @@ class Performance:
         """Count consecutive ticks."""
         if not len(rows):
             return
-        errors, drives = (rows[:, [signals.axis_column(axis, which) for axis in self._axes]]
-                          for which in (signals.ERROR, signals.DRIVE))  # fmt: skip
+        errors, drives = (rows[:, [signals.axis_column(axis, signal) for axis in self._axes]]
+                          for signal in (signals.ERROR, signals.DRIVE))  # fmt: skip
         errors = np.nan_to_num(errors[rows[:, signals.MODE] == Mode.CLOSED_LOOP])
         self._square_sum += np.einsum("ij,ij->j", errors, errors)
         self._count += len(errors)
@@ -79,10 +79,10 @@ class Performance:
             self._error_um = np.maximum(self._error_um, np.abs(errors).max(axis=0))
         self._drive_v = np.fmax(self._drive_v, np.abs(drives).max(axis=0))
         if self._kept < STEP_ANALYSIS_TICKS:
-            wanted = [
-                signals.axis_column(a, which) for a in self._axes for which in (signals.REFERENCE, signals.POSITION)
+            columns = [
+                signals.axis_column(a, signal) for a in self._axes for signal in (signals.REFERENCE, signals.POSITION)
             ]
-            self._traces.append(rows[:, wanted].copy())
+            self._traces.append(rows[:, columns].copy())
             self._kept += len(rows)
         self.trip = self.trip or first_trip(rows)
 

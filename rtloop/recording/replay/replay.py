@@ -58,23 +58,23 @@ def law_of(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
     """The commands that took effect, as a schedule; those for references are not needed, whose samples are inputs."""
     commands = [message_of(event, recording.header["axes"]) for event in recording.events]
-    parts = [command for command in commands if command is not None and command["kind"][0] in kinds]
-    found = np.concatenate([np.zeros(0, MESSAGE), *parts])
-    found["values"][found["kind"] == Kind.SET_MODE, 2] = 0.0  # what was held is among the recorded references
-    return found
+    law_commands = [command for command in commands if command is not None and command["kind"][0] in kinds]
+    schedule = np.concatenate([np.zeros(0, MESSAGE), *law_commands])
+    schedule["values"][schedule["kind"] == Kind.SET_MODE, 2] = 0.0  # what was held is among the recorded references
+    return schedule
 
 
 def misplaced_command(events: Sequence[Event]) -> int | None:
     """Tick of the first command that stands in the file for the second time, or behind one of a later tick."""
-    last_tick, seen = 0, set()
+    last_tick, executed_keys = 0, set()
     for event in events:
         if event["kind"] not in OBEYED:
             continue
-        what = event["what"]
-        key = (event["tick"], event["kind"], event["axis"], what["identity"], *map(float, what["values"]))
-        if key in seen or event["tick"] < last_tick:
+        details = event["what"]
+        key = (event["tick"], event["kind"], event["axis"], details["identity"], *map(float, details["values"]))
+        if key in executed_keys or event["tick"] < last_tick:
             return int(event["tick"])
-        seen.add(key)
+        executed_keys.add(key)
         last_tick = event["tick"]
     return None
 
@@ -119,8 +119,8 @@ class _Replay:
                     self._consume(rows)
                     self._found += len(rows)
                 if self._report.first_difference:
-                    behind = self._report.first_difference["tick"] + 1
-                    self._report.pass_over(behind, None, "behind the first difference")
+                    first_unverified = self._report.first_difference["tick"] + 1
+                    self._report.pass_over(first_unverified, None, "behind the first difference")
                     self._pass_left_out()
                     return self._report
                 if self._progress:
@@ -158,8 +158,10 @@ class _Replay:
         if last is None:
             self._report.pass_over(expected, None, "the recording states no end; `rtloop recover` completes it")
             return
-        written = sum(one.totals["ticks_logged"] - one.repeated for one in extents if one.totals)
-        if self._found == written and last["result"] != RECOVERED:  # what its disk had no room for was never recorded
+        ticks_logged = sum(extent.totals["ticks_logged"] - extent.repeated for extent in extents if extent.totals)
+        if (
+            self._found == ticks_logged and last["result"] != RECOVERED
+        ):  # what its disk had no room for was never recorded
             self._gaps.append({"first_tick": expected, "count": last["ticks_executed"] - expected})
         self._pass_gap(expected, last["ticks_executed"])
 
@@ -204,9 +206,9 @@ class _Replay:
 
     def _start(self, tick: int, law: LawMemory) -> None:
         header = self._recording.header
-        still_to_come = self._commands[self._commands["tick"] > tick]
+        later_commands = self._commands[self._commands["tick"] > tick]
         self._report.stretches += 1
-        self._rerun = Rerun(header, Tape(header), self._laws, law, still_to_come, tick)
+        self._rerun = Rerun(header, Tape(header), self._laws, law, later_commands, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
         self._compare_rate(recorded)
@@ -243,11 +245,11 @@ class _Replay:
 
 def _same(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
     """Which values are equal in bytes; what was measured counts as equal."""
-    same = recorded.view(np.uint64) == replayed.view(np.uint64)
-    same[:, MEASURED] = True
+    is_equal = recorded.view(np.uint64) == replayed.view(np.uint64)
+    is_equal[:, MEASURED] = True
     flags = recorded[:, signals.FLAGS]
     with np.errstate(invalid="ignore"):
-        measured = flags.astype(np.int64) & int(Flag.OVERRUN)
-    expected = (replayed[:, signals.FLAGS].astype(np.int64) & ~int(Flag.OVERRUN) | measured).astype(np.float64)
-    same[:, signals.FLAGS] = flags.view(np.uint64) == expected.view(np.uint64)
-    return same
+        measured_flags = flags.astype(np.int64) & int(Flag.OVERRUN)
+    expected = (replayed[:, signals.FLAGS].astype(np.int64) & ~int(Flag.OVERRUN) | measured_flags).astype(np.float64)
+    is_equal[:, signals.FLAGS] = flags.view(np.uint64) == expected.view(np.uint64)
+    return is_equal

@@ -55,10 +55,10 @@ class Tape:
         channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
         self._extras = extras_of(header)
         self.extra_channels = {name: f"extra {name}" for name in extra_channels_of(header)}
-        read = tuple(Channel(self.extra_channels[name]) for name in self._extras.inputs)
-        written = tuple(Channel(self.extra_channels[output.name]) for output in self._extras.outputs)
-        inputs = (*channels[0], Channel("enable"), *read)
-        self.facts = Facts(inputs, (*channels[1], *written), observed, real=False)
+        input_channels = tuple(Channel(self.extra_channels[name]) for name in self._extras.inputs)
+        output_channels = tuple(Channel(self.extra_channels[output.name]) for output in self._extras.outputs)
+        inputs = (*channels[0], Channel("enable"), *input_channels)
+        self.facts = Facts(inputs, (*channels[1], *output_channels), observed, real=False)
         self.wiring = {axis: Wiring(f"{axis} in", f"{axis} out") for axis in axes}
         self._columns, self._axes, self._observed = len(header["columns"]), len(axes), len(observed)
         self._rows = np.full((SLICE_TICKS, TIMING_COLUMNS + 1 + len(inputs) + 1 + self._observed), np.nan)
@@ -76,19 +76,21 @@ class Tape:
         with np.errstate(over="ignore"):
             tape[:, 1] = tape[:, 0] + np.rint(rows[:, signals.LATENESS] * 1e3)
         flags = rows[:, signals.FLAGS].astype(np.int64)
-        lost = (flags & int(Flag.HEARTBEAT_LOST)) != 0
-        tape[:, 3] = np.where(lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again
+        is_heartbeat_lost = (flags & int(Flag.HEARTBEAT_LOST)) != 0
+        tape[:, 3] = np.where(is_heartbeat_lost, np.inf, np.nan)  # a heartbeat that was found too old is too old again
         tape[:, TIMING_COLUMNS] = rows[:, signals.DRIVER_STATUS]
         for axis in range(self._axes):
             tape[:, first + axis] = rows[:, signals.axis_column(axis, signals.ADC)]
         tape[:, first + self._axes] = rows[:, signals.ENABLE]
-        read = len(self._extras.inputs)
-        if read:
+        input_count = len(self._extras.inputs)
+        if input_count:
             begin = signals.axis_column(self._axes, 0)
-            tape[:, first + self._axes + 1 : first + self._axes + 1 + read] = rows[:, begin : begin + read]
-        tape[:, first + self._axes + 1 + read] = rows[:, signals.SAMPLE_AGE]
+            tape[:, first + self._axes + 1 : first + self._axes + 1 + input_count] = rows[
+                :, begin : begin + input_count
+            ]
+        tape[:, first + self._axes + 1 + input_count] = rows[:, signals.SAMPLE_AGE]
         if self._observed:
-            tape[:, first + self._axes + read + 2 :] = rows[:, self._columns - self._observed :]
+            tape[:, first + self._axes + input_count + 2 :] = rows[:, self._columns - self._observed :]
         self._playback.load(tape, (flags & int(Flag.WRITE_FAILED)) != 0)
 
 

@@ -18,7 +18,11 @@ def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law:
         if parts[0] != parts[1]:
             values = [np.frombuffer(part, dtype.base) for part in parts]
             pairs = list(zip(*values, strict=True))
-            index = next(i for i, (one, other) in enumerate(pairs) if one.tobytes() != other.tobytes())
+            index = next(
+                i
+                for i, (recorded_value, replayed_value) in enumerate(pairs)
+                if recorded_value.tobytes() != replayed_value.tobytes()
+            )
             place = name if len(pairs) == 1 else f"{name}[{index}]"
             return place, pairs[index][0].item(), pairs[index][1].item()
     return "law, bytes that belong to no field", None, None
@@ -28,9 +32,9 @@ def _values(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype
     """Name, type and offset of every field, in the order of a snapshot."""
     offset = 0
     tables: tuple[tuple[Which, Records], ...] = (("coefficients", law.coefficients), ("state", law.axes))
-    for which, records in tables:
-        for axis, owned in zip(axes, fields(law.layout, law.coefficients, which), strict=True):
-            for name, dtype, start in owned:
+    for record_kind, records in tables:
+        for axis, axis_fields in zip(axes, fields(law.layout, law.coefficients, record_kind), strict=True):
+            for name, dtype, start in axis_fields:
                 yield f"law.{axis}.{name}", dtype, offset + start
             offset += records.itemsize
     for name, (dtype, start, *_) in (LOOP_STATE.fields or {}).items():

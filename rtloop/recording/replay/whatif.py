@@ -96,12 +96,12 @@ def resimulate(recording: Recording, law: Law, driver: Driver, progress: Progres
                 _tell(progress, ticks)
     finally:
         driver.close()
-    beside = zip(axes, before.report(), after.report(), strict=True)
+    axis_reports = zip(axes, before.report(), after.report(), strict=True)
     return {
         "ticks": ticks,
         "problems": recording.problems,
         "trips": {"recorded": before.trip, "resimulated": after.trip},
-        "axes": [{"name": name, "recorded": old, "resimulated": new} for name, old, new in beside],
+        "axes": [{"name": name, "recorded": old, "resimulated": new} for name, old, new in axis_reports],
     }
 
 

@@ -69,24 +69,24 @@ def read_bands(
     Raises RecordingError where there is no tick.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
-    between = _overview(recording, names, start_s, end_s, points)
-    if count == 0 and not len(between[0]):
+    overview_band = _overview(recording, names, start_s, end_s, points)
+    if count == 0 and not len(overview_band[0]):
         until = "" if end_s == np.inf else f" before {end_s:g} s"
         raise RecordingError(f"{recording.paths[0]}: holds no tick from {start_s:g} s on{until}")
-    stretch = max(-(-count // points), 1)
-    times, lows, highs = [between[0]], [between[1]], [between[2]]
-    done = 0
+    ticks_per_point = max(-(-count // points), 1)
+    times, lows, highs = [overview_band[0]], [overview_band[1]], [overview_band[2]]
+    tick_count = 0
     for rows in recording.between(["deadline_ns", *names], start_s, end_s):
-        edges = np.arange(0, len(rows), stretch)
+        edges = np.arange(0, len(rows), ticks_per_point)
         times.append(rows[edges, 0] * 1e-9)
         values = np.where(np.abs(rows[:, 1:]) < BEYOND_DRAWING, rows[:, 1:], np.nan)
         lows.append(np.fmin.reduceat(values, edges))
         highs.append(np.fmax.reduceat(values, edges))
-        done += len(rows)
+        tick_count += len(rows)
         if progress:
-            progress(done)
+            progress(tick_count)
     time_s, low, high = np.concatenate(times), np.concatenate(lows), np.concatenate(highs)
-    if len(between[0]):
+    if len(overview_band[0]):
         order = np.argsort(time_s, kind="stable")
         time_s, low, high = time_s[order], low[order], high[order]
     return {name: Band(time_s, low[:, index], high[:, index]) for index, name in enumerate(names)}
@@ -94,28 +94,30 @@ def read_bands(
 
 def panels(recording: Recording) -> list[Panel]:
     """What a picture shows, from the top. Raises RecordingError where there is nothing."""
-    found = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in OF_AN_AXIS]
-    found.append(Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured"))
+    axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in OF_AN_AXIS]
+    axis_panels.append(
+        Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured")
+    )
     if "imported" in recording.header:
-        drawn = {name for panel in found for name in panel.names}
-        others = [name for name in recording.columns[DEADLINE + 1 :] if name not in drawn]
-        found += [Panel(name, recording.units[name], [name]) for name in others[:MOST_OTHERS]]
-    if not any(panel.names for panel in found):
+        panel_signals = {name for panel in axis_panels for name in panel.names}
+        other_names = [name for name in recording.columns[DEADLINE + 1 :] if name not in panel_signals]
+        axis_panels += [Panel(name, recording.units[name], [name]) for name in other_names[:MOST_OTHERS]]
+    if not any(panel.names for panel in axis_panels):
         raise RecordingError(f"{recording.paths[0]}: holds no signal that could be drawn")
-    return [panel for panel in found if panel.names]
+    return [panel for panel in axis_panels if panel.names]
 
 
 def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
-    there = [name for signal in names if (name := f"{axis}_{signal}") in recording]
+    present = [name for signal in names if (name := f"{axis}_{signal}") in recording]
     label = axis if len(names) > 1 else f"{axis} {kind_of(names[0])}"
-    return Panel(label, unit_of(names[0]), there)
+    return Panel(label, unit_of(names[0]), present)
 
 
 def kind_of(name: str) -> str:
     """`position` of `x_position_um`, by which signals are drawn alike; the name itself where it is nothing known."""
     kind = name.rpartition("_")[0].rpartition("_")[2]
-    known = [signal for names in (*OF_AN_AXIS, TIMING) for signal in names]
-    return kind if f"{kind}_{name.rpartition('_')[2]}" in known else name
+    suffixes = [signal for names in (*OF_AN_AXIS, TIMING) for signal in names]
+    return kind if f"{kind}_{name.rpartition('_')[2]}" in suffixes else name
 
 
 def _overview(
@@ -126,14 +128,17 @@ def _overview(
     if not recording.skipped:
         return np.empty(0), empty, empty
     overview = recording.overview
-    inside = (overview.time_s >= start_s) & (overview.time_s <= end_s)
-    edges = np.arange(0, np.count_nonzero(inside), max(-(-np.count_nonzero(inside) // points), 1))
+    in_interval = (overview.time_s >= start_s) & (overview.time_s <= end_s)
+    edges = np.arange(0, np.count_nonzero(in_interval), max(-(-np.count_nonzero(in_interval) // points), 1))
     if not len(edges):
         return np.empty(0), empty, empty
-    found = [overview[name] for name in names]
-    low, high = (np.stack([getattr(one, part)[inside] for one in found], axis=1) for part in ("least", "most"))
+    extremes = [overview[name] for name in names]
+    low, high = (
+        np.stack([getattr(signal_extremes, part)[in_interval] for signal_extremes in extremes], axis=1)
+        for part in ("least", "most")
+    )
     low, high = (np.where(np.abs(values) < BEYOND_DRAWING, values, np.nan) for values in (low, high))
-    begins_s, ends_s = overview.time_s[inside][edges], np.fmax.reduceat(overview.end_s[inside], edges)
+    begins_s, ends_s = overview.time_s[in_interval][edges], np.fmax.reduceat(overview.end_s[in_interval], edges)
     times_s = np.stack([begins_s, ends_s], axis=1).ravel()  # level from the beginning of each to its end
     reduced = np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
     return times_s, np.repeat(reduced[0], 2, axis=0), np.repeat(reduced[1], 2, axis=0)
@@ -152,13 +157,13 @@ def kept_spans(recording: Recording) -> list[tuple[float, float]]:
 
 def marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
     """The events between two times, without those that end a file."""
-    found = []
+    events = []
     for event in recording.events:
-        time_s, kind, what = event["time_ns"] * 1e-9, event["kind"], event["what"]
+        time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]
         if kind not in FINAL and start_s <= time_s <= end_s:
-            label = what.get("mode") or ": ".join(filter(None, [kind, ", ".join(what.get("causes", []))]))
-            found.append(Mark(time_s, label.replace("_", " "), kind in BAD))
-    return found
+            label = details.get("mode") or ": ".join(filter(None, [kind, ", ".join(details.get("causes", []))]))
+            events.append(Mark(time_s, label.replace("_", " "), kind in BAD))
+    return events
 
 
 def title(recording: Recording) -> str:

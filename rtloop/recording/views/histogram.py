@@ -49,11 +49,11 @@ class Histogram:
         """The smallest recorded value that at least this share of all values does not exceed."""
         large = sorted(self._large.items())
         values = np.concatenate([np.arange(self.LINEAR_NS), np.array([value for value, _ in large], np.int64)])
-        below = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
-        if below[-1] == 0:
+        cumulative = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
+        if cumulative[-1] == 0:
             return [None] * len(quantiles)
-        ranks = [max(math.ceil(quantile * below[-1]), 1) for quantile in quantiles]
-        return [float(values[np.searchsorted(below, rank)]) / NS_PER_US for rank in ranks]
+        ranks = [max(math.ceil(quantile * cumulative[-1]), 1) for quantile in quantiles]
+        return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
     def classes(self) -> list[dict[str, Any]]:
         """Counts below each of CLASSES_US, and None for the rest; empty where nothing was measured."""

@@ -35,14 +35,16 @@ def write_page(
     """Write the page, by default beside the recording. Raises RecordingError, OutputError."""
     recording = files if isinstance(files, Recording) else load(files)
     target = recording.paths[0].with_suffix(".html") if output is None else Path(output)
-    drawn = panels(recording)
-    bands = read_bands(recording, [name for panel in drawn for name in panel.names], start_s, end_s, POINTS, progress)
+    panels_drawn = panels(recording)
+    bands = read_bands(
+        recording, [name for panel in panels_drawn for name in panel.names], start_s, end_s, POINTS, progress
+    )
     time_s = next(iter(bands.values())).time_s
     data = {
         "about": _about(recording, bands),
         "problems": recording.problems,
         "time_s": _encoded(time_s, np.float64),
-        "panels": [_panel(panel, bands) for panel in drawn],
+        "panels": [_panel(panel, bands) for panel in panels_drawn],
         "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
     embedded = json.dumps(data).replace("<", "\\u003c")
@@ -54,8 +56,10 @@ def write_page(
 def _about(recording: Recording, bands: dict[str, Band]) -> str:
     host = recording.header.get("host", {})
     points = len(next(iter(bands.values())).time_s)
-    each = "every tick" if all(band.thin for band in bands.values()) else "each with the extremes of its ticks"
-    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), f"{points:,} points, {each}"]
+    point_description = (
+        "every tick" if all(band.thin for band in bands.values()) else "each with the extremes of its ticks"
+    )
+    parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), f"{points:,} points, {point_description}"]
     return " · ".join(filter(None, parts))
 
 

@@ -62,12 +62,14 @@ def plot(
         raise OutputError(f"{target}: no picture ends in {target.suffix!r}; possible are {', '.join(FORMATS)}")
     recording = files if isinstance(files, Recording) else load(files)
     target = target or recording.paths[0].with_suffix(FORMATS[0])
-    drawn = panels(recording)
-    bands = read_bands(recording, [name for panel in drawn for name in panel.names], start_s, end_s, POINTS, progress)
+    panels_drawn = panels(recording)
+    bands = read_bands(
+        recording, [name for panel in panels_drawn for name in panel.names], start_s, end_s, POINTS, progress
+    )
     time_s = next(iter(bands.values())).time_s
-    figure = Figure(figsize=(12, 2.0 + 2.1 * len(drawn)), layout="constrained")
+    figure = Figure(figsize=(12, 2.0 + 2.1 * len(panels_drawn)), layout="constrained")
     FigureCanvasAgg(figure)
-    _draw(figure, drawn, bands, marks(recording, time_s[0], time_s[-1]))
+    _draw(figure, panels_drawn, bands, marks(recording, time_s[0], time_s[-1]))
     for begin, end in kept_spans(recording):
         if begin <= time_s[-1] and end >= time_s[0]:
             for panel in figure.axes:
@@ -79,21 +81,21 @@ def plot(
 
 
 def _draw(figure: Any, drawn: list[Panel], bands: dict[str, Band], events: list[Mark]) -> None:
-    places = list(np.ravel(figure.subplots(len(drawn), 1, sharex=True)))
-    for place, panel in zip(places, drawn, strict=True):
+    plots = list(np.ravel(figure.subplots(len(drawn), 1, sharex=True)))
+    for subplot, panel in zip(plots, drawn, strict=True):
         if panel.empty and all(np.isnan(bands[name].high).all() for name in panel.names):
-            place.text(0.5, 0.5, panel.empty, transform=place.transAxes, ha="center")
-            place.plot([], [], label=kind_of(panel.names[-1]))
-            place.set_yticks([])
+            subplot.text(0.5, 0.5, panel.empty, transform=subplot.transAxes, ha="center")
+            subplot.plot([], [], label=kind_of(panel.names[-1]))
+            subplot.set_yticks([])
         else:
             for name in panel.names:
-                _trace(place, bands[name], kind_of(name))
-            place.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
-        place.grid(visible=True, alpha=0.3)
-        place.margins(x=0)
-        place.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
-    places[-1].set_xlabel("time since the start of the run / s")
-    _mark_events(places, events)
+                _trace(subplot, bands[name], kind_of(name))
+            subplot.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
+        subplot.grid(visible=True, alpha=0.3)
+        subplot.margins(x=0)
+        subplot.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
+    plots[-1].set_xlabel("time since the start of the run / s")
+    _mark_events(plots, events)
 
 
 def _trace(place: Any, band: Band, kind: str) -> None:
@@ -111,5 +113,5 @@ def _mark_events(panels: list[Any], events: list[Mark]) -> None:
         for panel in panels:
             panel.axvline(event.time_s, color="tab:red" if event.bad else "0.3", linewidth=0.7, linestyle=":")
     for event in events[:MAX_LABELS]:
-        place, above = (event.time_s, 1.02), panels[0].get_xaxis_transform()
-        panels[0].text(*place, event.label, transform=above, rotation=30, fontsize=8, parse_math=False)
+        place, transform = (event.time_s, 1.02), panels[0].get_xaxis_transform()
+        panels[0].text(*place, event.label, transform=transform, rotation=30, fontsize=8, parse_math=False)

@@ -31,23 +31,25 @@ class Selection:
             return recording.columns
         for pattern in self.signals:
             if not any(fnmatchcase(name, pattern) for name in recording.columns):
-                there = ", ".join(recording.columns)
-                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; there are {there}")
-        meant = (*ALWAYS, *self.signals)
-        return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in meant))
+                available = ", ".join(recording.columns)
+                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; there are {available}")
+        patterns = (*ALWAYS, *self.signals)
+        return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
     def blocks(self, recording: Recording, names: Sequence[str]) -> Generator[Rows]:
         """Arrays (n, names) of the ticks that are meant. Raises RecordingError where a stretch holds none."""
-        whole = self.start_s <= 0.0 and math.isinf(self.end_s)
-        asked = ["tick", *names]
-        found, first = False, 0.0
-        for rows in recording.blocks(asked) if whole else recording.between(asked, self.start_s, self.end_s):
-            if not found and len(rows):
-                found, first = True, rows[0, 0]
-            kept = rows if self.every == 1 else rows[(rows[:, 0] - first) % self.every == 0]
-            if len(kept):
-                yield kept[:, 1:]
-        if not found and not whole:
+        is_everything = self.start_s <= 0.0 and math.isinf(self.end_s)
+        columns = ["tick", *names]
+        has_ticks, first = False, 0.0
+        for rows in (
+            recording.blocks(columns) if is_everything else recording.between(columns, self.start_s, self.end_s)
+        ):
+            if not has_ticks and len(rows):
+                has_ticks, first = True, rows[0, 0]
+            selected = rows if self.every == 1 else rows[(rows[:, 0] - first) % self.every == 0]
+            if len(selected):
+                yield selected[:, 1:]
+        if not has_ticks and not is_everything:
             until = "" if math.isinf(self.end_s) else f" until {self.end_s:g} s"
             raise RecordingError(f"{recording.paths[0]}: holds no tick from {self.start_s:g} s on{until}")
 

@@ -44,8 +44,8 @@ def step_metrics(
     if table is None:
         return None
     unreached = int(np.count_nonzero(np.isinf(table[:, 1])))
-    middle, worst = np.median(table, axis=0), np.max(table, axis=0)
-    pairs = (float(value) for pair in zip(middle, worst, strict=True) for value in pair)
+    median, maximum = np.median(table, axis=0), np.max(table, axis=0)
+    pairs = (float(value) for pair in zip(median, maximum, strict=True) for value in pair)
     return StepMetrics(len(table), unreached, *pairs)
 
 
@@ -77,11 +77,11 @@ def _one_step(
     static_error = abs(final_um - level_um) / abs(height_um)
     if static_error > SETTLING_BAND:
         return math.nan, math.inf, 100 * static_error
-    beyond = (position_um - final_um) * np.sign(height_um)
-    outside = np.flatnonzero(np.abs(position_um - final_um) > SETTLING_BAND * abs(height_um))
-    settled_ticks = int(outside[-1]) + 1 if outside.size else 0
+    overshoot_um = (position_um - final_um) * np.sign(height_um)
+    unsettled = np.flatnonzero(np.abs(position_um - final_um) > SETTLING_BAND * abs(height_um))
+    settled_ticks = int(unsettled[-1]) + 1 if unsettled.size else 0
     return (
-        max(0.0, 100 * float(np.max(beyond)) / abs(height_um)),
+        max(0.0, 100 * float(np.max(overshoot_um)) / abs(height_um)),
         1000 * settled_ticks / rate_hz,
         100 * static_error,
     )

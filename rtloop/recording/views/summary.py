@@ -151,15 +151,15 @@ class Extremes:
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
         """Count a block; NaN is no number."""
-        for name, (least, largest) in self._found.items():
+        for name, (minimum, maximum) in self._found.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
-            self._found[name] = float(np.fmin(least, low)), float(np.fmax(largest, high))
+            self._found[name] = float(np.fmin(minimum, low)), float(np.fmax(maximum, high))
 
     def summary(self) -> list[Range]:
         """What came of it."""
         return [
-            Range(name, self._units[name], *(found if found[0] <= found[1] else (None, None)))
-            for name, found in self._found.items()
+            Range(name, self._units[name], *(extremes if extremes[0] <= extremes[1] else (None, None)))
+            for name, extremes in self._found.items()
         ]
 
 
@@ -190,13 +190,15 @@ class Totals:
             self.limited[name] += int(np.count_nonzero(flags & flag))
         for name in self.histograms.keys() & column.keys():
             self.histograms[name].add(column[name])
-        closed = column["mode"] == Mode.CLOSED_LOOP if "mode" in column else None
-        if closed is not None and flags.size:
-            self.closed_ticks += int(np.count_nonzero(closed))
-            self.saturated_ticks += int(np.count_nonzero(flags[closed] & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED)))
+        is_closed_loop = column["mode"] == Mode.CLOSED_LOOP if "mode" in column else None
+        if is_closed_loop is not None and flags.size:
+            self.closed_ticks += int(np.count_nonzero(is_closed_loop))
+            self.saturated_ticks += int(
+                np.count_nonzero(flags[is_closed_loop] & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED))
+            )
         with np.errstate(over="ignore", invalid="ignore"):  # any double may stand in a recording
             for axis in self.axes:
-                axis.add(column, closed)
+                axis.add(column, is_closed_loop)
             self.extremes.add(column)
 
     @property
@@ -229,10 +231,10 @@ def _seamless(end: dict[str, Any] | None) -> bool:
 
 def _overview_span_s(readers: Sequence[Reader], totals: Totals) -> float:
     """From the first deadline to the last where ticks were left out by intention; 0 where none were."""
-    found = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
-    if not found or totals.first is None:
+    deadlines = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
+    if not deadlines or totals.first is None:
         return 0.0
-    first, last = found[0][0, LEAST], found[-1][-1, MOST]
+    first, last = deadlines[0][0, LEAST], deadlines[-1][-1, MOST]
     return float(max(last, totals.last[1]) - min(first, totals.first[1])) / 1e9
 
 
@@ -240,14 +242,16 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
-    finished = ends[-1]
-    executed = finished["ticks_executed"] if finished else int(totals.last[0]) + 1 if totals.first else 0
-    begin, skipped = header.get("first_tick", 0), [one for reader in readers for one in reader.skipped]
+    end_totals = ends[-1]
+    executed = end_totals["ticks_executed"] if end_totals else int(totals.last[0]) + 1 if totals.first else 0
+    begin, skipped = header.get("first_tick", 0), [tick_range for reader in readers for tick_range in reader.skipped]
     executed = max([executed, *(first + count for first, count in skipped)])
     ticks_skipped = sum(count for _, count in skipped)
     lost = executed - begin - totals.ticks - ticks_skipped
     problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
-    whole = bool(finished and finished["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
+    is_complete = (
+        bool(end_totals and end_totals["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
+    )
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
     phases = {name: reports[name] for name in MEASURED[2:]}
     size_bytes = sum(reader.size_bytes for reader in readers)
@@ -274,9 +278,9 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         lateness_histogram=totals.histograms["lateness_us"].classes(),
         exec_us=reports["exec_us"],
         phases={name: None if report is None else report["p50"] for name, report in phases.items()},
-        complete=whole,
-        result=finished["result"] if finished else None,
-        driver_error=finished.get("driver_error") if finished else None,
+        complete=is_complete,
+        result=end_totals["result"] if end_totals else None,
+        driver_error=end_totals.get("driver_error") if end_totals else None,
         problems=problems,
         realtime=header.get("realtime"),
         host=header.get("host"),

@@ -80,20 +80,22 @@ def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode
 
     A mode that is over within a tick stands at FASTEST, as in `transfer_of`, and its standard deviation is infinite.
     """
-    found, i = [], 0
+    modes, i = [], 0
     for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
         size, width = abs(rate), 2 if rate.imag != 0 else 1
-        part = covariance[i : i + width, i : i + width]
-        by_size = np.array([rate.real, rate.imag][:width]) / size
-        by_damping = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
+        block = covariance[i : i + width, i : i + width]
+        size_gradient = np.array([rate.real, rate.imag][:width]) / size
+        damping_gradient = np.array([-(rate.imag**2), rate.real * rate.imag][:width]) / size**3
         share = width * abs(residue / (1 - image) / model.static_gain)
-        size_std, damping_std = (float(np.sqrt(max(d @ part @ d, 0.0))) for d in (by_size, by_damping))
+        size_std, damping_std = (
+            float(np.sqrt(max(gradient @ block @ gradient, 0.0))) for gradient in (size_gradient, damping_gradient)
+        )
         damping = -rate.real / size
         if rate.real * model.period_s < -FASTEST:
             size, size_std, damping, damping_std = FASTEST / model.period_s, np.inf, 1.0, np.inf
-        found.append(Mode(size / (2 * np.pi), size_std / (2 * np.pi), damping, damping_std, float(share)))
+        modes.append(Mode(size / (2 * np.pi), size_std / (2 * np.pi), damping, damping_std, float(share)))
         i += (3 if noise else 2) * width
-    return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
+    return tuple(sorted(modes, key=lambda mode: mode.frequency_hz))
 
 
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
@@ -113,7 +115,7 @@ def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[C
 
     A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """
-    reach: Complex = rates.copy()
-    reach.real = np.maximum(rates.real, -FASTEST / period_s)
-    static = np.expm1(reach * period_s) / np.expm1(rates * period_s)
-    return reach, residues * static
+    limited: Complex = rates.copy()
+    limited.real = np.maximum(rates.real, -FASTEST / period_s)
+    gain_ratio = np.expm1(limited * period_s) / np.expm1(rates * period_s)
+    return limited, residues * gain_ratio

@@ -46,18 +46,20 @@ class Candidate(NamedTuple):
 
 def identified_delay(run: Excitation, orders: Sequence[int]) -> int:
     """Samples of delay, 0 to MOST_TICKS; without a second part to judge by, as the fit itself tells."""
-    possible = _possible(run)
-    if len(possible) == 1:
-        return possible[0]
+    delays = _possible(run)
+    if len(delays) == 1:
+        return delays[0]
     start = held_out_from(run)
     candidates = [
         _candidate(ticks, model, delayed(run, ticks), start)
-        for ticks in possible
+        for ticks in delays
         for model in models_at_gap(first_part(delayed(run, ticks), start), orders)
     ]
     if not candidates:
-        return possible[-1]
-    return min(simplest(candidates), key=lambda one: _refitted_rms_um(one.model, delayed(run, one.ticks))).ticks
+        return delays[-1]
+    return min(
+        simplest(candidates), key=lambda candidate: _refitted_rms_um(candidate.model, delayed(run, candidate.ticks))
+    ).ticks
 
 
 def simplest(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -65,9 +67,9 @@ def simplest(candidates: Sequence[Candidate]) -> list[Candidate]:
 
     A candidate whose errors follow from the input counts only where there is no other.
     """
-    sound = [candidate for candidate in candidates if candidate.independent] or candidates
-    limit_um = min(candidate.rms_um for candidate in sound) * (1 + WORTH)
-    predictive = [candidate for candidate in sound if candidate.rms_um <= limit_um]
+    eligible = [candidate for candidate in candidates if candidate.independent] or candidates
+    limit_um = min(candidate.rms_um for candidate in eligible) * (1 + WORTH)
+    predictive = [candidate for candidate in eligible if candidate.rms_um <= limit_um]
     fewest_poles = min(candidate.model.order for candidate in predictive)
     return [candidate for candidate in predictive if candidate.model.order == fewest_poles]
 
@@ -101,11 +103,11 @@ def held_out_from(run: Excitation) -> int | None:
     It begins with the first change that has half of all changes before it, or else at least LEAST_SHARE of them.
     """
     changes = np.diff(run.input, prepend=0.0) ** 2
-    before = (np.cumsum(changes) - changes) / max(float(changes.sum()), 1e-300)
+    share_before = (np.cumsum(changes) - changes) / max(float(changes.sum()), 1e-300)
     for share in (0.5, LEAST_SHARE):
-        enough = np.flatnonzero((changes > 0) & (before >= share))
-        if enough.size and before[enough[0]] <= 1 - LEAST_SHARE:
-            return int(enough[0])
+        positions = np.flatnonzero((changes > 0) & (share_before >= share))
+        if positions.size and share_before[positions[0]] <= 1 - LEAST_SHARE:
+            return int(positions[0])
     return None
 
 

@@ -63,31 +63,34 @@ def identify_dynamics(
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': another recording is needed to validate on")
-    excited = excited_order(run)
-    wanted = order or LEAST_EXCITED
-    if excited < wanted:
+    excited_poles = excited_order(run)
+    needed_poles = order or LEAST_EXCITED
+    if excited_poles < needed_poles:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the input can tell {excited} poles apart, {wanted} are asked for; "
+            f"{run.name}: too little excitation: the input can tell {excited_poles} poles apart, {needed_poles} are asked for; "
             "a step or a chirp over all frequencies of interest would help"
         )
-    centred, corrected = with_measured_levels(replace(run, position_um=run.position_um - run.position_um[0]))
-    orders = [order] if order else range(1, min(largest_order, excited) + 1)
+    recording, corrected = with_measured_levels(replace(run, position_um=run.position_um - run.position_um[0]))
+    orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)
     if delay_ticks is None:
-        delay_ticks = identified_delay(centred, orders)
-    centred, validation = delayed(centred, delay_ticks), [delayed(one, delay_ticks) for one in validation]
-    start = held_out_from(centred) if criterion == "held-out" else None
-    fitted = fitted_models(first_part(centred, start), orders)
-    if not fitted:
+        delay_ticks = identified_delay(recording, orders)
+    recording, validation = (
+        delayed(recording, delay_ticks),
+        [delayed(other_run, delay_ticks) for other_run in validation],
+    )
+    start = held_out_from(recording) if criterion == "held-out" else None
+    models = fitted_models(first_part(recording, start), orders)
+    if not models:
         raise UnsuitableData(
             f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed"
         )
-    fitted = _settled_within(fitted, centred)
-    candidates = [_candidate(model, centred, start, validation) for model in fitted]
+    models = _settled_within(models, recording)
+    candidates = [_candidate(model, recording, start, validation) for model in models]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
-    model = fitted[_chosen(candidates, score, by_aic=criterion != "validation" and start is None)]
-    if start is not None and (better := refined(model, centred)) and _has_settled(better, centred):
-        model = better
-    return _described(model, centred, tuple(candidates), delay_ticks, corrected)
+    model = models[_chosen(candidates, score, by_aic=criterion != "validation" and start is None)]
+    if start is not None and (refitted := refined(model, recording)) and _has_settled(refitted, recording):
+        model = refitted
+    return _described(model, recording, tuple(candidates), delay_ticks, corrected)
 
 
 def _settled_within(fitted: Sequence[Innovations], run: Excitation) -> list[Innovations]:
@@ -140,7 +143,7 @@ def _described(
 ) -> DynamicsFit:
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
-    left = run.position_um - model.output(run.input)
+    output_error_um = run.position_um - model.output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)
     covariance = estimate_covariance(model, run, errors, white=tests.white)
     return DynamicsFit(
@@ -149,7 +152,7 @@ def _described(
         static_gain_std(model, covariance, noise=True),
         modes_of(model, covariance, noise=True),
         float(np.sqrt(np.mean(errors**2))),
-        100 * (1 - float(np.std(left) / np.std(run.position_um))),
+        100 * (1 - float(np.std(output_error_um) / np.std(run.position_um))),
         tests,
         candidates,
         model,

@@ -79,72 +79,74 @@ def identify_in_loop(
     """
     _require_enough(run)
     run = from_rest(run)
-    driven, answer = from_outside(run), from_outside(replace(run, input=run.position_um))
+    driven, driven_position = from_outside(run), from_outside(replace(run, input=run.position_um))
     data = Instrumented(run, driven)
-    search = Search(data, whitening_of(run.position_um - answer, SHORT))
-    found, as_good = _searched(search, order, largest_order, delay_ticks)
-    chosen = _final(search, found, as_good)
-    if chosen is None:
+    search = Search(data, whitening_of(run.position_um - driven_position, SHORT))
+    models, equivalent = _searched(search, order, largest_order, delay_ticks)
+    final = _final(search, models, equivalent)
+    if final is None:
         raise UnsuitableData(
             f"{run.name}: no stable model of order {order or f'1 to {largest_order}'} explains it; another order, or "
             "more excitation from outside, is needed"
         )
-    delay_ticks = chosen.judged.delay_ticks
-    later = [delayed(one, delay_ticks) for one in validation]
-    settled = [one for one in (*found, *as_good) if one.delay_ticks == delay_ticks and one.estimate.settled]
-    tried = {one.model.order: one for one in settled}
-    candidates = tuple(_candidate(tried[key], later) for key in sorted(tried))
-    return _described(run.name, chosen, late(data, delay_ticks), candidates)
+    delay_ticks = final.judged.delay_ticks
+    delayed_validation = [delayed(item, delay_ticks) for item in validation]
+    settled_models = [
+        item for item in (*models, *equivalent) if item.delay_ticks == delay_ticks and item.estimate.settled
+    ]
+    by_order = {item.model.order: item for item in settled_models}
+    candidates = tuple(_candidate(by_order[key], delayed_validation) for key in sorted(by_order))
+    return _described(run.name, final, late(data, delay_ticks), candidates)
 
 
 def _final(search: Search, found: list[Judged], as_good: list[Judged]) -> Final | None:
     """The best of those that are as good as any; where the whole recording settles none of them, the next best."""
-    finals = [final for one in as_good if (final := search.final(one))]
+    finals = [final for model in as_good if (final := search.final(model))]
     if finals:
-        return min(finals, key=lambda one: one.judged.total)
-    others = sorted((one for one in found if one.estimate.settled), key=lambda one: one.rms_um)
-    return next((final for one in others if (final := search.final(one))), None)
+        return min(finals, key=lambda model: model.judged.total)
+    fallbacks = sorted((model for model in found if model.estimate.settled), key=lambda model: model.rms_um)
+    return next((final for model in fallbacks if (final := search.final(model))), None)
 
 
 def _searched(
     search: Search, order: int | None, largest_order: int, delay_ticks: int | None
 ) -> tuple[list[Judged], list[Judged]]:
     """All models that were tried, and those of the fewest poles that are as good as any; none where none is stable."""
-    most, patience = order or largest_order, None if order else PATIENCE
-    found = search.grown(None, delay_ticks or 0, most, patience)
-    if order and found and not any(one.model.order == order and one.estimate.settled for one in found):
-        larger = search.grown(found[-1], delay_ticks or 0, order + SPARE)
-        found += [search.pruned(one, order) for one in larger]
-    found = [one for one in found if order in (None, one.model.order)]
-    if not found:
+    most_poles, patience = order or largest_order, None if order else PATIENCE
+    models = search.grown(None, delay_ticks or 0, most_poles, patience)
+    if order and models and not any(model.model.order == order and model.estimate.settled for model in models):
+        larger_models = search.grown(models[-1], delay_ticks or 0, order + SPARE)
+        models += [search.pruned(model, order) for model in larger_models]
+    models = [model for model in models if order in (None, model.model.order)]
+    if not models:
         return [], []
     if delay_ticks is None:
-        found = _with_delays(search, found)
-    as_good = preferred(found)
+        models = _with_delays(search, models)
+    equivalent = preferred(models)
     if order is not None:
-        return found, as_good
-    if as_good[0].delay_ticks and delay_ticks is None:
-        found += search.grown(as_good[0], as_good[0].delay_ticks, most, 1)
-        as_good = preferred(found)
-    as_good = [search.pruned(one) for one in as_good]
-    fewest = min(one.model.order for one in as_good)
-    return found, [one for one in as_good if one.model.order == fewest]
+        return models, equivalent
+    if equivalent[0].delay_ticks and delay_ticks is None:
+        models += search.grown(equivalent[0], equivalent[0].delay_ticks, most_poles, 1)
+        equivalent = preferred(models)
+    equivalent = [search.pruned(model) for model in equivalent]
+    fewest_poles = min(model.model.order for model in equivalent)
+    return models, [model for model in equivalent if model.model.order == fewest_poles]
 
 
 def _with_delays(search: Search, found: list[Judged]) -> list[Judged]:
     """Models behind 0 … MOST_TICKS samples, until one more makes all of them worse; none larger than without delay."""
     best = preferred(found)[0]
     largest = best.model.order
-    small = [one for one in found if one.model.order <= largest]
-    everything, row = list(found), [one for one in small if one.estimate.settled] or small
-    row = [*row, *(one for one in search.reduced(best) if one)]
+    small_models = [model for model in found if model.model.order <= largest]
+    all_models, current = list(found), [model for model in small_models if model.estimate.settled] or small_models
+    current = [*current, *(model for model in search.reduced(best) if model)]
     for _ in range(MOST_TICKS):
-        pairs = [(one, later) for one in row if (later := search.later(one))]
-        row = [later for _, later in pairs]
-        everything += row
-        if all(later.worse_than(one) for one, later in pairs):
+        pairs = [(model, later) for model in current if (later := search.later(model))]
+        current = [later for _, later in pairs]
+        all_models += current
+        if all(later.worse_than(model) for model, later in pairs):
             break
-    return everything
+    return all_models
 
 
 def _require_enough(run: LoopExcitation) -> None:
@@ -161,12 +163,12 @@ def _require_enough(run: LoopExcitation) -> None:
 
 def _candidate(judged: Judged, validation: Sequence[Excitation]) -> Candidate:
     unknowns = judged.model.pack(noise=False).size
-    left = [left_by(judged.model, run) for run in validation]
+    residuals = [left_by(judged.model, run) for run in validation]
     return Candidate(
         judged.model.order,
         judged.rms_um,
         2 * np.log(judged.rms_um) + 2 * unknowns / judged.squares.size,
-        float(np.sqrt(np.mean(np.concatenate(left) ** 2))) if left else np.nan,
+        float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))) if residuals else np.nan,
     )
 
 
@@ -174,17 +176,17 @@ def _described(name: str, chosen: Final, data: Instrumented, candidates: tuple[C
     model = chosen.estimate.model
     modes = modes_of(model, chosen.estimate.covariance, noise=False)
     _require_known(name, modes)
-    left = left_by(model, data.run)
-    whole = with_past(left.size)
-    errors = whitened(left, chosen.whitening)[whole]
+    residual_um = left_by(model, data.run)
+    past = with_past(residual_um.size)
+    errors = whitened(residual_um, chosen.whitening)[past]
     return DynamicsFit(
         transfer_of(model),
         model.static_gain,
         static_gain_std(model, chosen.estimate.covariance, noise=False),
         modes,
         float(np.sqrt(np.mean(errors**2))),
-        100 * (1 - float(np.std(left) / np.std(data.run.position_um))),
-        residual_tests(data.driven[whole], errors, ARX_ORDER),
+        100 * (1 - float(np.std(residual_um) / np.std(data.run.position_um))),
+        residual_tests(data.driven[past], errors, ARX_ORDER),
         candidates,
         model,
         chosen.judged.delay_ticks,

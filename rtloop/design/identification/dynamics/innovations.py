@@ -93,12 +93,16 @@ class Innovations:
         through_noise = _modes(self, errors) if noise else through_input
         rows: list[Real] = []
         for i, image in enumerate(self.images):
-            moved = self.residues[i] * _mode(image, through_input[i])
+            pole_response = self.residues[i] * _mode(image, through_input[i])
             if noise:
-                moved = moved + self.noise_gains[i] * _mode(image, through_noise[i])
-            parts = [self.period_s * image * moved, through_input[i], *([through_noise[i]] if noise else [])]
+                pole_response = pole_response + self.noise_gains[i] * _mode(image, through_noise[i])
+            gradients = [
+                self.period_s * image * pole_response,
+                through_input[i],
+                *([through_noise[i]] if noise else []),
+            ]
             pair = self.rates[i].imag != 0
-            rows += [row for part in parts for row in (_both(part) if pair else [part.real])]
+            rows += [row for part in gradients for row in (_both(part) if pair else [part.real])]
         rows.append(np.ones(u.size))
         return -self.whiten(np.array(rows), self.predictor_poles())
 
@@ -112,12 +116,12 @@ class Innovations:
 
     def unpack(self, values: Real, *, noise: bool) -> Innovations:
         """The model with other unknowns; which modes are pairs stays."""
-        found: list[list[complex]] = []
+        unknowns: list[list[complex]] = []
         numbers = iter(values[:-1].tolist())
         for rate in self.rates:
             pair = rate.imag != 0
-            found.append([complex(next(numbers), next(numbers) if pair else 0.0) for _ in range(3 if noise else 2)])
-        columns = np.array(found, dtype=complex).reshape(len(found), 3 if noise else 2).T
+            unknowns.append([complex(next(numbers), next(numbers) if pair else 0.0) for _ in range(3 if noise else 2)])
+        columns = np.array(unknowns, dtype=complex).reshape(len(unknowns), 3 if noise else 2).T
         gains = columns[2] if noise else self.noise_gains
         return Innovations(self.period_s, columns[0], columns[1], gains, float(values[-1]))
 

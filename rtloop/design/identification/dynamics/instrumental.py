@@ -58,49 +58,49 @@ def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kep
 
     Where no steps lead from `start` to Σ ψ ε = 0, they begin anew from the two-stage method's model.
     """
-    if (found := settled(start, data, whitening, kept)).settled:
-        return found
+    if (first_estimate := settled(start, data, whitening, kept)).settled:
+        return first_estimate
     driven, x = whitened(data.driven, whitening), whitened(data.run.position_um, whitening)
-    first = descended(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
-    return settled(first, data, whitening, kept) if _decays(first) else None
+    two_stage = descended(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
+    return settled(two_stage, data, whitening, kept) if _decays(two_stage) else None
 
 
 def settled(first: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate:
     """From `first` to where Σ ψ ε = 0, or `first` where the steps do not settle."""
-    u, driven, x = (whitened(one, whitening) for one in (data.run.input, data.driven, data.run.position_um))
-    step, spread = _step(first, u, driven, x, kept)
-    without = Estimate(first, spread, settled=False)
+    u, driven, x = (whitened(signal, whitening) for signal in (data.run.input, data.driven, data.run.position_um))
+    step, initial_covariance = _step(first, u, driven, x, kept)
+    unsettled = Estimate(first, initial_covariance, settled=False)
     model = first
     for _ in range(STEPS):
         model = _moved(model, step)
         if not _decays(model):
-            return without
+            return unsettled
         step, covariance = _step(model, u, driven, x, kept)
         if np.all(np.abs(step) <= NEAR * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
             return Estimate(model, covariance, settled=True)
-    return without
+    return unsettled
 
 
 def left_by(model: Innovations, run: Excitation) -> Real:
     """x − G u − x₀ (samples,): noise, where the model is right. x₀, and an offset, are those that leave least."""
-    left = run.position_um - model.output(run.input)
-    ringing = _ringing(model, left.size)
-    return left - np.linalg.lstsq(ringing.T, left, rcond=None)[0] @ ringing
+    error = run.position_um - model.output(run.input)
+    decays = _ringing(model, error.size)
+    return error - np.linalg.lstsq(decays.T, error, rcond=None)[0] @ decays
 
 
 def whitening_of(noise: Real, most: int = NOISE_ORDER) -> Real:
     """A_n (NOISE_ORDER + 1,), of the order up to `most` that Akaike's criterion takes (Levinson's recursion)."""
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
-    along = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
-    longer, power = np.eye(1, NOISE_ORDER + 1)[0], float(along[0])
-    found, least = longer, np.inf
+    autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
+    coefficients, power = np.eye(1, NOISE_ORDER + 1)[0], float(autocorrelation[0])
+    best, least_criterion = coefficients, np.inf
     for order in range(1, most + 1):
-        reflected = float(longer[:order] @ along[order:0:-1]) / power
-        longer = longer - reflected * np.pad(longer[order::-1], (0, NOISE_ORDER - order))
-        power *= 1 - reflected**2
-        if (criterion := noise.size * np.log(power) + 2 * order) < least:
-            found, least = longer, criterion
-    return found
+        reflection = float(coefficients[:order] @ autocorrelation[order:0:-1]) / power
+        coefficients = coefficients - reflection * np.pad(coefficients[order::-1], (0, NOISE_ORDER - order))
+        power *= 1 - reflection**2
+        if (criterion := noise.size * np.log(power) + 2 * order) < least_criterion:
+            best, least_criterion = coefficients, criterion
+    return best
 
 
 def whitened(signals: Real, whitening: Real) -> Real:
@@ -128,17 +128,17 @@ def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tup
 
     All signals are whitened and whole: one that is cut begins with a jump, which rings in ψ and not in the position.
     """
-    ringing, nothing = _ringing(model, u.size)[:, kept], np.zeros_like(u)
+    decays, zeros = _ringing(model, u.size)[:, kept], np.zeros_like(u)
     slopes, instruments = (
-        np.vstack([-model.sensitivities(one, nothing, noise=False)[:-1][:, kept], ringing]) for one in (u, driven)
+        np.vstack([-model.sensitivities(signal, zeros, noise=False)[:-1][:, kept], decays]) for signal in (u, driven)
     )
     scale = np.linalg.norm(instruments, axis=1)
     scale[scale == 0] = 1.0
     slopes, instruments = slopes / scale[:, None], instruments / scale[:, None]
-    left = (x - replace(model, offset=0.0).output(u))[kept]
+    residual = (x - replace(model, offset=0.0).output(u))[kept]
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
-    step = inverse @ (instruments @ left)
-    variance = float(np.sum((left - step @ slopes) ** 2)) / max(left.size - step.size - NOISE_ORDER, 1)
+    step = inverse @ (instruments @ residual)
+    variance = float(np.sum((residual - step @ slopes) ** 2)) / max(residual.size - step.size - NOISE_ORDER, 1)
     with np.errstate(over="ignore", invalid="ignore"):
         covariance = variance * inverse @ (instruments @ instruments.T) @ inverse.T / np.outer(scale, scale)
     count = model.pack(noise=False).size - 1
@@ -151,9 +151,9 @@ def _decays(model: Innovations) -> bool:
 
 def _moved(model: Innovations, step: Real) -> Innovations:
     """By `step`, or by a part of it where all of it moves a pole beyond FURTHEST, or to where it does not decay."""
-    tried = model
+    updated = model
     for halvings in range(HALVINGS):
-        tried = model.unpack(model.pack(noise=False) + np.append(step, 0.0) / 2**halvings, noise=False)
-        if _decays(tried) and np.all(np.abs(tried.rates - model.rates) <= FURTHEST * np.abs(model.rates)):
+        updated = model.unpack(model.pack(noise=False) + np.append(step, 0.0) / 2**halvings, noise=False)
+        if _decays(updated) and np.all(np.abs(updated.rates - model.rates) <= FURTHEST * np.abs(model.rates)):
             break
-    return tried
+    return updated

@@ -16,5 +16,5 @@ from rtloop.hil.modal import Complex, Modal, Real
 def held_from(rates: Complex, residues: Complex, direct: Real, period_s: float) -> Modal:
     """The sum in s with poles `rates` (n,) whose zero-order hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
     x = rates * period_s
-    held = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
-    return Modal(rates, residues / (period_s * held), direct)
+    hold_factor = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
+    return Modal(rates, residues / (period_s * hold_factor), direct)

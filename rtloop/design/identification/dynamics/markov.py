@@ -57,13 +57,13 @@ class Guesses:
 
     def model(self, order: int) -> Innovations | None:
         """`order` modes without noise model; None where a mode has no continuous counterpart or does not decay."""
-        images = self._images(order)
-        if np.any((images.imag == 0) & (images.real < SMALLEST_IMAGE)) or np.any(np.abs(images) < SMALLEST_IMAGE):
+        z_poles = self._images(order)
+        if np.any((z_poles.imag == 0) & (z_poles.real < SMALLEST_IMAGE)) or np.any(np.abs(z_poles) < SMALLEST_IMAGE):
             return None
-        images = images[images.imag >= 0]
-        images = np.where(np.abs(images) >= 1, images * (0.9999 / np.abs(images)), images)
-        nothing = np.zeros(images.size, dtype=complex)
-        return Innovations(self._period_s, (np.log(images) / self._period_s).astype(complex), nothing, nothing)
+        z_poles = z_poles[z_poles.imag >= 0]
+        z_poles = np.where(np.abs(z_poles) >= 1, z_poles * (0.9999 / np.abs(z_poles)), z_poles)
+        no_gains = np.zeros(z_poles.size, dtype=complex)
+        return Innovations(self._period_s, (np.log(z_poles) / self._period_s).astype(complex), no_gains, no_gains)
 
     def _images(self, order: int) -> Complex:
         """Eigenvalues of the shift along the Hankel matrix's dominant column space."""
@@ -75,13 +75,13 @@ class Guesses:
 def with_residues(model: Innovations, u: Real, y: Real) -> Innovations:
     """The model with residues and offset that fit best, its rates as they are."""
     rows = -model.sensitivities(u, np.zeros_like(u), noise=False)
-    values, kept = model.pack(noise=False), []
+    values, solved = model.pack(noise=False), []
     i = 0
     for rate in model.rates:
         width = 2 if rate.imag != 0 else 1
-        kept += range(i + width, i + 2 * width)
+        solved += range(i + width, i + 2 * width)
         i += 2 * width
-    kept.append(values.size - 1)
-    scale = np.sqrt((rows[kept] ** 2).mean(axis=1)) + 1e-300
-    values[kept] = np.linalg.lstsq((rows[kept] / scale[:, None]).T, y, rcond=None)[0] / scale
+    solved.append(values.size - 1)
+    scale = np.sqrt((rows[solved] ** 2).mean(axis=1)) + 1e-300
+    values[solved] = np.linalg.lstsq((rows[solved] / scale[:, None]).T, y, rcond=None)[0] / scale
     return model.unpack(values, noise=False)

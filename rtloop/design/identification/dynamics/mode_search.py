@@ -33,10 +33,10 @@ class Spectra:
     def __init__(self, left: Real, driven: Real, period_s: float) -> None:
         size = 1 << (2 * left.size - 1).bit_length()
         spectrum = np.fft.rfft(driven, size)
-        together = max(1, int(RESOLUTION_HZ * size * period_s))
-        self._power = _blocks(np.abs(spectrum) ** 2, together)
-        self._cross = _blocks(np.conj(spectrum) * np.fft.rfft(left, size), together)
-        middles = together * np.arange(self._power.size) + (together - 1) / 2
+        block_size = max(1, int(RESOLUTION_HZ * size * period_s))
+        self._power = _blocks(np.abs(spectrum) ** 2, block_size)
+        self._cross = _blocks(np.conj(spectrum) * np.fft.rfft(left, size), block_size)
+        middles = block_size * np.arange(self._power.size) + (block_size - 1) / 2
         self._back: Complex = np.exp(-2j * np.pi * middles / size)
         self._period_s = period_s
         self._variance = float(np.sum(left**2)) * size / 2 / left.size
@@ -48,9 +48,9 @@ class Spectra:
         real_gain, real = self._best((-np.geomspace(self._slowest, top, REAL)).astype(complex))
         if not pair_allowed:
             return real
-        pair_gain, pair = max((self._pair(damping, top) for damping in DAMPINGS), key=lambda found: found[0])
-        worth = {True: pair_gain, False: real_gain}
-        return pair if self._worth(worth, pair=True) >= self._worth(worth, pair=False) else real
+        pair_gain, pair = max((self._pair(damping, top) for damping in DAMPINGS), key=lambda scored: scored[0])
+        gains = {True: pair_gain, False: real_gain}
+        return pair if self._worth(gains, pair=True) >= self._worth(gains, pair=False) else real
 
     def _pair(self, damping: float, top: float) -> tuple[float, complex]:
         """The best near this damping: each has its own, because from a broad pair no way leads to a light one."""
@@ -60,7 +60,9 @@ class Spectra:
         for _ in range(ZOOMS):
             near = abs(pair) * np.geomspace(1 / step, step, ZOOMED)
             dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
-            gain, pair = max((gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda c: c[0])
+            gain, pair = max(
+                (gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda scored: scored[0]
+            )
             step **= 2 / (ZOOMED - 1)
         return gain, pair
 
@@ -68,20 +70,27 @@ class Spectra:
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
     def _best(self, rates: Complex) -> tuple[float, complex]:
-        return max(((self._explained(rate), complex(rate)) for rate in rates), key=lambda found: found[0])
+        return max(((self._explained(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
 
     def _explained(self, rate: complex) -> float:
         """Energy of e that the best residues of this mode explain."""
         image = np.exp(rate * self._period_s)
         if rate.imag == 0:
-            below = self._back / (1 - image.real * self._back)
-            return float((np.conj(below) @ self._cross).real ** 2 / ((np.abs(below) ** 2) @ self._power))
-        below = 1 / (1 - 2 * image.real * self._back + abs(image) ** 2 * self._back**2)
-        weight = np.abs(below) ** 2 * self._power
-        across = np.conj(below * self._back) * self._cross
-        own, shared = weight.sum(), weight @ self._back.real
-        sides = np.array([across.sum().real, (across @ np.conj(self._back)).real])
-        return float(sides @ np.linalg.solve([[own * (1 + 1e-12), shared], [shared, own * (1 + 1e-12)]], sides))
+            mode_response = self._back / (1 - image.real * self._back)
+            return float(
+                (np.conj(mode_response) @ self._cross).real ** 2 / ((np.abs(mode_response) ** 2) @ self._power)
+            )
+        mode_response = 1 / (1 - 2 * image.real * self._back + abs(image) ** 2 * self._back**2)
+        weight = np.abs(mode_response) ** 2 * self._power
+        weighted_cross = np.conj(mode_response * self._back) * self._cross
+        auto_energy, cross_energy = weight.sum(), weight @ self._back.real
+        right_side = np.array([weighted_cross.sum().real, (weighted_cross @ np.conj(self._back)).real])
+        return float(
+            right_side
+            @ np.linalg.solve(
+                [[auto_energy * (1 + 1e-12), cross_energy], [cross_energy, auto_energy * (1 + 1e-12)]], right_side
+            )
+        )
 
 
 def _pairs(sizes: Real, dampings: Real) -> Complex:

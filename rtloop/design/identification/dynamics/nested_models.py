@@ -57,8 +57,8 @@ class Judged:
 
     def worse_than(self, other: Judged) -> bool:
         """By more than chance."""
-        more = self.squares - other.squares
-        return float(more.mean()) > CLEAR * float(more.std()) / np.sqrt(more.size)
+        excess = self.squares - other.squares
+        return float(excess.mean()) > CLEAR * float(excess.std()) / np.sqrt(excess.size)
 
 
 class Final(NamedTuple):
@@ -74,26 +74,26 @@ class Search:
 
     def __init__(self, data: Instrumented, whitening: Real) -> None:
         self._data, self._whitening, self._judging = data, whitening, whitening
-        whole, blocks = with_past(data.run.input.size), np.arange(data.run.input.size) // BLOCK
-        self._whole, self._kept = whole, whole & (blocks % 2 == 0)
-        self._held_out: npt.NDArray[np.bool_] = whole & (blocks % 2 == 1)
+        has_past, blocks = with_past(data.run.input.size), np.arange(data.run.input.size) // BLOCK
+        self._whole, self._kept = has_past, has_past & (blocks % 2 == 0)
+        self._held_out: npt.NDArray[np.bool_] = has_past & (blocks % 2 == 1)
 
     def grown(self, start: Judged | None, delay_ticks: int, most: int, in_vain: int | None = None) -> list[Judged]:
         """From `start`, or from nothing, by a mode more each, up to `most` poles, or until `in_vain` in a row do not
         pay."""
         data = late(self._data, delay_ticks)
-        found = [start] if start else []
+        models = [start] if start else []
         model = start.model if start else _nothing(data.run.period_s)
-        while model.order < most and not (in_vain and len(found) > in_vain and _in_vain(found, in_vain)):
+        while model.order < most and not (in_vain and len(models) > in_vain and _in_vain(models, in_vain)):
             rate = self._next(model, data, pair_allowed=most - model.order > 1)
             if (judged := self._judged(with_mode(model, rate), delay_ticks, fresh=True)) is None:
                 break
-            found.append(judged)
+            models.append(judged)
             model = judged.model
-        if found:
-            best = min(found, key=lambda one: one.rms_um)
+        if models:
+            best = min(models, key=lambda item: item.rms_um)
             self._judging = whitening_of(left_by(best.model, data.run))
-        return [self._scored(one.estimate, delay_ticks) for one in found]
+        return [self._scored(item.estimate, delay_ticks) for item in models]
 
     def later(self, judged: Judged) -> Judged | None:
         """The same modes behind one sample of delay more: each begins a sample earlier behind it."""
@@ -105,8 +105,12 @@ class Search:
         """Without the modes that do not pay; where an `order` is asked for, without those above it that pay least."""
         if order and judged.model.order <= order:
             return judged
-        fewer = self.reduced(judged)
-        best = min((one for one in fewer if one and one.estimate.settled), key=lambda one: one.rms_um, default=None)
+        reduced = self.reduced(judged)
+        best = min(
+            (candidate for candidate in reduced if candidate and candidate.estimate.settled),
+            key=lambda candidate: candidate.rms_um,
+            default=None,
+        )
         return judged if best is None or (not order and best.worse_than(judged)) else self.pruned(best, order)
 
     def reduced(self, judged: Judged) -> list[Judged | None]:
@@ -125,14 +129,16 @@ class Search:
         return Final(estimate, whitening, self._scored(estimate, judged.delay_ticks))
 
     def _next(self, model: Innovations, data: Instrumented, *, pair_allowed: bool) -> complex:
-        left, driven = (whitened(one, self._whitening) for one in (left_by(model, data.run), data.driven))
-        left[~self._whole] = 0.0
-        return Spectra(left, driven, data.run.period_s).mode(pair_allowed=pair_allowed)
+        residual, driven = (whitened(signal, self._whitening) for signal in (left_by(model, data.run), data.driven))
+        residual[~self._whole] = 0.0
+        return Spectra(residual, driven, data.run.period_s).mode(pair_allowed=pair_allowed)
 
     def _judged(self, start: Innovations, delay_ticks: int, *, fresh: bool = False) -> Judged | None:
         data, whitening = late(self._data, delay_ticks), self._judging
         if fresh:
-            start = with_residues(start, *(whitened(one, whitening) for one in (data.driven, data.run.position_um)))
+            start = with_residues(
+                start, *(whitened(signal, whitening) for signal in (data.driven, data.run.position_um))
+            )
         estimate = estimated(start, data, whitening, self._kept)
         return self._scored(estimate, delay_ticks) if estimate else None
 
@@ -144,11 +150,11 @@ class Search:
 def preferred(found: list[Judged]) -> list[Judged]:
     """Of those that settled, where any did, those of the fewest poles which are not worse than the best; first that
     which fits all of the recording best."""
-    among = [one for one in found if one.estimate.settled] or found
-    best = min(among, key=lambda one: one.rms_um)
-    as_good = [one for one in among if not one.worse_than(best)]
-    fewest = min(one.model.order for one in as_good)
-    return sorted((one for one in as_good if one.model.order == fewest), key=lambda one: one.total)
+    eligible = [model for model in found if model.estimate.settled] or found
+    best = min(eligible, key=lambda model: model.rms_um)
+    equivalent = [model for model in eligible if not model.worse_than(best)]
+    fewest_poles = min(model.model.order for model in equivalent)
+    return sorted((model for model in equivalent if model.model.order == fewest_poles), key=lambda model: model.total)
 
 
 def late(data: Instrumented, ticks: int) -> Instrumented:
@@ -162,8 +168,8 @@ def with_mode(model: Innovations, rate: complex) -> Innovations:
 
 
 def _in_vain(found: list[Judged], last: int) -> bool:
-    best = min(found[:-last], key=lambda one: one.rms_um)
-    return not any(best.worse_than(one) for one in found[-last:])
+    best = min(found[:-last], key=lambda model: model.rms_um)
+    return not any(best.worse_than(model) for model in found[-last:])
 
 
 def _without(model: Innovations, mode: int) -> Innovations:

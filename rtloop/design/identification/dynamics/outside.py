@@ -43,15 +43,15 @@ def from_rest(run: LoopExcitation) -> LoopExcitation:
 
 def from_outside(run: LoopExcitation) -> Real:
     """û (samples,) of a recording whose signals begin at 0."""
-    moved = [one for one in run.outside if np.ptp(one) > 0]
-    regressors = np.vstack([lagged((run.input,), ARX_ORDER), moved, lagged(moved, ARX_ORDER)])
+    moving = [signal for signal in run.outside if np.ptp(signal) > 0]
+    regressors = np.vstack([lagged((run.input,), ARX_ORDER), moving, lagged(moving, ARX_ORDER)])
     scale = np.sqrt(np.mean(regressors**2, axis=1)) + 1e-300
     regressors /= scale[:, None]
     normal = regressors @ regressors.T
     normal[np.diag_indices_from(normal)] += RIDGE * run.input.size
-    found = solve(normal, regressors @ run.input, assume_a="pos") / scale
-    driven = found[ARX_ORDER:] @ (regressors[ARX_ORDER:] * scale[ARX_ORDER:, None])
-    return np.asarray(lfilter([1.0], _stable(np.concatenate([[1.0], -found[:ARX_ORDER]])), driven), dtype=float)
+    coefficients = solve(normal, regressors @ run.input, assume_a="pos") / scale
+    driven = coefficients[ARX_ORDER:] @ (regressors[ARX_ORDER:] * scale[ARX_ORDER:, None])
+    return np.asarray(lfilter([1.0], _stable(np.concatenate([[1.0], -coefficients[:ARX_ORDER]])), driven), dtype=float)
 
 
 def _stable(polynomial: Real) -> Real:

@@ -55,34 +55,34 @@ def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     until, behind the last likely one, two more in turn do not pay."""
     guesses = _guesses(run)
     clear, likely = guesses.gap(max(orders), CLEAR), guesses.gap(max(orders), LIKELY)
-    found: list[Innovations] = []
+    models: list[Innovations] = []
     errors: list[float] = []
-    for order in orders if len(orders) == 1 else [one for one in orders if one >= clear - 2]:
+    for order in orders if len(orders) == 1 else [candidate for candidate in orders if candidate >= clear - 2]:
         start = guesses.model(order)
-        if start is None and found and found[-1].order == order - 1:
-            start = _grown(found[-1])
+        if start is None and models and models[-1].order == order - 1:
+            start = _grown(models[-1])
         model = start and refined(with_residues(start, run.input, run.position_um), run)
         if model is None:
             continue
-        found.append(model)
+        models.append(model)
         errors.append(rms_error(model, run))
         if order > likely and len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
             break
-    return found
+    return models
 
 
 def models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Models of the order within `orders` that the impulse response shows, and of one pole more: a fast real pole
     hides below the gap. Empty where none is stable."""
     guesses = _guesses(run)
-    at_gap = guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0]
-    fitted: list[Innovations] = []
-    for order in [order for order in (at_gap, at_gap + 1) if order in orders]:
-        start = guesses.model(order) or (_grown(fitted[-1]) if fitted else None)
+    gap_order = guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0]
+    models: list[Innovations] = []
+    for order in [order for order in (gap_order, gap_order + 1) if order in orders]:
+        start = guesses.model(order) or (_grown(models[-1]) if models else None)
         model = start and refined(with_residues(start, run.input, run.position_um), run)
         if model is not None:
-            fitted.append(model)
-    return fitted
+            models.append(model)
+    return models
 
 
 def _guesses(run: Excitation) -> Guesses:
@@ -111,21 +111,23 @@ def descended(model: Innovations, run: Excitation, *, noise: bool, kept: Kept = 
     """Downhill from `model` to the least sum of squared errors of the samples `kept`, with or without noise model."""
 
     def errors(values: Real) -> Real:
-        tried = model.unpack(values, noise=noise)
-        if np.any(tried.rates.real >= 0) or (found := tried.errors(run.input, run.position_um)) is None:
+        trial = model.unpack(values, noise=noise)
+        if np.any(trial.rates.real >= 0) or (solution := trial.errors(run.input, run.position_um)) is None:
             return np.full(run.input.size, USELESS)
-        return np.clip(np.nan_to_num(found, nan=USELESS), -USELESS, USELESS)
+        return np.clip(np.nan_to_num(solution, nan=USELESS), -USELESS, USELESS)
 
     def jacobian(values: Real) -> Real:
-        tried = model.unpack(values, noise=noise)
-        found = tried.sensitivities(run.input, errors(values), noise=noise).T
-        return np.clip(np.nan_to_num(found, nan=STEEPEST), -STEEPEST, STEEPEST)
+        trial = model.unpack(values, noise=noise)
+        solution = trial.sensitivities(run.input, errors(values), noise=noise).T
+        return np.clip(np.nan_to_num(solution, nan=STEEPEST), -STEEPEST, STEEPEST)
 
     settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
     with np.errstate(over="ignore", invalid="ignore"):
-        of_kept: Any = lambda values: jacobian(values)[kept]
-        found = least_squares(lambda values: errors(values)[kept], model.pack(noise=noise), of_kept, **settings)
-    return model.unpack(found.x, noise=noise)
+        selected_jacobian: Any = lambda values: jacobian(values)[kept]
+        solution = least_squares(
+            lambda values: errors(values)[kept], model.pack(noise=noise), selected_jacobian, **settings
+        )
+    return model.unpack(solution.x, noise=noise)
 
 
 def has_counterpart(model: Innovations) -> bool:
@@ -150,5 +152,5 @@ def excited_order(run: Excitation) -> int:
     sizes = np.linalg.svd(lagged @ lagged.T, compute_uv=False)
     gain = np.ptp(run.position_um) / max(np.ptp(run.input), 1e-300)
     noise = noise_of(run.position_um) / max(gain, 1e-300) * np.sqrt(lags)
-    found = int((sizes > max(LEAST_EXCITATION**2 * sizes[0], noise**2)).sum()) // 2
-    return found if found < ENOUGH_POLES else max(found, LARGEST_ORDER)
+    poles = int((sizes > max(LEAST_EXCITATION**2 * sizes[0], noise**2)).sum()) // 2
+    return poles if poles < ENOUGH_POLES else max(poles, LARGEST_ORDER)

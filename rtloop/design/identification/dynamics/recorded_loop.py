@@ -63,17 +63,17 @@ def recorded_loop(
     closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)
     if state == "open" or (state == "auto" and not np.any(closed)):
         return None
-    known = tuple(names) or tuple(f"{axis_of(recording, axis, path)}_{name}" for name in KNOWN)
-    held = tuple(name for name in known if name in recording)
-    if not held or (names and len(held) < len(known)):
-        missing = ", ".join(name for name in known if name not in recording)
+    expected = tuple(names) or tuple(f"{axis_of(recording, axis, path)}_{name}" for name in KNOWN)
+    present = tuple(name for name in expected if name in recording)
+    if not present or (names and len(present) < len(expected)):
+        missing = ", ".join(name for name in expected if name not in recording)
         raise UnsuitableData(
             f"{path}: no excitation from outside: it holds no {missing}; --outside names signals that moved the loop"
         )
     skipped = int("imported" in recording.header)
-    outside, closed = np.array(recording.read(*held))[:, skipped:], closed[skipped:]
-    start, end = _longest(closed) if np.any(closed) else (0, outside.shape[1])
-    return RecordedLoop(start, end, held, outside, _first_limited(recording, start, end))
+    external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]
+    start, end = _longest(closed) if np.any(closed) else (0, external.shape[1])
+    return RecordedLoop(start, end, present, external, _first_limited(recording, start, end))
 
 
 def _first_limited(recording: Recording, start: int, end: int) -> int | None:

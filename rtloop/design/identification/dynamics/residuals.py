@@ -46,16 +46,21 @@ def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> Re
     Changes of the input, because a level that lasts correlates with any slow drift.
     """
     change = np.diff(u, prepend=0.0)
-    own, inputs = _correlations(errors, errors, lags), _correlations(change, change, lags)
-    across = _correlations(errors, change, lags)[1:] / np.sqrt(own[0] * inputs[0] or 1.0)
-    own, inputs = own / (own[0] or 1.0), inputs / (inputs[0] or 1.0)
+    autocorrelation, input_correlation = _correlations(errors, errors, lags), _correlations(change, change, lags)
+    cross_correlation = _correlations(errors, change, lags)[1:] / np.sqrt(
+        autocorrelation[0] * input_correlation[0] or 1.0
+    )
+    autocorrelation, input_correlation = (
+        autocorrelation / (autocorrelation[0] or 1.0),
+        input_correlation / (input_correlation[0] or 1.0),
+    )
     n, k = errors.size, np.arange(1, lags + 1)
-    ljung_box = n * (n + 2) * float(np.sum(own[1:] ** 2 / (n - k)))
-    variance = max(1.0 + 2 * float(own[1:] @ inputs[1:]), 1e-3)
+    ljung_box = n * (n + 2) * float(np.sum(autocorrelation[1:] ** 2 / (n - k)))
+    variance = max(1.0 + 2 * float(autocorrelation[1:] @ input_correlation[1:]), 1e-3)
     bound = float(norm.ppf(1 - (1 - LEVEL) / (2 * lags))) * np.sqrt(variance / n)
-    largest = float(np.abs(across).max())
+    largest = float(np.abs(cross_correlation).max())
     limit = float(chi2.ppf(LEVEL, max(lags - unknowns // 3, 1)))
-    return ResidualTests(float(np.abs(own[1:]).max()), ljung_box / limit, largest, largest / bound)
+    return ResidualTests(float(np.abs(autocorrelation[1:]).max()), ljung_box / limit, largest, largest / bound)
 
 
 def _correlations(a: Real, b: Real, lags: int) -> Real:

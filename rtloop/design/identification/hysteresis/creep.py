@@ -25,13 +25,13 @@ def creep_explains(run: Measured) -> bool:
     thresholds = placed_thresholds(FINEST, float(np.abs(run.drive_v).max()), "chebyshev-from-0")
     plays = play_outputs(run.drive_v[:-1], thresholds)
     columns = np.column_stack([averaged(plays, blocks.size), np.ones(blocks.time_s.size)])
-    passed = blocks.time_s / blocks.time_s[-1]
-    lags = np.column_stack([lagged(blocks.drive_v, passed, 1 / part) for part in CREEP_PARTS])
+    elapsed = blocks.time_s / blocks.time_s[-1]
+    lags = np.column_stack([lagged(blocks.drive_v, elapsed, 1 / part) for part in CREEP_PARTS])
     noise = noise_of(run.position_um) ** 2 / blocks.size
-    alone, with_lags = (
-        max(_left(one, blocks.position_um) - noise, 0.0) for one in (columns, np.hstack([columns, lags]))
+    plays_only, with_lags = (
+        max(_left(matrix, blocks.position_um) - noise, 0.0) for matrix in (columns, np.hstack([columns, lags]))
     )
-    return with_lags < EXPLAINED**2 * alone
+    return with_lags < EXPLAINED**2 * plays_only
 
 
 def _left(columns: Real, position_um: Real) -> float:

@@ -24,9 +24,9 @@ WITHIN = 0.999
 
 def early_errors(run: Kept, one: Equations, common: Common, own: Real, thresholds: Real) -> Real:
     """In µm (blocks,); NaN where memory is known."""
-    found = np.full(one.known.size, np.nan)
+    early_um = np.full(one.known.size, np.nan)
     if one.known.all() or not one.known.any():
-        return found
+        return early_um
     first_v, gaps = float(run.full_v[0]), np.maximum(np.diff(thresholds, prepend=0.0), 1e-9)
     low, high = (averaged_plays(run, thresholds, first_v + side * thresholds) for side in (-1.0, 1.0))
     weights = np.diff(common.slopes, prepend=0.0)
@@ -35,18 +35,18 @@ def early_errors(run: Kept, one: Equations, common: Common, own: Real, threshold
     def left(unknown: Real) -> Real:
         return position - unknown[-1] - np.clip(first_v + np.cumsum(unknown[:-1]), low, high) @ weights
 
-    settled = np.diff(settled_memory(run.full_v, thresholds), prepend=first_v)
-    starts = [settled, np.zeros(gaps.size), 0.5 * gaps, -0.5 * gaps]
-    inside, bounds = WITHIN * gaps, np.append(gaps, np.inf)
-    early = np.cumsum(~one.known) - 1
-    odd = early * PIECES // (early[-1] + 1) % 2 == 1
-    for judged in (~one.known & odd, ~one.known & ~odd):
+    settled_rises = np.diff(settled_memory(run.full_v, thresholds), prepend=first_v)
+    starts = [settled_rises, np.zeros(gaps.size), 0.5 * gaps, -0.5 * gaps]
+    inner_bounds, bounds = WITHIN * gaps, np.append(gaps, np.inf)
+    early_index = np.cumsum(~one.known) - 1
+    is_odd = early_index * PIECES // (early_index[-1] + 1) % 2 == 1
+    for judged in (~one.known & is_odd, ~one.known & ~is_odd):
         fits = [
             least_squares(
-                lambda x, rest=~judged: left(x)[rest], np.append(np.clip(rises, -inside, inside), 0.0),
+                lambda x, rest=~judged: left(x)[rest], np.append(np.clip(rises, -inner_bounds, inner_bounds), 0.0),
                 bounds=(-bounds, bounds),
             )
             for rises in starts
         ]  # fmt: skip
-        found[judged] = left(min(fits, key=lambda fit: fit.cost).x)[judged]
-    return found
+        early_um[judged] = left(min(fits, key=lambda fit: fit.cost).x)[judged]
+    return early_um

@@ -29,43 +29,45 @@ def held_out(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
 
     First of all that is fitted, then of the plays alone, as they are written, offsets aside.
     """
-    found = _piece_by_piece(recordings, limits)
+    errors_um = _piece_by_piece(recordings, limits)
     for group in range(GROUPS):
-        others = [one for i, one in enumerate(recordings) if i % GROUPS != group]
-        whole = [i for i in range(group, len(recordings), GROUPS) if _shown(recordings[i], others)]
-        if whole:
-            common, _ = fitted(others, limits)
-            for i in whole:
-                found[i] = judged(recordings[i], common)
-    return found
+        other_recordings = [recording for i, recording in enumerate(recordings) if i % GROUPS != group]
+        covered = [i for i in range(group, len(recordings), GROUPS) if _shown(recordings[i], other_recordings)]
+        if covered:
+            common, _ = fitted(other_recordings, limits)
+            for i in covered:
+                errors_um[i] = judged(recordings[i], common)
+    return errors_um
 
 
 def judged(one: Equations, common: Common) -> Real:
     """Errors in µm (blocks, 2) of a recording that the model knows nothing of; NaN where memory is not known."""
-    found, odd = np.full((one.known.size, 2), np.nan), pieces(one) % 2 == 1
-    for half in (one.known & odd, one.known & ~odd):
-        rest = one.known & ~half
-        found[rest] = _left(one.only(rest), common, own_of(one.only(half), common))
-    return _offsets_aside(one, found)
+    errors_um, is_odd = np.full((one.known.size, 2), np.nan), pieces(one) % 2 == 1
+    for fitted_blocks in (one.known & is_odd, one.known & ~is_odd):
+        judged_blocks = one.known & ~fitted_blocks
+        errors_um[judged_blocks] = _left(one.only(judged_blocks), common, own_of(one.only(fitted_blocks), common))
+    return _offsets_aside(one, errors_um)
 
 
 def pieces(one: Equations) -> npt.NDArray[np.intp]:
     """Number of the piece of its stretch that each block is in; −1 where memory is not known."""
-    found = np.full(one.known.size, -1)
+    numbers = np.full(one.known.size, -1)
     for column in (one.offsets.T > 0) & one.known:
-        found[column] = np.arange(column.sum()) * PIECES // column.sum()
-    return found
+        numbers[column] = np.arange(column.sum()) * PIECES // column.sum()
+    return numbers
 
 
 def _piece_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    found = [np.full((one.known.size, 2), np.nan) for one in recordings]
-    folds = [np.where(one.known, pieces(one) % FOLDS, -1) for one in recordings]
+    errors_um = [np.full((recording.known.size, 2), np.nan) for recording in recordings]
+    folds = [np.where(recording.known, pieces(recording) % FOLDS, -1) for recording in recordings]
     for fold in range(FOLDS):
-        rest = [one.only(among != fold) for one, among in zip(recordings, folds, strict=True)]
-        common, owns = fitted(rest, limits)
-        for one, among, own, left in zip(recordings, folds, owns, found, strict=True):
-            left[among == fold] = _left(one.only(among == fold), common, own)
-    return [_offsets_aside(one, left) for one, left in zip(recordings, found, strict=True)]
+        fitted_recordings = [
+            recording.only(fold_numbers != fold) for recording, fold_numbers in zip(recordings, folds, strict=True)
+        ]
+        common, gains = fitted(fitted_recordings, limits)
+        for recording, fold_numbers, own_gains, error_um in zip(recordings, folds, gains, errors_um, strict=True):
+            error_um[fold_numbers == fold] = _left(recording.only(fold_numbers == fold), common, own_gains)
+    return [_offsets_aside(recording, error_um) for recording, error_um in zip(recordings, errors_um, strict=True)]
 
 
 def _left(one: Equations, common: Common, own: Real) -> Real:
@@ -74,19 +76,21 @@ def _left(one: Equations, common: Common, own: Real) -> Real:
 
 def _offsets_aside(one: Equations, found: Real) -> Real:
     """The plays alone leave every stretch its offset: its mean."""
-    for part in (one.offsets.T > 0) & one.known:
-        found[part, 1] -= np.mean(found[part, 1])
+    for stretch in (one.offsets.T > 0) & one.known:
+        found[stretch, 1] -= np.mean(found[stretch, 1])
     return found
 
 
 def _shown(one: Equations, others: Sequence[Equations]) -> bool:
     if len(others) < OTHERS:
         return False
-    moved = np.sort([_moved(other) for other in others], axis=0)[-OTHERS]
-    return bool(np.all(moved >= SHOWN * _moved(one)))
+    covered_travel = np.sort([_moved(other) for other in others], axis=0)[-OTHERS]
+    return bool(np.all(covered_travel >= SHOWN * _moved(one)))
 
 
 def _moved(one: Equations) -> Real:
     """How far every slope's column goes within a stretch (plays,): between them, it goes where memory is not known."""
     stretches = (one.offsets.T > 0) & one.known
-    return np.max([np.zeros(one.slopes.shape[1]), *(np.ptp(one.slopes[part], axis=0) for part in stretches)], axis=0)
+    return np.max(
+        [np.zeros(one.slopes.shape[1]), *(np.ptp(one.slopes[stretch], axis=0) for stretch in stretches)], axis=0
+    )

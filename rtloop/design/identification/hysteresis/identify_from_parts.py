@@ -87,25 +87,25 @@ def identify_from_parts(
     for run in runs:
         require_rising(run)
     work = prepared_work(runs, weights, before_v)
-    stroke_v, missing = _require_stroke(runs, work)
-    trials = [Trial(placed_thresholds(count, 0.5 * stroke_v, one), one, ()) for one in tried(placement)]
+    stroke_v, missing_drive = _require_stroke(runs, work)
+    trials = [Trial(placed_thresholds(count, 0.5 * stroke_v, rule), rule, ()) for rule in tried(placement)]
     if thresholds_v is not None:
-        trials = [_given(np.array(thresholds_v, float), stroke_v, missing)]
-    best, errors_um = _chosen(work, trials)
-    common, judgements, on_others = judgements_of(work, best, others)
-    left = np.concatenate([one.left_um for one in judgements])
-    model = PlayModel(best.thresholds_v, np.diff(common.slopes, prepend=0.0))
-    creep_um = max(float(np.ptp(work.equations(run, best).creep @ common.creep)) for run in work.runs)
-    shape = explaining(_shape(runs, work, model, judgements, left, best.placed, weights), runs)
-    return PartsFit(shape, judgements, on_others, best.terms, errors_um, stroke_v, creep_um, missing)
+        trials = [_given(np.array(thresholds_v, float), stroke_v, missing_drive)]
+    trial, errors_um = _chosen(work, trials)
+    common, judgements, other_judgements = judgements_of(work, trial, others)
+    residual_um = np.concatenate([rule.left_um for rule in judgements])
+    model = PlayModel(trial.thresholds_v, np.diff(common.slopes, prepend=0.0))
+    creep_um = max(float(np.ptp(work.equations(run, trial).creep @ common.creep)) for run in work.runs)
+    hysteresis = explaining(_shape(runs, work, model, judgements, residual_um, trial.placed, weights), runs)
+    return PartsFit(hysteresis, judgements, other_judgements, trial.terms, errors_um, stroke_v, creep_um, missing_drive)
 
 
 def _given(thresholds: Real, stroke_v: float, missing: str) -> Trial:
     require_ascending(thresholds)
-    beyond = thresholds[thresholds >= 0.5 * stroke_v]
-    if beyond.size:
+    too_large = thresholds[thresholds >= 0.5 * stroke_v]
+    if too_large.size:
         raise UnsuitableData(
-            f"thresholds from {beyond[0]:g} V on cannot be told: the longest stroke of known memory has {stroke_v:.4g} "
+            f"thresholds from {too_large[0]:g} V on cannot be told: the longest stroke of known memory has {stroke_v:.4g} "
             f"V and shows plays below {0.5 * stroke_v:.4g} V{f'; {missing}' if missing else ''}"
         )
     return Trial(thresholds, "given", ())
@@ -118,7 +118,7 @@ def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
         return stroke_v, ""
     widest = max(work.runs, key=lambda run: float(np.ptp(run.full_v)))
     turn_v, reached_v, goal_v = missing_stroke(widest.full_v)
-    missing = (
+    hint = (
         f"missing: the drive from {reached_v:.4g} V on to {goal_v:.4g} V, in one stroke from {turn_v:.4g} V, which "
         f"would show plays from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
     )
@@ -126,23 +126,25 @@ def _require_stroke(runs: Sequence[Measured], work: Work) -> tuple[float, str]:
         raise UnsuitableData(
             f"{', '.join(run.name for run in runs)}: too little excitation: what the actuator remembers at first is "
             f"not known, and the longest stroke from where it is known has {stroke_v:.4g} V of the "
-            f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN:g} % are needed; {missing}"
+            f"{work.largest_v:.4g} V that the drive covers; at least {100 * LEAST_KNOWN:g} % are needed; {hint}"
         )
-    return stroke_v, missing
+    return stroke_v, hint
 
 
 def _chosen(work: Work, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:
     """The best placement; then drift, then creep, where each earns its place."""
-    found = {trial.placed: _squares(work, trial) for trial in trials}
-    best = min(trials, key=lambda trial: float(np.mean(found[trial.placed])))
-    least = found[best.placed]
+    squares_by_name = {trial.placed: _squares(work, trial) for trial in trials}
+    best = min(trials, key=lambda trial: float(np.mean(squares_by_name[trial.placed])))
+    least_squares = squares_by_name[best.placed]
     for term in _candidates(work):
-        more = best._replace(terms=(*best.terms, term))
-        name = " + ".join((more.placed, *more.terms))
-        found[name] = _squares(work, more)
-        if _earned(found[name], least) and (term != "creep" or _takes_time(work, more, name, found, least)):
-            best, least = more, found[name]
-    return best, {name: float(np.sqrt(np.mean(squares))) for name, squares in found.items()}
+        extended = best._replace(terms=(*best.terms, term))
+        name = " + ".join((extended.placed, *extended.terms))
+        squares_by_name[name] = _squares(work, extended)
+        if _earned(squares_by_name[name], least_squares) and (
+            term != "creep" or _takes_time(work, extended, name, squares_by_name, least_squares)
+        ):
+            best, least_squares = extended, squares_by_name[name]
+    return best, {name: float(np.sqrt(np.mean(squares))) for name, squares in squares_by_name.items()}
 
 
 def _earned(squares: Real, without: Real) -> bool:
@@ -155,11 +157,11 @@ def _takes_time(work: Work, trial: Trial, name: str, found: dict[str, Real], wit
     An actuator that is no sum of plays may have one (Bouc and Wen's is a lag by path), and the weights that are left
     beside it would be no model of it. A drive of one speed cannot tell the two.
     """
-    by_path = f"{name} by path"
-    found[by_path] = _squares(work, trial._replace(clock="path"))
-    gains = [other - found[name] for other in (without, found[by_path])]
-    sure = all(np.mean(gain) > SURELY * np.std(gain, ddof=1) / gain.size**0.5 for gain in gains)
-    return sure and _earned(found[name], found[by_path])
+    path_name = f"{name} by path"
+    found[path_name] = _squares(work, trial._replace(clock="path"))
+    gains = [reference_value - found[name] for reference_value in (without, found[path_name])]
+    is_certain = all(np.mean(gain) > SURELY * np.std(gain, ddof=1) / gain.size**0.5 for gain in gains)
+    return is_certain and _earned(found[name], found[path_name])
 
 
 def _candidates(work: Work) -> tuple[Term, ...]:
@@ -173,8 +175,8 @@ def _candidates(work: Work) -> tuple[Term, ...]:
 
 def _squares(work: Work, trial: Trial) -> Real:
     """Mean square of the errors held out of each recording that is judged (runs,)."""
-    found = held_out([work.equations(run, trial) for run in work.runs], work.limits)
-    return np.array([float(np.nanmean(one[:, 0] ** 2)) for one in found if np.any(np.isfinite(one))])
+    errors_um = held_out([work.equations(run, trial) for run in work.runs], work.limits)
+    return np.array([float(np.nanmean(error_um[:, 0] ** 2)) for error_um in errors_um if np.any(np.isfinite(error_um))])
 
 
 def _shape(
@@ -182,10 +184,12 @@ def _shape(
     weights: Weights,
 ) -> HysteresisFit:  # fmt: skip
     widest = max(runs, key=lambda run: float(np.ptp(run.drive_v)))
-    noises = [noise_of(run.position_um) ** 2 / part.size for run, part in zip(runs, work.runs, strict=True)]
+    noises = [
+        noise_of(run.position_um) ** 2 / averaged_run.size for run, averaged_run in zip(runs, work.runs, strict=True)
+    ]
     return HysteresisFit(
         model,
-        tuple(one.offset_um for one in judgements),
+        tuple(judgement.offset_um for judgement in judgements),
         float(np.sqrt(np.mean(left**2))),
         float(np.abs(left).max()),
         float(np.sqrt(np.mean(noises))),

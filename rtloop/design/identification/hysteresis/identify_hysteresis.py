@@ -98,17 +98,17 @@ def identify_hysteresis(
     largest_v = max(float(np.abs(run.drive_v).max()) for run in runs)
     if thresholds_v is not None:
         return explaining(_fitted(runs, np.array(thresholds_v, float), "given", weights, largest_v), runs)
-    fits = [_fitted(runs, placed_thresholds(count, largest_v, one), one, weights, largest_v) for one in placements]
+    fits = [_fitted(runs, placed_thresholds(count, largest_v, rule), rule, weights, largest_v) for rule in placements]
     return explaining(min(fits, key=lambda fit: fit.rms_error_um), runs)
 
 
 def explaining(fit: HysteresisFit, runs: Sequence[Measured]) -> HysteresisFit:
     """The fit of `runs`. Raises UnsuitableData for one that explains hardly anything of them."""
-    part = fit.rms_error_um / fit.range_um
-    if part > LARGEST_ERROR:
+    error_share = fit.rms_error_um / fit.range_um
+    if error_share > LARGEST_ERROR:
         raise UnsuitableData(
             f"{', '.join(run.name for run in runs)}: no sum of plays explains how the position follows the drive: the "
-            f"best errs by {100 * part:.0f} % of the range (rms), and {100 * LARGEST_ERROR:.0f} % are allowed. Look at "
+            f"best errs by {100 * error_share:.0f} % of the range (rms), and {100 * LARGEST_ERROR:.0f} % are allowed. Look at "
             "position over drive: are these the axis's own signals, of one slow drive, and is the sensor's sign right?"
         )
     return fit
@@ -119,8 +119,8 @@ def unexplained_um(runs: Sequence[Measured], fit: HysteresisFit) -> float:
     errors = fit.rms_error_um
     with suppress(UnsuitableData):  # so many cannot be told apart
         errors = min(errors, identify_hysteresis(runs, FINEST).rms_error_um)
-    left_um = math.sqrt(max(0.0, errors**2 - fit.noise_um**2))
-    return left_um if left_um > STRUCTURE * fit.range_um else 0.0
+    unexplained = math.sqrt(max(0.0, errors**2 - fit.noise_um**2))
+    return unexplained if unexplained > STRUCTURE * fit.range_um else 0.0
 
 
 def _fitted(
@@ -133,8 +133,8 @@ def _fitted(
     columns = np.vstack([part.columns for part in equations])
     position = np.concatenate([part.position_um for part in equations])
     range_um = max(float(np.ptp(part.position_um)) for part in equations)
-    least = LEAST_SLOPE * range_um / max(float(np.ptp(run.drive_v)) for run in runs)
-    slopes, offsets = _solve(columns, position, thresholds.size, least if weights == "invertible" else -np.inf)
+    least_slope = LEAST_SLOPE * range_um / max(float(np.ptp(run.drive_v)) for run in runs)
+    slopes, offsets = _solve(columns, position, thresholds.size, least_slope if weights == "invertible" else -np.inf)
     errors = columns @ np.concatenate([slopes, offsets]) - position
     model = PlayModel(thresholds, np.diff(slopes, prepend=0.0))
     widest = max(runs, key=lambda run: float(np.ptp(run.drive_v)))
@@ -150,7 +150,7 @@ def _fitted(
         loop_shape(widest.drive_v, model_output(model, widest.drive_v)),
         placed,
         weights,
-        least,
+        least_slope,
     )
 
 
@@ -171,15 +171,15 @@ def _block(run: Measured) -> int:
 
 def _averaged(rows: Real, size: int) -> Real:
     """Means of `size` successive rows; an incomplete block at the end is left out."""
-    kept = rows[: rows.shape[0] // size * size]
-    return kept.reshape(-1, size, rows.shape[1]).mean(axis=1)
+    complete = rows[: rows.shape[0] // size * size]
+    return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
 def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Real, Real]:
     """Slopes ≥ `least` and offsets, by least squares. Raises UnsuitableData where they cannot be told apart."""
     scale = np.linalg.norm(columns, axis=0)
-    sizes = np.linalg.svd(columns / scale, compute_uv=False)
-    if sizes[-1] < LEAST_DIRECTION * sizes[0]:
+    singular_values = np.linalg.svd(columns / scale, compute_uv=False)
+    if singular_values[-1] < LEAST_DIRECTION * singular_values[0]:
         raise UnsuitableData(
             f"too little excitation: {plays} weights cannot be told apart by these drives; fewer operators, or drives "
             "with loops of several sizes, would help"
@@ -191,9 +191,9 @@ def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Rea
 
 
 def _require_reached(thresholds: Real, largest_v: float) -> None:
-    beyond = thresholds[thresholds >= largest_v]
-    if beyond.size:
+    unreached = thresholds[thresholds >= largest_v]
+    if unreached.size:
         raise UnsuitableData(
-            f"too little excitation: thresholds from {beyond[0]:g} V on are never reached by a drive of at most "
+            f"too little excitation: thresholds from {unreached[0]:g} V on are never reached by a drive of at most "
             f"{largest_v:g} V; drive further, or leave them out"
         )

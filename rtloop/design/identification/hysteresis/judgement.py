@@ -98,7 +98,7 @@ class Spread(NamedTuple):
 
 def together(rms_um: Sequence[float]) -> Spread:
     """Of the errors of several recordings, NaN where one has none."""
-    squares = np.square([one for one in rms_um if np.isfinite(one)])
+    squares = np.square([value for value in rms_um if np.isfinite(value)])
     rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
     if squares.size < 2:
         return Spread(rms, None)
@@ -140,20 +140,20 @@ def judged_from_rest(
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
     """`runs`, each from rest and held out in turn, and `others`, of unknown memory, under plays placed as in
     `shape`."""
-    work = prepared_work(runs, shape.weights, [np.zeros(1)] * len(runs))
+    recordings = prepared_work(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
-    return judgements_of(work, trial, others)[1:]
+    return judgements_of(recordings, trial, others)[1:]
 
 
 def prepared_work(runs: Sequence[Measured], weights: Weights, before_v: Sequence[npt.ArrayLike | None] | None) -> Work:
     """Recordings, averaged; `before_v` is the drive of each since rest, where that is known."""
-    before = [None] * len(runs) if before_v is None else before_v
-    parts = [kept(run, len(runs), one) for run, one in zip(runs, before, strict=True)]
-    largest_v = max(float(np.ptp(run.full_v)) for run in parts)
-    range_um = max(float(np.ptp(run.position_um)) for run in parts)
-    least = LEAST_SLOPE * range_um / largest_v if weights == "invertible" else -np.inf
-    duration_s, path_v = np.max([(run.time_s[-1], run.path_v[-1]) for run in parts], axis=0).tolist()
-    return Work(parts, largest_v, range_um, least, duration_s, path_v)
+    drives_before = [None] * len(runs) if before_v is None else before_v
+    averaged_runs = [kept(run, len(runs), drive_before) for run, drive_before in zip(runs, drives_before, strict=True)]
+    largest_v = max(float(np.ptp(run.full_v)) for run in averaged_runs)
+    range_um = max(float(np.ptp(run.position_um)) for run in averaged_runs)
+    least_slope = LEAST_SLOPE * range_um / largest_v if weights == "invertible" else -np.inf
+    duration_s, path_v = np.max([(run.time_s[-1], run.path_v[-1]) for run in averaged_runs], axis=0).tolist()
+    return Work(averaged_runs, largest_v, range_um, least_slope, duration_s, path_v)
 
 
 def judgements_of(
@@ -161,24 +161,28 @@ def judgements_of(
 ) -> tuple[Common, tuple[Judgement, ...], tuple[Judgement, ...]]:
     """Of all recordings, by fits that each had no part in; what they share is by a fit to all."""
     recordings = [work.equations(run, trial) for run in work.runs]
-    common, owns = fitted(recordings, work.limits)
-    found = held_out(recordings, work.limits)
-    first = tuple(_judgement(*one, common, trial) for one in zip(work.runs, recordings, owns, found, strict=True))
-    then = []
+    common, gains = fitted(recordings, work.limits)
+    errors_um = held_out(recordings, work.limits)
+    judgements = tuple(
+        _judgement(*recording, common, trial) for recording in zip(work.runs, recordings, gains, errors_um, strict=True)
+    )
+    other_judgements = []
     for run in (kept(run, len(others)) for run in others):
-        one = work.equations(run, trial)
-        then.append(_judgement(run, one, own_of(one, common), judged(one, common), common, trial))
-    return common, first, tuple(then)
+        recording = work.equations(run, trial)
+        other_judgements.append(
+            _judgement(run, recording, own_of(recording, common), judged(recording, common), common, trial)
+        )
+    return common, judgements, tuple(other_judgements)
 
 
 def _judgement(run: Kept, one: Equations, own: Real, error: Real, common: Common, trial: Trial) -> Judgement:
-    left, offsets = errors(one, common, own), own[: one.offsets.shape[1]]
-    moved = (one.offsets @ offsets)[one.known] - offsets[-1:]
-    apart = np.concatenate([left[~one.known], moved, np.zeros(1)])
-    known = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[-1]))
+    residual_um, offsets = errors(one, common, own), own[: one.offsets.shape[1]]
+    offset_changes = (one.offsets @ offsets)[one.known] - offsets[-1:]
+    departures = np.concatenate([residual_um[~one.known], offset_changes, np.zeros(1)])
+    known_block = 0 if run.before_v is not None else known_from(run.drive_v, float(trial.thresholds_v[-1]))
     return Judgement(
         run.name, run.time_s, run.drive_v, run.position_um, error[:, 0], error[:, 1],
-        early_errors(run, one, common, own, trial.thresholds_v), left[one.known],
+        early_errors(run, one, common, own, trial.thresholds_v), residual_um[one.known],
         float(offsets[-1]) if offsets.size else np.nan, float(own[offsets.size :].sum()), run.before_v is not None,
-        None if known is None else float(run.time_s[known]), float(np.abs(apart).max()) if offsets.size else np.nan,
+        None if known_block is None else float(run.time_s[known_block]), float(np.abs(departures).max()) if offsets.size else np.nan,
     )  # fmt: skip

@@ -75,29 +75,33 @@ class Limits(NamedTuple):
 
 def fitted(recordings: Sequence[Equations], limits: Limits) -> tuple[Common, list[Real]]:
     """What all share, and the gains of what is each one's own, from the blocks whose memory is known."""
-    known = [one.only(one.known) for one in recordings]
-    plays, creep = known[0].slopes.shape[1], known[0].creep.shape[1]
-    shared = np.vstack([np.hstack([one.slopes, one.creep]) for one in known])
-    columns = np.hstack([shared, np.asarray(block_diag(*(one.own for one in known)), np.float64)])
-    weights = np.concatenate([np.full(plays + creep, FLOOR), *(one.own_weights for one in known)])
-    neighbours = np.zeros((plays - 1, weights.size))
-    neighbours[:, :plays] = RIDGE * limits.drive_v * np.diff(np.eye(plays), axis=0)
-    held = columns.shape[0] ** 0.5 * np.vstack([neighbours, np.diag(weights)])
-    position = np.concatenate([*(one.position_um for one in known), np.zeros(held.shape[0])])
-    least = np.full(weights.size, -np.inf)
-    least[:plays] = limits.least_slope
-    orthogonal, triangle = np.linalg.qr(np.vstack([columns, held]))
-    found = lsq_linear(triangle, orthogonal.T @ position, (least, np.inf), method="bvls").x
-    parts = np.split(found, np.cumsum([plays, creep, *(one.own_weights.size for one in known)])[:-1])
-    return Common(parts[0], parts[1]), parts[2:]
+    known_blocks = [recording.only(recording.known) for recording in recordings]
+    plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]
+    shared = np.vstack([np.hstack([recording.slopes, recording.creep]) for recording in known_blocks])
+    columns = np.hstack([shared, np.asarray(block_diag(*(recording.own for recording in known_blocks)), np.float64)])
+    penalties = np.concatenate([np.full(plays + creep, FLOOR), *(recording.own_weights for recording in known_blocks)])
+    neighbour_rows = np.zeros((plays - 1, penalties.size))
+    neighbour_rows[:, :plays] = RIDGE * limits.drive_v * np.diff(np.eye(plays), axis=0)
+    penalty_rows = columns.shape[0] ** 0.5 * np.vstack([neighbour_rows, np.diag(penalties)])
+    position = np.concatenate([*(recording.position_um for recording in known_blocks), np.zeros(penalty_rows.shape[0])])
+    lower_bounds = np.full(penalties.size, -np.inf)
+    lower_bounds[:plays] = limits.least_slope
+    orthogonal, triangle = np.linalg.qr(np.vstack([columns, penalty_rows]))
+    solution = lsq_linear(triangle, orthogonal.T @ position, (lower_bounds, np.inf), method="bvls").x
+    gains = np.split(
+        solution, np.cumsum([plays, creep, *(recording.own_weights.size for recording in known_blocks)])[:-1]
+    )
+    return Common(gains[0], gains[1]), gains[2:]
 
 
 def own_of(one: Equations, common: Common) -> Real:
     """Gains of what is a recording's own, by a model that is given."""
-    known = one.only(one.known)
-    held = known.known.size**0.5 * np.diag(one.own_weights)
-    left = np.append(errors(known, common, np.zeros(one.own_weights.size)), np.zeros(one.own_weights.size))
-    return np.asarray(np.linalg.lstsq(np.vstack([known.own, held]), left, rcond=None)[0], np.float64)
+    known_blocks = one.only(one.known)
+    penalty_rows = known_blocks.known.size**0.5 * np.diag(one.own_weights)
+    right_side = np.append(errors(known_blocks, common, np.zeros(one.own_weights.size)), np.zeros(one.own_weights.size))
+    return np.asarray(
+        np.linalg.lstsq(np.vstack([known_blocks.own, penalty_rows]), right_side, rcond=None)[0], np.float64
+    )
 
 
 def errors(one: Equations, common: Common, own: Real) -> Real:

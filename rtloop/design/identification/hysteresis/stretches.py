@@ -50,17 +50,19 @@ class Kept(NamedTuple):
 
 def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kept:
     """One of so many recordings; a drive is beside the position of the tick that follows it."""
-    most = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
-    drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most)
+    most_blocks = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
+    drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
     time_s = run.seconds[:-1] - run.seconds[0]
-    before = None if before_v is None else np.asarray(before_v, float)
+    drive_before = None if before_v is None else np.asarray(before_v, float)
     path_v = np.cumsum(np.abs(np.diff(drive, prepend=drive[0])))
-    time_s, slow, position, path_v = averaged(np.column_stack([time_s, drive, run.position_um[1:], path_v]), size).T
-    if before is None:
+    time_s, mean_drive, position, path_v = averaged(
+        np.column_stack([time_s, drive, run.position_um[1:], path_v]), size
+    ).T
+    if drive_before is None:
         stretch, stroke_v = _stretches(drive, size)
     else:
-        stretch, stroke_v = np.zeros(slow.size, np.intp), 2 * float(np.abs(np.append(before, drive)).max())
-    return Kept(run.name, time_s, slow, position, path_v, stretch, stroke_v, drive, size, before)
+        stretch, stroke_v = np.zeros(mean_drive.size, np.intp), 2 * float(np.abs(np.append(drive_before, drive)).max())
+    return Kept(run.name, time_s, mean_drive, position, path_v, stretch, stroke_v, drive, size, drive_before)
 
 
 def equations(
@@ -79,15 +81,15 @@ def equations(
     plays[:, :-1] -= plays[:, 1:].copy()
     stretches = int(run.stretch.max()) + 1
     offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
-    since = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
-    drift = [since] if "drift" in terms else []
-    passed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
-    creep = [lagged(run.drive_v, passed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
+    centred_time = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
+    drift = [centred_time] if "drift" in terms else []
+    elapsed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
+    creep = [lagged(run.drive_v, elapsed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
     return Equations(
         plays,
-        np.array(creep).reshape(-1, since.size).T,
+        np.array(creep).reshape(-1, centred_time.size).T,
         offsets.astype(float),
-        np.array(drift).reshape(-1, since.size).T,
+        np.array(drift).reshape(-1, centred_time.size).T,
         run.position_um,
         run.stretch >= 0,
     )
@@ -96,20 +98,20 @@ def equations(
 def _stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
     """Of every block, −1 for those that are not all in one or in one with too few to judge any; the longest stroke."""
     numbers = known_stretches(drive)
-    among = numbers[: drive.size // size * size].reshape(-1, size)
-    whole = np.where(np.all(among == among[:, :1], axis=1), among[:, 0], -1)
-    found, stroke_v = np.full(whole.size, -1), 0.0
-    for number in np.flatnonzero(np.bincount(whole[whole >= 0]) >= PIECES):
-        found[whole == number] = found.max() + 1
+    tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)
+    block_numbers = np.where(np.all(tick_numbers == tick_numbers[:, :1], axis=1), tick_numbers[:, 0], -1)
+    stretch, stroke_v = np.full(block_numbers.size, -1), 0.0
+    for number in np.flatnonzero(np.bincount(block_numbers[block_numbers >= 0]) >= PIECES):
+        stretch[block_numbers == number] = stretch.max() + 1
         stroke_v = max(stroke_v, float(np.ptp(drive[numbers == number])))
-    return found, stroke_v
+    return stretch, stroke_v
 
 
 def averaged_plays(run: Kept, thresholds: Real, state: Real) -> Real:
     """(blocks, plays), of plays that stood at `state` (plays,) when the recording began."""
-    parts, at_once = [], max(1, AT_ONCE // run.size) * run.size
-    for start in range(0, run.full_v.size, at_once):
-        outputs = play_outputs(run.full_v[start : start + at_once], thresholds, state)
+    parts, chunk_ticks = [], max(1, AT_ONCE // run.size) * run.size
+    for start in range(0, run.full_v.size, chunk_ticks):
+        outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
         state = outputs[-1]
         parts.append(averaged(outputs, run.size))
     return np.concatenate(parts)
@@ -117,15 +119,15 @@ def averaged_plays(run: Kept, thresholds: Real, state: Real) -> Real:
 
 def averaged(rows: Real, size: int) -> Real:
     """Means of `size` successive rows; an incomplete block at the end is left out."""
-    whole = rows[: rows.shape[0] // size * size]
-    return whole.reshape(-1, size, rows.shape[1]).mean(axis=1)
+    complete = rows[: rows.shape[0] // size * size]
+    return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
 def lagged(drive_v: Real, passed: Real, constant: float) -> Real:
     """Drive behind a first-order lag, which stood still at first: (blocks,). `passed` is what the constant is in."""
     shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
-    found, last = np.empty(drive_v.size), float(drive_v[0])
+    found, level = np.empty(drive_v.size), float(drive_v[0])
     for k, share in enumerate(shares):
-        last += share * (drive_v[k] - last)
-        found[k] = last
+        level += share * (drive_v[k] - level)
+        found[k] = level
     return found

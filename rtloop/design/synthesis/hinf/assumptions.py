@@ -49,27 +49,27 @@ def _stabilisable(condition: str, says: str, a: Real, b: Real) -> list[str]:
 
 def _ranks(plant: GeneralisedPlant) -> list[str]:
     faults = []
-    for name, matrix, says in (
+    for name, matrix, requirement in (
         ("D12", plant.d12, "full column rank is needed: every u must cost something at high frequencies"),
         ("D21", plant.d21.T, "full row rank is needed: every y must be disturbed at high frequencies"),
     ):
         values = np.linalg.svd(matrix, compute_uv=False)
         rank = int(np.sum(values > SMALL * values.max(initial=0.0)))
         if rank < matrix.shape[1]:
-            faults.append(f"rank: {name} has rank {rank} of {matrix.shape[1]}; {says}")
+            faults.append(f"rank: {name} has rank {rank} of {matrix.shape[1]}; {requirement}")
     return faults
 
 
 def _axis_zeros(which: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
     """Zeros on the imaginary axis: the modes of A − B D⁺C that C, less what D explains, does not see."""
     solve = np.linalg.pinv(d)
-    inner, unseen = a - b @ solve @ c, c - d @ solve @ c
+    inner, residual_c = a - b @ solve @ c, c - d @ solve @ c
     faults = []
     for value in np.linalg.eigvals(inner):
         on_axis = abs(value.real) <= 1e-9 * max(abs(value), SMALL * float(np.linalg.norm(inner)))
         if value.imag < 0 or not on_axis:
             continue
-        if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), unseen]).T):
+        if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), residual_c]).T):
             place = f"the path {which} has a zero at ω = {value.imag:.6g} rad/s"
             faults.append(f"imaginary-axis zero: {place}; a little damping would help")
     return faults

@@ -52,21 +52,21 @@ class GeneralisedPlant(NamedTuple):
 
     def closed_with(self, controller: Matrices) -> Matrices:
         """F_l(P, K): the loop from w to z with u = K y. Raises ValueError where D22 and D_K leave no solution."""
-        well = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
-        if np.linalg.cond(well) > 1e14:
+        loop_matrix = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
+        if np.linalg.cond(loop_matrix) > 1e14:
             raise ValueError("controller: I − D22·D_K is singular, so the loop is not well posed")
-        inverse = np.linalg.inv(well)  # y = inverse (C2 x + D21 w + D22 C_K x_K)
-        seen_plant, seen_w = inverse @ self.c2, inverse @ self.d21
-        seen_own = inverse @ self.d22 @ controller.c
-        own = controller.c + controller.d @ seen_own  # u = D_K seen_plant x + own x_K + D_K seen_w w
-        u_plant, u_w = controller.d @ seen_plant, controller.d @ seen_w
+        inverse = np.linalg.inv(loop_matrix)  # y = inverse (C2 x + D21 w + D22 C_K x_K)
+        output_from_plant, output_from_w = inverse @ self.c2, inverse @ self.d21
+        output_from_k = inverse @ self.d22 @ controller.c
+        command_from_k = controller.c + controller.d @ output_from_k  # u = D_K seen_plant x + own x_K + D_K seen_w w
+        command_from_plant, command_from_w = controller.d @ output_from_plant, controller.d @ output_from_w
         a = np.block([
-            [self.a + self.b2 @ u_plant, self.b2 @ own],
-            [controller.b @ seen_plant, controller.a + controller.b @ seen_own],
+            [self.a + self.b2 @ command_from_plant, self.b2 @ command_from_k],
+            [controller.b @ output_from_plant, controller.a + controller.b @ output_from_k],
         ])  # fmt: skip
-        b = np.vstack([self.b1 + self.b2 @ u_w, controller.b @ seen_w])
-        c = np.hstack([self.c1 + self.d12 @ u_plant, self.d12 @ own])
-        return Matrices(a, b, c, self.d11 + self.d12 @ u_w)
+        b = np.vstack([self.b1 + self.b2 @ command_from_w, controller.b @ output_from_w])
+        c = np.hstack([self.c1 + self.d12 @ command_from_plant, self.d12 @ command_from_k])
+        return Matrices(a, b, c, self.d11 + self.d12 @ command_from_w)
 
 
 def augmented(plant: Transfer, weights: Weights) -> GeneralisedPlant:
@@ -77,17 +77,17 @@ def augmented(plant: Transfer, weights: Weights) -> GeneralisedPlant:
     if not plant.is_strictly_proper:
         raise ValueError(f"plant: {plant.zeros.size} zeros and {plant.order} poles; fewer zeros than poles are needed")
     g, w1, w2, w3 = (realised(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
-    none_g, none_2, none_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
-    error = np.concatenate([-g.c, 0 * w1.b, none_2, -w3.c])  # e without x_d and without the direct part of W3
+    zeros_g, zeros_2, zeros_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
+    error = np.concatenate([-g.c, 0 * w1.b, zeros_2, -w3.c])  # e without x_d and without the direct part of W3
     a = np.asarray(block_diag(g.a, w1.a, w2.a, w3.a), dtype=float)
     a[g.b.size : g.b.size + w1.b.size] += np.outer(w1.b, error)
     b1 = np.column_stack([
-        np.concatenate([none_g, w1.b, none_2, none_3]),
-        np.concatenate([none_g, -w3.d * w1.b, none_2, w3.b]),
+        np.concatenate([zeros_g, w1.b, zeros_2, zeros_3]),
+        np.concatenate([zeros_g, -w3.d * w1.b, zeros_2, w3.b]),
     ])  # fmt: skip
-    b2 = np.concatenate([g.b, 0 * w1.b, w2.b, none_3])[:, None]
-    o1 = w1.d * error + np.concatenate([none_g, w1.c, none_2, none_3])
-    o2 = np.concatenate([none_g, 0 * w1.c, w2.c, none_3])
+    b2 = np.concatenate([g.b, 0 * w1.b, w2.b, zeros_3])[:, None]
+    o1 = w1.d * error + np.concatenate([zeros_g, w1.c, zeros_2, zeros_3])
+    o2 = np.concatenate([zeros_g, 0 * w1.c, w2.c, zeros_3])
     direct = np.array([[1.0, -w3.d]])
     return GeneralisedPlant(
         a, b1, b2, np.vstack([o1, o2]), error[None, :],

@@ -41,7 +41,7 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
 
 def _gains(system: Matrices, omega: Real) -> Peak:
     values = np.linalg.norm(system.response((1j * omega).astype(complex)), 2, axis=(1, 2))
-    return max(Peak(float(value), float(at)) for value, at in zip(values, omega, strict=True))
+    return max(Peak(float(value), float(frequency)) for value, frequency in zip(values, omega, strict=True))
 
 
 def _largest(matrix: Real) -> float:
@@ -59,5 +59,5 @@ def _crossings(system: Matrices, gamma: float) -> Real:
     hamiltonian = np.block([[a, np.zeros((n, n))], [-c.T @ c, -a.T]]) + np.vstack([b, -c.T @ d]) @ inner
     values = np.linalg.eigvals(hamiltonian)
     upper = np.abs(values.real) < 1e-8 * np.abs(values)
-    found = np.unique(np.abs(values[upper].imag))
-    return np.concatenate([[0.0], found]) if found.size % 2 else found
+    frequencies = np.unique(np.abs(values[upper].imag))
+    return np.concatenate([[0.0], frequencies]) if frequencies.size % 2 else frequencies

@@ -40,9 +40,9 @@ class Normalised(NamedTuple):
         """The controller for the plant as it was given."""
         a, b, c, d = controller
         b, c, d = b @ self.from_y, self.to_u @ c, self.to_u @ d @ self.from_y
-        seen = np.linalg.inv(np.eye(d.shape[1]) + self.direct @ d)  # y − D22 u = seen (y − D22 C x)
+        inverse = np.linalg.inv(np.eye(d.shape[1]) + self.direct @ d)  # y − D22 u = seen (y − D22 C x)
         return Matrices(
-            a - b @ seen @ self.direct @ c, b @ seen, c - d @ seen @ self.direct @ c, d @ seen
+            a - b @ inverse @ self.direct @ c, b @ inverse, c - d @ inverse @ self.direct @ c, d @ inverse
         )  # fmt: skip
 
 

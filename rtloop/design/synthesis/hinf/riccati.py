@@ -34,8 +34,8 @@ def stabilising_solution(hamiltonian: Real) -> Real:
     """
     n = hamiltonian.shape[0] // 2
     scale = _scale(hamiltonian)
-    both = np.concatenate([scale, 1 / scale])
-    balanced = hamiltonian * both / both[:, None]
+    joint_scale = np.concatenate([scale, 1 / scale])
+    balanced = hamiltonian * joint_scale / joint_scale[:, None]
     try:
         form, vectors, stable = schur(balanced, sort="lhp")  # pyright: ignore[reportAssignmentType]
     except np.linalg.LinAlgError:  # an eigenvalue that reordering pushes over the axis is on it

@@ -56,21 +56,21 @@ def synthesise_hinf(
     Order: that of the plant.
     """
     check_assumptions(plant)
-    normal = normalised(plant)
-    gamma_opt, limiting = smallest_gamma(normal, tolerance)
-    wanted = gamma_opt * (1 + backoff) if gamma is None else gamma
+    normal_form = normalised(plant)
+    gamma_opt, limiting = smallest_gamma(normal_form, tolerance)
+    target_gamma = gamma_opt * (1 + backoff) if gamma is None else gamma
     try:
-        controller = normal.restored(_central(normal, _solve(normal, wanted), wanted))
+        controller = normal_form.restored(_central(normal_form, _solve(normal_form, target_gamma), target_gamma))
     except NoController as fault:
-        raise NoController(f"gamma: {wanted:g} cannot be reached; {gamma_opt:.6g} can. {fault}") from None
+        raise NoController(f"gamma: {target_gamma:g} cannot be reached; {gamma_opt:.6g} can. {fault}") from None
     loop = plant.closed_with(controller)
     achieved = hinf_norm(loop).norm
-    if not achieved <= 1.01 * wanted:
+    if not achieved <= 1.01 * target_gamma:
         raise NoController(
-            f"the controller for γ = {wanted:.6g} reaches {achieved:.6g}: rounding has spoilt it; "
+            f"the controller for γ = {target_gamma:.6g} reaches {achieved:.6g}: rounding has spoilt it; "
             "a larger back-off, or weights whose corners lie less far apart, would help"
         )
-    return Hinf(controller, wanted, gamma_opt, achieved, limiting)
+    return Hinf(controller, target_gamma, gamma_opt, achieved, limiting)
 
 
 def smallest_gamma(normal: Normalised, tolerance: float = 1e-7) -> tuple[float, str]:
@@ -164,7 +164,7 @@ def _central(normal: Normalised, solutions: _Solutions, gamma: float) -> Matrice
     f12, f2 = f[columns : columns + p2], f[columns + p2 :]
     l12, l2 = injection[:, rows : rows + m2], injection[:, rows + m2 :]
     z = np.linalg.inv(np.eye(a.shape[0]) - y @ x / gamma**2)
-    own2, seen2 = z @ (b2 + l12) @ d12, -d21 @ (c2 + f12)
-    own1 = -z @ l2 + own2 @ np.linalg.solve(d12, direct)
-    seen_through = np.linalg.solve(d21, seen2)
-    return Matrices(a + np.hstack([b1, b2]) @ f + own1 @ seen_through, own1, f2 + direct @ seen_through, direct)
+    input_2, output_2 = z @ (b2 + l12) @ d12, -d21 @ (c2 + f12)
+    input_y = -z @ l2 + input_2 @ np.linalg.solve(d12, direct)
+    output_y = np.linalg.solve(d21, output_2)
+    return Matrices(a + np.hstack([b1, b2]) @ f + input_y @ output_y, input_y, f2 + direct @ output_y, direct)

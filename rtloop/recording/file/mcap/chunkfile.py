@@ -95,10 +95,10 @@ class ChunkFile:
     def append(self, content: Content) -> None:
         """Compress and write one chunk and its index records, if it has any."""
         chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
-        after = self.size + len(chunk)
-        position, places = after, {}
+        index_begin = self.size + len(chunk)
+        position, index_offsets = index_begin, {}
         for channel, record in content.indexes.items():
-            places[channel] = position
+            index_offsets[channel] = position
             position += len(record)
         entry = ChunkIndex(
             chunk_length=len(chunk),
@@ -106,15 +106,15 @@ class ChunkFile:
             compression="zstd",
             compressed_size=len(chunk) - CHUNK_HEAD.size,
             message_end_time=content.end,
-            message_index_length=position - after,
-            message_index_offsets=places,
+            message_index_length=position - index_begin,
+            message_index_offsets=index_offsets,
             message_start_time=content.start,
             uncompressed_size=len(content.records),
         )
         counts = self._distinct_counts.setdefault(tuple(content.counts.items()), content.counts)
-        written = _Written(pack_records([entry]), counts, self._crc)
+        written_chunk = _Written(pack_records([entry]), counts, self._crc)
         self._append(chunk + b"".join(content.indexes.values()))
-        self._chunks.append(written)
+        self._chunks.append(written_chunk)
         if self._name != self.part:
             self._show()
 
@@ -211,21 +211,21 @@ class ChunkFile:
 
     def _refuse_to_replace(self) -> None:
         try:
-            is_finished, is_begun = _is_taken(self.path), _is_taken(self.part)
+            has_final, has_part = _is_taken(self.path), _is_taken(self.part)
         except OSError as error:
             raise self._refused(error) from None
-        if is_finished:
+        if has_final:
             raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
-        if is_begun:
+        if has_part:
             message = f"{self.part} is left from an unfinished run; `rtloop recover` completes it"
             raise OutputError(message, errno.EEXIST)
 
     def _append(self, data: bytes) -> None:
         """All of `data` at the end of the file, or nothing of it."""
         try:
-            done = 0
-            while done < len(data):
-                done += os.pwrite(self._fd, data[done:], self.size + done)
+            written_bytes = 0
+            while written_bytes < len(data):
+                written_bytes += os.pwrite(self._fd, data[written_bytes:], self.size + written_bytes)
         except OSError as error:
             with contextlib.suppress(OSError):  # what is left of it is overwritten, or recognised as cut off
                 os.ftruncate(self._fd, self.size)
@@ -252,8 +252,8 @@ class ChunkFile:
         )
 
     def _refused(self, error: OSError) -> OutputError:
-        where = error.filename if isinstance(error, Untrusted) else self.part
-        return OutputError(f"{where}: {error.strerror}", error.errno or 0)
+        path = error.filename if isinstance(error, Untrusted) else self.part
+        return OutputError(f"{path}: {error.strerror}", error.errno or 0)
 
 
 def _is_taken(path: Path) -> bool:

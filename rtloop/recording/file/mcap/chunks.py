@@ -63,8 +63,10 @@ class Source:
             raise RecordingError(f"{path}: {error.strerror}") from None
         if magic != MAGIC:
             release(self._fd)
-            what = "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
-            raise RecordingError(f"{path}: not a recording: {what or 'not an MCAP file'}")
+            description = (
+                "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
+            )
+            raise RecordingError(f"{path}: not a recording: {description or 'not an MCAP file'}")
 
     def read(self, offset: int, length: int) -> bytes:
         """Up to `length` bytes; fewer at the end of the file."""
@@ -126,12 +128,12 @@ def scanned_chunks(source: Source, position: int = len(MAGIC)) -> tuple[list[Ent
             continue
         if source.read(position, 1) == bytes([Opcode.DATA_END]):
             break
-        found = _next_chunk(source, position + 1)
-        if found is None:
+        next_offset = _next_chunk(source, position + 1)
+        if next_offset is None:
             problems.append(f"it ends in the middle of a chunk: {source.size - position} bytes are left out")
             break
-        problems.append(f"bytes {position} to {found} are damaged")
-        position = found
+        problems.append(f"bytes {position} to {next_offset} are damaged")
+        position = next_offset
     return entries, problems
 
 
@@ -141,19 +143,19 @@ def _record_at(source: Source, position: int) -> tuple[Entry | None, int]:
     if len(head) < INDEX_HEAD_BYTES:
         return None, 0
     opcode, length = PREFIX.unpack_from(head)
-    whole = PREFIX.size + length
-    if position + whole > source.size:
+    record_length = PREFIX.size + length
+    if position + record_length > source.size:
         return None, 0
     if opcode == Opcode.CHUNK:
         try:
             parse_chunk_head(head)
         except DamagedChunk:
             return None, 0
-        return Entry(position, whole, None), whole
+        return Entry(position, record_length, None), record_length
     entries_length = int.from_bytes(head[PREFIX.size + 2 : INDEX_HEAD_BYTES], "little")
     is_index = opcode == Opcode.MESSAGE_INDEX and length == 6 + entries_length
     is_header = opcode == Opcode.HEADER and position == len(MAGIC)
-    return None, whole if is_index or is_header else 0
+    return None, record_length if is_index or is_header else 0
 
 
 def _next_chunk(source: Source, position: int) -> int | None:

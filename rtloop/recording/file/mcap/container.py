@@ -81,8 +81,8 @@ def parse_chunk_head(data: bytes) -> ChunkHead:
     if len(data) < CHUNK_HEAD.size:
         raise DamagedChunk("cut off")
     opcode, length, start, end, uncompressed, crc, name_length, name, compressed = CHUNK_HEAD.unpack_from(data)
-    good = opcode == Opcode.CHUNK and name_length == 4 and name == b"zstd"
-    if not good or length != CHUNK_HEAD.size - PREFIX.size + compressed or uncompressed > LARGEST_CHUNK_BYTES:
+    is_zstd_chunk = opcode == Opcode.CHUNK and name_length == 4 and name == b"zstd"
+    if not is_zstd_chunk or length != CHUNK_HEAD.size - PREFIX.size + compressed or uncompressed > LARGEST_CHUNK_BYTES:
         raise DamagedChunk("its header contradicts itself")
     return ChunkHead(start, end, uncompressed, crc, compressed)
 

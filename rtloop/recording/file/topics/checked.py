@@ -241,37 +241,37 @@ def require_columns(header: dict[str, Any]) -> None:
 
 def extras_of(header: Mapping[str, Any]) -> Extras:
     """Inputs and outputs beside sensors and drives, as the loop had them."""
-    found = header.get("extras", {})
-    outputs = [[output[field] for field in ExtraOutput._fields] for output in found.get("outputs", ())]
+    entries = header.get("extras", {})
+    outputs = [[output[field] for field in ExtraOutput._fields] for output in entries.get("outputs", ())]
     return Extras(
-        tuple(entry["name"] for entry in found.get("inputs", ())), tuple(ExtraOutput(*output) for output in outputs)
+        tuple(entry["name"] for entry in entries.get("inputs", ())), tuple(ExtraOutput(*output) for output in outputs)
     )
 
 
 def extra_channels_of(header: Mapping[str, Any]) -> dict[str, str]:
     """The channel of each of them."""
-    found = header.get("extras", {})
-    return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in found.get(kind, ())}
+    entries = header.get("extras", {})
+    return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in entries.get(kind, ())}
 
 
 def event_from(payload: bytes, axes: Sequence[str]) -> Event:
     """The event in a message of `/events`, of a recording with these axes. Raises Malformed."""
     event = _parsed(payload)
     _require(_Event, event)
-    kind, what = event["kind"], event["what"]
+    kind, details = event["kind"], event["what"]
     if event["axis"] is not None and event["axis"] not in axes:
         raise Malformed(f"axis: {_shown(event['axis'])}; null or one of {', '.join(axes)} is allowed")
     if (model := _OF_RECORDER.get(kind)) is not None:
         if event["who"] != RECORDER:
             raise Malformed(f"who: {_shown(event['who'])}; only the {RECORDER} says {kind}")
-        _require(model, what, "what.")
+        _require(model, details, "what.")
         return event
     if not known(Kind, kind):
         raise Malformed(f"kind: {_shown(kind)}; {', '.join(Kind.__members__).lower()} or a number")
     if not known(Origin, event["who"]) and (fault := name_fault(event["who"])):
         raise Malformed(f"who: {fault}")
-    _require(_Message, what, "what.")
-    _require_command(kind, event["axis"], [_number(value) for value in what["values"]])
+    _require(_Message, details, "what.")
+    _require_command(kind, event["axis"], [_number(value) for value in details["values"]])
     return event
 
 
@@ -289,14 +289,14 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
     first, *parameters = values
     if kind == "load_law" and axis is None:
         raise Malformed("axis: null; a law is loaded for one axis")
-    allowed = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
-    if allowed and first not in allowed:
+    allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
+    if allowed_values and first not in allowed_values:
         raise Malformed(f"what.values: {first:g} for the {kind[kind.index('_') + 1 :]}; "
-                        f"{', '.join(f'{one:d}' for one in allowed)} are allowed")  # fmt: skip
-    lowest = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
-    for least, value in zip(lowest, parameters, strict=False):
-        if not (value.is_integer() and least <= value <= LARGEST_TICK):
-            raise Malformed(f"what.values: {value:g}; a whole number from {least} is an index of a reference")
+                        f"{', '.join(f'{value_allowed:d}' for value_allowed in allowed_values)} are allowed")  # fmt: skip
+    minima = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
+    for minimum, value in zip(minima, parameters, strict=False):
+        if not (value.is_integer() and minimum <= value <= LARGEST_TICK):
+            raise Malformed(f"what.values: {value:g}; a whole number from {minimum} is an index of a reference")
 
 
 def _number(value: Any) -> float:
@@ -313,12 +313,12 @@ def _number(value: Any) -> float:
 
 def _parsed(payload: bytes) -> dict[str, Any]:
     try:
-        found = pydantic_core.from_json(payload, allow_inf_nan=False)
+        value = pydantic_core.from_json(payload, allow_inf_nan=False)
     except ValueError:
         raise Malformed("it is not JSON") from None
-    if not isinstance(found, dict):
-        raise Malformed(f"{_shown(found)}; an object is needed")
-    return found
+    if not isinstance(value, dict):
+        raise Malformed(f"{_shown(value)}; an object is needed")
+    return value
 
 
 def _require(model: type[BaseModel], found: dict[str, Any], place: str = "") -> None:
@@ -326,8 +326,8 @@ def _require(model: type[BaseModel], found: dict[str, Any], place: str = "") -> 
         model.model_validate(found)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        where = place + ".".join(str(part) for part in first["loc"])
-        raise Malformed(f"{where}: {_shown(first['input'])}; {first['msg'].lower()}") from None
+        location = place + ".".join(str(part) for part in first["loc"])
+        raise Malformed(f"{location}: {_shown(first['input'])}; {first['msg'].lower()}") from None
 
 
 def _shown(value: Any) -> str:

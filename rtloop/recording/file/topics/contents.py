@@ -34,7 +34,9 @@ def may_tell(entry: Entry, channel: int) -> bool:
     """Whether a chunk may hold messages of one of the slow topics: what is left out stands in chunks of its own."""
     if entry.index is None or channel == format.OVERVIEW:
         return may_hold(entry, channel)
-    return any(other not in (format.TICKS, format.OVERVIEW) for other in entry.index.message_index_offsets)
+    return any(
+        other_channel not in (format.TICKS, format.OVERVIEW) for other_channel in entry.index.message_index_offsets
+    )
 
 
 def may_hold(entry: Entry, channel: int) -> bool:
@@ -57,8 +59,8 @@ def read_chunk(source: Source, entry: Entry) -> bytes:
     record = source.read(entry.offset, entry.length)
     if entry.index:
         head = parse_chunk_head(record)
-        said = entry.index.message_start_time, entry.index.message_end_time, entry.index.uncompressed_size
-        if (head.start, head.end, head.uncompressed) != said:
+        indexed = entry.index.message_start_time, entry.index.message_end_time, entry.index.uncompressed_size
+        if (head.start, head.end, head.uncompressed) != indexed:
             raise DamagedChunk("it contradicts the index")
     return record
 

@@ -72,16 +72,16 @@ def event_of(
 
 def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
     """Axis, value and limit of a TRIPPED message in words; None where no axis is to blame."""
-    _, value, limit, bit, number = (float(one) for one in message["values"][:5])
+    _, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
         return None
     if causes == ["law"]:
-        which = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
-        return f"{axes[axis]}: law {which!r} {_failure(int(limit), value)}"
+        law_name = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
+        return f"{axes[axis]}: law {law_name!r} {_failure(int(limit), value)}"
     unit = UNITS.get(causes[0], "")
-    beside = "" if causes == ["non_finite"] else f", its limit {limit:g}{unit}"
-    return f"{axes[axis]}: {causes[0]} {value:.6g}{unit}{beside}"
+    limit_text = "" if causes == ["non_finite"] else f", its limit {limit:g}{unit}"
+    return f"{axes[axis]}: {causes[0]} {value:.6g}{unit}{limit_text}"
 
 
 def _failure(code: int, value: float) -> str:
@@ -104,11 +104,11 @@ def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None
 
 def name_fault(name: str) -> str | None:
     """What is wrong with the name of an operator, and what is allowed; None for one that may stand in a recording."""
-    spelled = all(character in BETWEEN or category(character)[0] in "LMN" for character in name)
-    if not 0 < len(name) <= MAX_NAME or not spelled or not name[0].isalnum() or name.endswith(" "):
-        shown = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
+    has_valid_characters = all(character in BETWEEN or category(character)[0] in "LMN" for character in name)
+    if not 0 < len(name) <= MAX_NAME or not has_valid_characters or not name[0].isalnum() or name.endswith(" "):
+        displayed = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
         allowed = f"1 to {MAX_NAME} letters, digits, blanks and {BETWEEN.strip()}, a letter or digit first"
-        return f"{shown}; {allowed}, are allowed"
+        return f"{displayed}; {allowed}, are allowed"
     if name != OPERATOR and (known(Origin, name) or name.lower() == RECORDER):
         return f"{name!r}; others have this name: one that is no number and none of {', '.join(TAKEN)} is allowed"
     return None

@@ -33,14 +33,14 @@ def own_header(content: bytes) -> bytes:
     if [message.channel for message in messages] != [format.CONFIGURATION]:
         raise DamagedChunk("it has no header")
     try:
-        found = [
+        channels = [
             Channel.read(ReadDataStream(io.BytesIO(record)))
             for opcode, record in split_records(content)
             if opcode == Opcode.CHANNEL
         ]
     except (struct.error, ValueError, McapError):
         raise DamagedChunk("its channels cannot be read") from None
-    if [(one.id, one.topic) for one in found] not in OWN_CHANNELS:
+    if [(channel.id, channel.topic) for channel in channels] not in OWN_CHANNELS:
         raise DamagedChunk("its channels are not those of a recording")
     return messages[0].payload
 
@@ -55,8 +55,8 @@ def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dic
         digest = hashlib.sha256(header["configuration"].encode()).hexdigest()
         if header.get("configuration_sha256") != digest:
             raise Malformed("the recorded configuration does not match its SHA-256")
-        schema = pack_records([*format.schemas(header["columns"]), *format.channels()])
-        if content is not None and not content.startswith(schema):
+        expected_records = pack_records([*format.schemas(header["columns"]), *format.channels()])
+        if content is not None and not content.startswith(expected_records):
             raise Malformed("the schema of the ticks does not match the recorded columns")
         require_columns(header)
     except Malformed as reason:
@@ -66,10 +66,10 @@ def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dic
 
 def absent(numbers: Iterable[int]) -> list[str]:
     """What is missing between, or in front of, the parts of a rotated run that are there; one alone is a whole one."""
-    there = set(numbers)
-    if len(there) == 1:
+    present = set(numbers)
+    if len(present) == 1:
         return []
-    return [absent_part(number) for number in range(1, max(there)) if number not in there]
+    return [absent_part(number) for number in range(1, max(present)) if number not in present]
 
 
 def absent_part(number: int) -> str:

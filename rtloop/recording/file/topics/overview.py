@@ -97,11 +97,11 @@ class OverviewLayout:
         self._names = names
         self._blank = np.zeros(1, self._dtype)
         format.fill_tags(self._blank, names)
-        same = np.ones(self._dtype.itemsize, bool)
+        is_fixed = np.ones(self._dtype.itemsize, bool)
         for name in names:
             _, start, *_ = (self._dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
-            same[start : start + 8] = False
-        self._fixed = np.flatnonzero(same)
+            is_fixed[start : start + 8] = False
+        self._fixed = np.flatnonzero(is_fixed)
         self._tags = self._blank.view(np.uint8)[self._fixed]
 
     def messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
@@ -124,22 +124,22 @@ class OverviewLayout:
     def intervals(self, payloads: Sequence[bytes]) -> Intervals:
         """What messages say that `require` lets pass."""
         records = np.frombuffer(b"".join(payloads), self._dtype)
-        found = np.empty((len(records), self._columns, len(PARTS)))
+        intervals = np.empty((len(records), self._columns, len(PARTS)))
         for index, name in enumerate(self._names):
-            found[:, index // len(PARTS), index % len(PARTS)] = records[name]
-        return found
+            intervals[:, index // len(PARTS), index % len(PARTS)] = records[name]
+        return intervals
 
 
 def plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
     """Which intervals (n, columns, 3) are about ticks behind those of all before them."""
-    good = np.ones(len(intervals), bool)
+    is_plausible = np.ones(len(intervals), bool)
     for column in (TICK, DEADLINE):
-        least, most = intervals[:, column, LEAST], intervals[:, column, MOST]
-        good &= (least >= 0) & (least <= most) & (most <= LARGEST) & (least == np.floor(least))
-        good &= most == np.floor(most)
-        before = np.fmax.accumulate(np.concatenate([[-1.0], most[:-1]]))
-        good &= least > before
-    return good
+        minimum, maximum = intervals[:, column, LEAST], intervals[:, column, MOST]
+        is_plausible &= (minimum >= 0) & (minimum <= maximum) & (maximum <= LARGEST) & (minimum == np.floor(minimum))
+        is_plausible &= maximum == np.floor(maximum)
+        previous_maximum = np.fmax.accumulate(np.concatenate([[-1.0], maximum[:-1]]))
+        is_plausible &= minimum > previous_maximum
+    return is_plausible
 
 
 def ranges(intervals: Intervals) -> list[Range]:
@@ -149,21 +149,21 @@ def ranges(intervals: Intervals) -> list[Range]:
     first, end = intervals[:, TICK, LEAST].astype(np.int64), intervals[:, TICK, MOST].astype(np.int64) + 1
     breaks = np.flatnonzero(first[1:] != end[:-1]) + 1
     begins, ends = np.concatenate([[0], breaks]), np.concatenate([breaks, [len(first)]]) - 1
-    return [(int(first[one]), int(end[other] - first[one])) for one, other in zip(begins, ends, strict=True)]
+    return [(int(first[begin]), int(end[last] - first[begin])) for begin, last in zip(begins, ends, strict=True)]
 
 
 def uncovered(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
     """What no range of `covered`, in the order of their ticks, has of the ticks from `first` to before `end`."""
-    found = []
+    gaps = []
     for begin, count in covered:
         if begin + count <= first:
             continue
         if begin >= end:
             break
         if begin > first:
-            found.append((first, begin - first))
+            gaps.append((first, begin - first))
         first = begin + count
-    return [*found, (first, end - first)] if first < end else found
+    return [*gaps, (first, end - first)] if first < end else gaps
 
 
 def _names(columns: Sequence[str]) -> list[str]:

@@ -39,8 +39,8 @@ class Ticks(NamedTuple):
         """Those from `tick` on; None where all come before it."""
         if self.last < tick:
             return None
-        place = int(np.searchsorted(self.numbers, tick))
-        return Ticks(self.rows[place:], self.numbers[place:], int(self.numbers[place]), self.last)
+        index = int(np.searchsorted(self.numbers, tick))
+        return Ticks(self.rows[index:], self.numbers[index:], int(self.numbers[index]), self.last)
 
 
 class TickLayout:
@@ -50,11 +50,11 @@ class TickLayout:
         self.columns = tuple(columns)
         self._blank = format.blank_ticks(self.columns, 1)
         varying = ("_log_time", "_publish_time", *self.columns)
-        same = np.ones(self._blank.itemsize, bool)
+        is_fixed = np.ones(self._blank.itemsize, bool)
         for name in varying:
             _, start, *_ = (self._blank.dtype.fields or {})[name]
-            same[start : start + 8] = False
-        self._fixed = np.flatnonzero(same)
+            is_fixed[start : start + 8] = False
+        self._fixed = np.flatnonzero(is_fixed)
         self._fixed_bytes = self._blank.view(np.uint8)[self._fixed]
 
     def ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
@@ -82,8 +82,11 @@ def missing(ticks: np.ndarray[Any, Any], expected: int) -> list[tuple[int, int]]
     """(first tick, how many) of all that is missing in `ticks` (n,), n > 0, which are to begin at `expected`."""
     if ticks[0] == expected and ticks[-1] == expected + len(ticks) - 1:  # the usual case
         return []
-    known = np.concatenate([[expected - 1], ticks]).astype(np.int64)
-    return [(int(known[i]) + 1, int(known[i + 1] - known[i]) - 1) for i in np.flatnonzero(np.diff(known) != 1)]
+    ticks_with_start = np.concatenate([[expected - 1], ticks]).astype(np.int64)
+    return [
+        (int(ticks_with_start[i]) + 1, int(ticks_with_start[i + 1] - ticks_with_start[i]) - 1)
+        for i in np.flatnonzero(np.diff(ticks_with_start) != 1)
+    ]
 
 
 def _require_whole(records: np.ndarray[Any, Any]) -> None:
@@ -95,20 +98,20 @@ def _require_whole(records: np.ndarray[Any, Any]) -> None:
 def whole_fault(name: str, values: np.ndarray[Any, Any]) -> str | None:
     """What is wrong with the values of a column of whole numbers; None where nothing is."""
     low, high = WHOLE[name]
-    good = (values >= low) & (values <= high) & (values == np.floor(values))
-    if good.all():
+    is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
+    if is_valid.all():
         return None
-    return f"{name}: {float(values[np.argmin(good)]):g}; a whole number from {low:g} to {high:g} is allowed"
+    return f"{name}: {float(values[np.argmin(is_valid)]):g}; a whole number from {low:g} to {high:g} is allowed"
 
 
 def _require_times(records: np.ndarray[Any, Any]) -> None:
     """Ticks and deadlines that grow, and log times that go with the deadlines."""
     for name in ("tick", "deadline_ns"):
-        growing = np.diff(records[name]) > 0
-        if not growing.all():
-            row = int(np.argmin(growing)) + 1
+        is_growing = np.diff(records[name]) > 0
+        if not is_growing.all():
+            row = int(np.argmin(is_growing)) + 1
             raise DamagedChunk(f"out of order: {name} {records[name][row]:g} after {records[name][row - 1]:g}")
     starts = records["_log_time"] - records["deadline_ns"].astype(np.uint64)
-    same = np.all(starts == starts[0]) and np.array_equal(records["_publish_time"], records["_log_time"])
-    if not same or records["_log_time"].max() >= LARGEST_NS:
+    is_consistent = np.all(starts == starts[0]) and np.array_equal(records["_publish_time"], records["_log_time"])
+    if not is_consistent or records["_log_time"].max() >= LARGEST_NS:
         raise DamagedChunk("its log times do not go with its deadlines")
