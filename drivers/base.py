@@ -105,7 +105,7 @@ class Driver(ABC):
         """Bring every output to its safe value and let the hardware go; again and again without harm."""
 
 
-def index_of(channels: Sequence[Channel], name: str) -> int:
+def channel_index(channels: Sequence[Channel], name: str) -> int:
     """Position of a channel. Raises ValueError that lists the channels there are."""
     names = [channel.name for channel in channels]
     if name not in names:
@@ -118,6 +118,6 @@ def require_channels(wiring: Mapping[str, Wiring], facts: Facts) -> None:
     for axis, (source, sink) in wiring.items():
         for name, channels in ((source, facts.inputs), (sink, facts.outputs)):
             try:
-                index_of(channels, name)
+                channel_index(channels, name)
             except ValueError as error:
                 raise ValueError(f"channels.{axis}: {error}") from None

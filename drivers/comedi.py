@@ -67,21 +67,21 @@ class ComediOptions(Options):
         return self
 
 
-def _call_in_python(function: int, device: int, line: tuple[int, ...], last: Any) -> int:
-    """As `_call`: `last` is of type uint32 where it is a code."""
-    last_type = ctypes.c_uint32 if getattr(last, "dtype", None) == np.uint32 else ctypes.c_ssize_t
+def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: Any) -> int:
+    """As `_set_functions`: `last` is of type uint32 where it is a code."""
+    last_type = ctypes.c_uint32 if getattr(final_argument, "dtype", None) == np.uint32 else ctypes.c_ssize_t
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
-    return prototype(int(function))(int(device), *map(int, line), int(last))
+    return prototype(int(function))(int(device), *map(int, line), int(final_argument))
 
 
 @intrinsic_like(_call_in_python)
-def _call(compiler: Any, function: Any, device: Any, line: Any, last: Any) -> Any:
+def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: Any) -> Any:
     """`int function(comedi_t *, subdevice, channel, range, aref, last)`, addresses as integers.
 
     `last` is a code, or the address where one goes.
     """
     types, ir = compiler.types, compiler.ir
-    last_type = ir.IntType(32) if last == types.uint32 else ir.IntType(64)
+    last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         word, int32 = ir.IntType(64), ir.IntType(32)
@@ -90,7 +90,7 @@ def _call(compiler: Any, function: Any, device: Any, line: Any, last: Any) -> An
         pointer = builder.inttoptr(arguments[0], function_type)
         return builder.call(pointer, [arguments[1], *numbers, arguments[3]])
 
-    return types.int32(types.intp, types.intp, types.UniTuple(types.uint32, 4), last), codegen
+    return types.int32(types.intp, types.intp, types.UniTuple(types.uint32, 4), final_argument), codegen
 
 
 @cfunc(SIGNATURE)
@@ -173,7 +173,7 @@ class ComediDriver(Driver):
             return None
         names = self._inputs, card["failed_input"], self._outputs, card["failed_output"]
         channels = ", ".join(group[i] for group, i in (names[:2], names[2:]) if i >= 0)
-        return DriverError(f"{self._options.device}: {channels}: {self._board.last_error()}")
+        return DriverError(f"{self._options.device}: {channels}: {self._board.error_text()}")
 
     def open(self) -> Pointers:
         """Take the board's subdevices; outputs to `safe_v`, unless all can be read back. Raises DriverError."""
@@ -182,13 +182,13 @@ class ComediDriver(Driver):
         try:
             inputs = self._lines(Kind.INPUT, options.input_subdevice, self._inputs)
             outputs = self._lines(Kind.OUTPUT, options.output_subdevice, self._outputs)
-            self._fill(inputs, outputs, np.zeros(1, np.uint32))
+            self._fill_context(inputs, outputs, np.zeros(1, np.uint32))
             self._outputs_v = self._read_back(outputs)
             if self._outputs_v is None:
                 self._park()
                 self._outputs_v = [options.safe_v] * len(self._outputs)
         except DriverError:
-            self._release()
+            self._close_board()
             raise
         return Pointers(self._context.ctypes.data, comedi_read.address, comedi_write.address)
 
@@ -202,18 +202,20 @@ class ComediDriver(Driver):
             try:
                 self._park()
             finally:
-                self._release()
+                self._close_board()
 
     def _lines(self, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
         """The address and scale of each channel, on a subdevice that is reserved."""
         assert self._board is not None
-        reserved, options = self._board.take(kind, subdevice), self._options
+        reserved, options = self._board.reserve_subdevice(kind, subdevice), self._options
         range_v, aref = (
             (options.input_range_v, options.aref) if kind is Kind.INPUT else (options.output_range_v, "ground")
         )
-        return np.array([self._board.line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE)
+        return np.array(
+            [self._board.channel_line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE
+        )
 
-    def _fill(self, inputs: np.ndarray, outputs: np.ndarray, code: np.ndarray) -> None:
+    def _fill_context(self, inputs: np.ndarray, outputs: np.ndarray, code: np.ndarray) -> None:
         """The context of the compiled functions."""
         assert self._board is not None
         self._arrays = inputs, outputs, code
@@ -228,7 +230,7 @@ class ComediDriver(Driver):
         assert self._board is not None
         volts = []
         for line in outputs:
-            code = self._board.code(tuple(line.tolist()))
+            code = self._board.output_code(tuple(line.tolist()))
             if code is None:
                 return None
             volts.append(float(line["lowest_v"] + code * line["lsb_v"]))
@@ -239,13 +241,13 @@ class ComediDriver(Driver):
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(f"driver 'comedi': its outputs could not be made safe: {self.error}")
 
-    def _release(self) -> None:
+    def _close_board(self) -> None:
         if self._board is not None:
             self._board.close()
             self._board = None
 
 
-def _require_name(where: str, name: str, kind: Kind) -> None:
+def _require_name(key: str, name: str, kind: Kind) -> None:
     """Raise ValueError for a name that no channel has."""
     if not re.fullmatch(f"{kind.prefix}(0|[1-9][0-9]{{0,3}})", name):
-        raise ValueError(f"{where}: {name!r}; allowed are {kind.prefix}0, {kind.prefix}1, …")
+        raise ValueError(f"{key}: {name!r}; allowed are {kind.prefix}0, {kind.prefix}1, …")

@@ -72,7 +72,7 @@ class Board:
             raise MissingLibrary(f"driver 'comedi': {error}; install libcomedi0 (Debian's name of libcomedi)") from None
         self._handle: int | None = self._library.comedi_open(device.encode())
         if self._handle is None:
-            raise DriverError(f"{device}: {self.last_error()}{_HINTS.get(self._library.comedi_errno(), '')}")
+            raise DriverError(f"{device}: {self.error_text()}{_HINTS.get(self._library.comedi_errno(), '')}")
 
     @property
     def addresses(self) -> tuple[int, int, int]:
@@ -81,29 +81,29 @@ class Board:
         read, write = (ctypes.cast(function, c_void_p).value or 0 for function in functions)
         return self._handle or 0, read, write
 
-    def last_error(self) -> str:
+    def error_text(self) -> str:
         """Why the last call that failed did."""
         return self._library.comedi_strerror(self._library.comedi_errno()).decode()
 
-    def take(self, kind: Kind, wanted: int | None) -> int:
+    def reserve_subdevice(self, kind: Kind, number: int | None) -> int:
         """Reserve a subdevice for this process: number `wanted`, or the first of its kind."""
-        subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if wanted is None else wanted
-        if wanted is None and subdevice < 0:
+        subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if number is None else number
+        if number is None and subdevice < 0:
             raise DriverError(f"{self._device}: the board has no analogue {kind.name.lower()}s")
-        if wanted is not None and self._library.comedi_get_subdevice_type(self._handle, wanted) != kind:
+        if number is not None and self._library.comedi_get_subdevice_type(self._handle, number) != kind:
             numbers = range(self._library.comedi_get_n_subdevices(self._handle))
             suitable = [n for n in numbers if self._library.comedi_get_subdevice_type(self._handle, n) == kind]
             raise DriverError(
-                f"{self._device}: {kind.name.lower()}_subdevice: {wanted} has no analogue {kind.name.lower()}s; "
+                f"{self._device}: {kind.name.lower()}_subdevice: {number} has no analogue {kind.name.lower()}s; "
                 f"there are {', '.join(map(str, suitable)) or 'none'}"
             )
         if self._library.comedi_lock(self._handle, subdevice) < 0:
             busy = self._library.comedi_errno() == errno.EBUSY
-            reason = "another program uses it" if busy else self.last_error()
+            reason = "another program uses it" if busy else self.error_text()
             raise DriverError(f"{self._device}: subdevice {subdevice}: {reason}")
         return subdevice
 
-    def line(self, kind: Kind, subdevice: int, channel: int, range_v: tuple[float, float], aref: str) -> tuple:
+    def channel_line(self, kind: Kind, subdevice: int, channel: int, range_v: tuple[float, float], aref: str) -> tuple:
         """A channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code."""
         name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
         if channel >= count:
@@ -120,7 +120,7 @@ class Board:
         lsb_v = (range_v[1] - range_v[0]) / highest_code
         return subdevice, channel, index, AREFS[aref], range_v[0], lsb_v, highest_code
 
-    def code(self, line: tuple) -> int | None:
+    def output_code(self, line: tuple) -> int | None:
         """The code at an output, as the kernel remembers it; None where it does not.
 
         Before anything was written it remembers 0, wherever the output is: that is not believed at the lower end of a

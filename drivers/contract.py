@@ -24,7 +24,7 @@ _UNTOUCHED = -123456.789
 _GUARD = 16
 
 
-class Calls:
+class DriverCalls:
     """A driver's pointers, called as the loop calls them."""
 
     def __init__(self, pointers: Pointers, facts: Facts) -> None:
@@ -66,11 +66,11 @@ class DriverContract:
         return None
 
     @contextmanager
-    def opened(self) -> Iterator[tuple[Driver, Calls]]:
+    def opened(self) -> Iterator[tuple[Driver, DriverCalls]]:
         """An open driver and its calls; closed at the end."""
         driver = self.driver()
         try:
-            yield driver, Calls(driver.open(), driver.facts)
+            yield driver, DriverCalls(driver.open(), driver.facts)
         finally:
             driver.close()
 
@@ -123,7 +123,7 @@ class DriverContract:
         driver = self.driver()
         try:
             pointers = driver.open()
-            Calls(pointers, driver.facts)
+            DriverCalls(pointers, driver.facts)
             assert all(isinstance(address, int) for address in pointers), f"addresses are integers: {pointers}"
         finally:
             driver.close()
@@ -159,7 +159,7 @@ class DriverContract:
             for _ in range(3):
                 calls.write([channel.safe_v for channel in driver.facts.outputs])
                 status, values = calls.read()
-                assert status >= 0, f"read returned {status}{_raised(driver)}"
+                assert status >= 0, f"read returned {status}{_error_suffix(driver)}"
                 inputs = driver.facts.inputs
                 for channel, value in zip(inputs, values[: len(inputs)], strict=True):
                     inside = channel.minimum_v <= value <= channel.maximum_v
@@ -172,9 +172,9 @@ class DriverContract:
         """From end to end, all outputs at once."""
         with self.opened() as (driver, calls):
             for share in (0.0, 0.25, 0.5, 1.0):
-                volts = [_between(channel, share) for channel in driver.facts.outputs]
+                volts = [_volts_at_share(channel, share) for channel in driver.facts.outputs]
                 status = calls.write(volts)
-                assert status >= 0, f"write({volts}) returned {status}{_raised(driver)}"
+                assert status >= 0, f"write({volts}) returned {status}{_error_suffix(driver)}"
                 self._require_outputs(driver, volts, f"write({volts})")
 
     def test_nothing_outside_the_range_gets_through(self) -> None:
@@ -190,7 +190,7 @@ class DriverContract:
     def test_close_parks_every_output(self) -> None:
         """At its safe value."""
         with self.opened() as (driver, calls):
-            calls.write([_between(channel, 0.75) for channel in driver.facts.outputs])
+            calls.write([_volts_at_share(channel, 0.75) for channel in driver.facts.outputs])
         self._require_outputs(driver, [channel.safe_v for channel in driver.facts.outputs], "close")
 
     def test_close_again_and_again(self) -> None:
@@ -202,27 +202,27 @@ class DriverContract:
     def test_open_after_close(self) -> None:
         """Works as the first time did."""
         with self.opened() as (driver, calls):
-            calls.write([_between(channel, 0.75) for channel in driver.facts.outputs])
+            calls.write([_volts_at_share(channel, 0.75) for channel in driver.facts.outputs])
             driver.close()
-            calls = Calls(driver.open(), driver.facts)
-            assert calls.read()[0] >= 0, f"read failed after close and open{_raised(driver)}"
+            calls = DriverCalls(driver.open(), driver.facts)
+            assert calls.read()[0] >= 0, f"read failed after close and open{_error_suffix(driver)}"
             status = calls.write([channel.safe_v for channel in driver.facts.outputs])
-            assert status >= 0, f"write failed after close and open{_raised(driver)}"
+            assert status >= 0, f"write failed after close and open{_error_suffix(driver)}"
 
-    def _require_outputs(self, driver: Driver, wanted: Sequence[float], after: str) -> None:
+    def _require_outputs(self, driver: Driver, expected: Sequence[float], event: str) -> None:
         outputs_v = self.outputs(driver)
         if outputs_v is not None:
-            deviation = max(abs(a - b) for a, b in zip(outputs_v, wanted, strict=True))
+            deviation = max(abs(a - b) for a, b in zip(outputs_v, expected, strict=True))
             assert deviation <= self.tolerance_v, (
-                f"after {after} the outputs are {list(outputs_v)}; {list(wanted)} is needed"
+                f"after {event} the outputs are {list(outputs_v)}; {list(expected)} is needed"
             )
 
 
-def _raised(driver: Driver) -> str:
+def _error_suffix(driver: Driver) -> str:
     """What `read` or `write` raised, if the driver kept it."""
     error = getattr(driver, "error", None)
     return "" if error is None else f": {type(error).__name__}: {error}"
 
 
-def _between(channel: Channel, share: float) -> float:
+def _volts_at_share(channel: Channel, share: float) -> float:
     return channel.minimum_v + share * (channel.maximum_v - channel.minimum_v)

@@ -58,13 +58,13 @@ class Playback:
     def __init__(self) -> None:
         self._context = np.zeros(1, CONTEXT)
         self._rows: npt.NDArray[np.float64] = np.empty((0, TIMING_COLUMNS + 1))
-        self._refused: npt.NDArray[np.bool_] | None = None
+        self._refused_writes: npt.NDArray[np.bool_] | None = None
 
-    def load(self, rows: npt.NDArray[np.float64], refused: npt.NDArray[np.bool_] | None = None) -> None:
+    def load(self, rows: npt.NDArray[np.float64], refused_writes: npt.NDArray[np.bool_] | None = None) -> None:
         """Continue with `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed); `refused` (n,) writes fail again."""
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
-        self._refused = None if refused is None else np.ascontiguousarray(refused)
-        self._context["refusals"] = 0 if self._refused is None else self._refused.ctypes.data
+        self._refused_writes = None if refused_writes is None else np.ascontiguousarray(refused_writes)
+        self._context["refusals"] = 0 if self._refused_writes is None else self._refused_writes.ctypes.data
         self._context["rows"], self._context["columns"] = self._rows.shape
         self._context["row"], self._context["address"] = 0, self._rows.ctypes.data
 

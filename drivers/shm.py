@@ -17,13 +17,22 @@ from pydantic import Field
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring, require_channels
 from rtloop.drivers.errors import DriverError
 from rtloop.hil import board
-from rtloop.hil.board import FIFO, HIGHEST_CODE, LOWEST_CODE, LSB_V, MAX_CHANNELS, WRITTEN, BoardMemory, latest_sample
+from rtloop.hil.board import (
+    FIFO,
+    HIGHEST_CODE,
+    LOWEST_CODE,
+    LSB_V,
+    MAX_CHANNELS,
+    WRITTEN,
+    BoardMemory,
+    copy_latest_sample,
+)
 from rtloop.hil.native.atomics import load_acquire, store_release
 from rtloop.hil.native.compiled import cfunc
 from rtloop.hil.native.monotonic import monotonic_ns
 from rtloop.hil.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.hil.options import BoardOptions
-from rtloop.hil.trusted import open_file, release
+from rtloop.hil.trusted import close_descriptor, open_file
 
 CONTEXT = np.dtype(
     [(name, np.int64) for name in ("channels", "words", "sample_ns", "fifo", "adc_codes")]
@@ -52,7 +61,7 @@ def shm_read(context, values):
     copied_codes = carray(address_pointer(card.copied), MAX_CHANNELS, np.int64)
     held_codes = carray(address_pointer(card.held), MAX_CHANNELS, np.int64)
     out = carray(values, card.channels + 1)
-    sample_time_ns = latest_sample(words, sample_ns, codes, copied_codes, card.channels, TRIES)
+    sample_time_ns = copy_latest_sample(words, sample_ns, codes, copied_codes, card.channels, TRIES)
     if sample_time_ns >= 0:
         card.held_ns = sample_time_ns
         for i in range(card.channels):
@@ -123,10 +132,10 @@ class ShmDriver(Driver):
                 f"{self._file}: {error.strerror}; start the board with `rtloop hil serve CONFIG`"
             ) from None
         try:
-            self._take(self._fd)
+            self._claim_board(self._fd)
             memory = self._memory = BoardMemory(self._fd)
         except (DriverError, OSError) as error:
-            release(self._fd)
+            close_descriptor(self._fd)
             self._fd = None
             if isinstance(error, DriverError):
                 raise
@@ -139,7 +148,8 @@ class ShmDriver(Driver):
         context = np.zeros(1, CONTEXT)
         context["channels"], context["held_ns"] = len(self.wiring), -1
         arrays = {"words": memory.words, "sample_ns": memory.sample_ns, "fifo": memory.fifo,
-                  "adc_codes": memory.adc_codes, "copied": copied_codes, "timespec": timespec, "held": held_codes}  # fmt: skip
+                  "adc_codes": memory.adc_codes, "copied": copied_codes, "timespec": timespec,
+                  "held": held_codes}  # fmt: skip
         for name, array in arrays.items():
             context[name] = array.ctypes.data
         self._arrays = context, copied_codes, held_codes, timespec
@@ -157,10 +167,10 @@ class ShmDriver(Driver):
             context["channels"] = MAX_CHANNELS
             _WRITE(shm_write.address)(context.ctypes.data, safe.ctypes.data)
             self._memory, self._arrays = None, ()
-            release(self._fd)
+            close_descriptor(self._fd)
             self._fd = None
 
-    def _take(self, fd: int) -> None:
+    def _claim_board(self, fd: int) -> None:
         """Check that this is a board and that nobody else drives it. Raises DriverError."""
         if os.fstat(fd).st_size < board.file_bytes():
             raise DriverError(f"{self._file}: not a board's memory, or its board has not started")
@@ -171,5 +181,5 @@ class ShmDriver(Driver):
             raise DriverError(f"{self._file}: board version {facts['version'][0]}, this driver speaks {board.VERSION}")
         if facts["channels"][0] < len(self.wiring):
             raise DriverError(f"{self._file}: {facts['channels'][0]} channels, {len(self.wiring)} are needed")
-        if not board.take_role(fd, board.CONTROLLER_BYTE):
+        if not board.lock_role(fd, board.CONTROLLER_BYTE):
             raise DriverError(f"{self._file}: another controller drives this board")

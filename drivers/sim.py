@@ -64,7 +64,7 @@ class SimDriver(Driver):
         self._rig_options = options
         self._rig = build_rig(options, self._axes_by_plant(), 1.0 / rate_hz)
         self._context = np.zeros(1, CONTEXT)
-        self._looped_v = np.zeros(options.loopback)
+        self._loopback_v = np.zeros(options.loopback)
 
     def _axes_by_plant(self) -> list[str]:
         """Axis at each plant. Raises ValueError for a wiring that leaves the rig."""
@@ -87,21 +87,27 @@ class SimDriver(Driver):
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
         return Facts(
-            inputs=(*(_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)), *self._looped("adc")),
-            outputs=(*(_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)), *self._looped("dac")),
+            inputs=(
+                *(_converter_channel(f"adc{i}", plant.adc) for i, plant in enumerate(plants)),
+                *self._loopback_channels("adc"),
+            ),
+            outputs=(
+                *(_converter_channel(f"dac{i}", plant.dac) for i, plant in enumerate(plants)),
+                *self._loopback_channels("dac"),
+            ),
             observed=tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um")),
             exclusive=False,
             real=False,
         )
 
-    def _looped(self, kind: str) -> list[Channel]:
+    def _loopback_channels(self, kind: str) -> list[Channel]:
         """The channels behind those of the plants."""
-        return [Channel(f"{kind}{len(self.wiring) + i}") for i in range(self._looped_v.size)]
+        return [Channel(f"{kind}{len(self.wiring) + i}") for i in range(self._loopback_v.size)]
 
     def open(self) -> Pointers:
         """Pointers to the compiled rig."""
         coefficients, state = self._rig
-        self._context["looped"], self._context["looped_v"] = self._looped_v.size, self._looped_v.ctypes.data
+        self._context["looped"], self._context["looped_v"] = self._loopback_v.size, self._loopback_v.ctypes.data
         self._context["count"] = coefficients.size
         self._context["coefficients"], self._context["state"] = coefficients.ctypes.data, state.ctypes.data
         return Pointers(self._context.ctypes.data, sim_read.address, sim_write.address)
@@ -113,13 +119,13 @@ class SimDriver(Driver):
     @property
     def dac_v(self) -> list[float]:
         """What each DAC was given last, as it renders it."""
-        return [*self._rig[1]["dac_v"].tolist(), *self._looped_v.tolist()]
+        return [*self._rig[1]["dac_v"].tolist(), *self._loopback_v.tolist()]
 
     def close(self) -> None:
         """Outputs at 0 V; no time passes, for the rig exists only while it is called."""
         self._rig[1]["dac_v"] = 0.0
-        self._looped_v[:] = 0.0
+        self._loopback_v[:] = 0.0
 
 
-def _channel(name: str, converter: ConverterOptions) -> Channel:
+def _converter_channel(name: str, converter: ConverterOptions) -> Channel:
     return Channel(name, -converter.range_v, converter.range_v)

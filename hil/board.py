@@ -25,8 +25,8 @@ from rtloop.hil.native.monotonic import monotonic_ns, sleep_until
 from rtloop.hil.options import BoardOptions
 from rtloop.hil.rig import advance, build_rig, sample
 from rtloop.hil.stages.noise import seed_word
-from rtloop.hil.trusted import open_file, release
-from rtloop.hil.witness import LEVELS, PAST, SEEN, move, see_write
+from rtloop.hil.trusted import close_descriptor, open_file
+from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS, judge_write, record_level
 
 MAGIC = int.from_bytes(b"rtlboard", "little")
 VERSION = 3
@@ -41,7 +41,10 @@ BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 FACTS = np.dtype([("magic", np.uint64), ("version", np.int64), ("channels", np.int64), ("rate_hz", np.float64)])
 """First in the file, written once."""
-WORDS, SEQUENCE, FAULT, LONGEST_LATE_NS, DROPPED, REPEATED, WRITTEN, TAKEN, UNSEEN, LOOKED_NS = 9, *range(9)
+WORDS, SEQUENCE, FAULT, LARGEST_LATENESS_NS, DROPPED, REPEATED, WRITTEN, EXAMINED, MISSED_WRITES, LOOKED_NS = (
+    9,
+    *range(9),
+)
 """uint64 words: samples so far (BUSY while one is written), the fault that a test asks for, how late the board's own
 clock ever was (between two looks at its outputs lay at most so much more than its period), how many samples were
 dropped and repeated, how many writes there were, how many of them the board has looked at, how many it came too
@@ -66,10 +69,10 @@ class BoardMemory:
         arrays = {}
         for name, (dtype, count) in _LAYOUT.items():
             arrays[name] = np.frombuffer(self._map, dtype, count, offset)
-            offset += _aligned(dtype.itemsize * count)
+            offset += _padded_bytes(dtype.itemsize * count)
         self.facts, self.words, self.sample_ns = arrays["facts"], arrays["words"], arrays["sample_ns"]
         self.adc_codes = arrays["adc_codes"]
-        self.fifo, self.seen = arrays["fifo"].view(np.recarray), arrays["seen"].view(np.recarray)
+        self.fifo, self.evidence = arrays["fifo"].view(np.recarray), arrays["seen"].view(np.recarray)
         self._arrays = tuple(arrays.values())
 
     @property
@@ -89,21 +92,21 @@ _LAYOUT: dict[str, tuple[np.dtype, int]] = {
     "words": (np.dtype(np.uint64), WORDS),
     "sample_ns": (np.dtype(np.int64), 1),
     "adc_codes": (np.dtype(np.int64), MAX_CHANNELS),
-    "seen": (SEEN, MAX_CHANNELS),
+    "seen": (EVIDENCE, MAX_CHANNELS),
     "fifo": (WRITE, FIFO),
 }
 
 
-def _aligned(size: int) -> int:
+def _padded_bytes(size: int) -> int:
     return -(-size // 64) * 64
 
 
 def file_bytes() -> int:
     """Length of a board's file."""
-    return sum(_aligned(dtype.itemsize * count) for dtype, count in _LAYOUT.values())
+    return sum(_padded_bytes(dtype.itemsize * count) for dtype, count in _LAYOUT.values())
 
 
-class BoardBusy(OSError):
+class BoardConflict(OSError):
     """Another board serves this file."""
 
 
@@ -112,8 +115,8 @@ def serve(
     options: BoardOptions,
     axes: Sequence[str],
     rate_hz: float,
-    stopped: Callable[[], bool],
-    ready: Callable[[], None] = lambda: None,
+    is_stopped: Callable[[], bool],
+    on_ready: Callable[[], None] = lambda: None,
 ) -> int:
     """Be the board at `path` until `stopped`; returns the samples taken. Raises ValueError, OSError, BoardBusy."""
     if len(axes) > MAX_CHANNELS:
@@ -121,8 +124,8 @@ def serve(
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
     fd = open_file(path, os.O_RDWR | os.O_CREAT, 0o660, group=True)
     try:
-        if not take_role(fd, BOARD_BYTE):
-            raise BoardBusy(f"{path}: another board serves this file")
+        if not lock_role(fd, BOARD_BYTE):
+            raise BoardConflict(f"{path}: another board serves this file")
         os.ftruncate(fd, file_bytes())  # never shorter: a controller may still have it mapped
         memory = BoardMemory(fd)
         memory.reset()
@@ -130,23 +133,23 @@ def serve(
         losses = np.zeros(1, LOSSES).view(np.recarray)
         losses.word = seed_word(options.seed, "losses")
         losses.dropped_share, losses.repeated_share = options.dropped_share, options.repeated_share
-        levels = np.zeros((MAX_CHANNELS, LEVELS), PAST).view(np.recarray)
-        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.fifo, memory.adc_codes, memory.seen,
-                     levels, losses, timespec.ctypes.data)  # fmt: skip
-        _run(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
+        levels = np.zeros((MAX_CHANNELS, MAX_LEVELS), LEVEL).view(np.recarray)
+        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.fifo, memory.adc_codes,
+                     memory.evidence, levels, losses, timespec.ctypes.data)  # fmt: skip
+        _advance_board(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
-        ready()
+        on_ready()
         start_ns, index, slice_ticks = time.monotonic_ns(), 0, max(1, round(SLICE_S * rate_hz))
-        while not stopped():
-            index = _run(*arguments, start_ns, 1e9 / rate_hz, index, slice_ticks)
+        while not is_stopped():
+            index = _advance_board(*arguments, start_ns, 1e9 / rate_hz, index, slice_ticks)
         memory.facts["magic"] = 0
         return int(memory.words[SEQUENCE])
     finally:
-        release(fd)
+        close_descriptor(fd)
 
 
-def take_role(fd: int, byte: int) -> bool:
+def lock_role(fd: int, byte: int) -> bool:
     """Lock one byte of the file for this open file: BOARD_BYTE or CONTROLLER_BYTE; False where another has it.
 
     The lock belongs to the open file and not to the process, whose locks would all go when any of its descriptors
@@ -161,33 +164,33 @@ def take_role(fd: int, byte: int) -> bool:
 
 
 @jit
-def _run(
+def _advance_board(
     coefficients,
     state,
     words,
     sample_ns,
     fifo,
     adc_codes,
-    seen,
-    past,
+    evidence,
+    levels,
     losses,
     timespec,
     start_ns,
     period_ns,
     index,
-    count,
+    periods,
 ):
     """`count` periods of the board's fixed grid; periods that a stall swallowed still move the rig. Next index."""
     actuator_v = np.zeros(coefficients.shape[0])
-    for _ in range(count):
+    for _ in range(periods):
         wake_ns = start_ns + np.int64(index * period_ns)
         now_ns = monotonic_ns(timespec)
         while now_ns < wake_ns:
             now_ns = sleep_until(wake_ns, timespec)
-        if np.uint64(now_ns - wake_ns) > words[LONGEST_LATE_NS]:
-            words[LONGEST_LATE_NS] = np.uint64(now_ns - wake_ns)
+        if np.uint64(now_ns - wake_ns) > words[LARGEST_LATENESS_NS]:
+            words[LARGEST_LATENESS_NS] = np.uint64(now_ns - wake_ns)
         fault = load_acquire(words, FAULT)
-        value_arrives, time_arrives = _arrives(losses[0], words)
+        value_arrives, time_arrives = _draw_delivery(losses[0], words)
         frozen = fault == FROZEN_INPUT
         sequence = load_acquire(words, SEQUENCE)
         store_release(words, SEQUENCE, BUSY)
@@ -196,20 +199,20 @@ def _run(
             volts = sample(coefficients[i], state[i])
             if value_arrives and not frozen:
                 adc_codes[i] = np.int64(np.rint(volts / LSB_V))
-            _look(seen[i], state[i], index)
+            _record_position(evidence[i], state[i], index)
         if time_arrives and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
-        _look_at_outputs(words, fifo, seen, past, coefficients.shape[0], fault != STUCK_OUTPUT, timespec)
+        _observe_outputs(words, fifo, evidence, levels, coefficients.shape[0], fault != STUCK_OUTPUT, timespec)
         for i in range(coefficients.shape[0]):
-            actuator_v[i] = seen[i].last_v
+            actuator_v[i] = evidence[i].last_v
         advance(coefficients, state, actuator_v)
         index += 1
     return index
 
 
 @jit
-def _arrives(losses, words):
+def _draw_delivery(losses, words):
     """Whether this sample's value, and whether its time, reach the controller."""
     word = losses.word
     word ^= word << _SHIFTS[0]
@@ -227,44 +230,46 @@ def _arrives(losses, words):
 
 
 @jit
-def _look(seen, state, index):
+def _record_position(evidence, state, index):
     """The true position, and the farthest it ever was."""
-    seen.true_position_um = state.true_position_um
-    if abs(state.true_position_um) > seen.largest_position_um:
-        seen.largest_position_um = abs(state.true_position_um)
+    evidence.true_position_um = state.true_position_um
+    if abs(state.true_position_um) > evidence.largest_position_um:
+        evidence.largest_position_um = abs(state.true_position_um)
 
 
 @jit
-def _look_at_outputs(words, fifo, seen, past, channels, follow, timespec):
+def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec):
     """See the writes since the look before, and what the outputs are at; stuck outputs do not `follow`."""
     look_begin_ns = monotonic_ns(timespec)
     write_count = load_acquire(words, WRITTEN)
     now_ns = monotonic_ns(timespec)
-    see_writes(words, fifo, seen, past, channels, write_count, now_ns, follow)
+    examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows)
     words[LOOKED_NS] = np.uint64(look_begin_ns)  # what `written` did not count yet was written after this
     for i in range(channels):
-        if follow:
-            move(seen[i], seen[i].written_v, now_ns)
+        if follows:
+            record_level(evidence[i], evidence[i].written_v, now_ns)
 
 
 @jit
-def see_writes(words, fifo, seen, past, channels, written, now_ns, follow):
+def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows):
     """See every write up to number `written` that was not seen yet; all of them were made before `now_ns`."""
-    examined_count = words[TAKEN]
-    if written - examined_count > np.uint64(FIFO):
-        words[UNSEEN] += written - examined_count - np.uint64(FIFO)
-        examined_count = written - np.uint64(FIFO)
-    while examined_count < written:
+    examined_count = words[EXAMINED]
+    if write_count - examined_count > np.uint64(FIFO):
+        words[MISSED_WRITES] += write_count - examined_count - np.uint64(FIFO)
+        examined_count = write_count - np.uint64(FIFO)
+    while examined_count < write_count:
         write = fifo[np.int64(examined_count % np.uint64(FIFO))]
         written_ns = min(max(write.ns, np.int64(words[LOOKED_NS])), now_ns)
         for i in range(channels):
-            words[UNSEEN] += np.uint64(see_write(seen[i], past[i], write.codes[i] * LSB_V, written_ns, follow))
+            words[MISSED_WRITES] += np.uint64(
+                judge_write(evidence[i], levels[i], write.codes[i] * LSB_V, written_ns, follows)
+            )
         examined_count += np.uint64(1)
-    words[TAKEN] = examined_count
+    words[EXAMINED] = examined_count
 
 
 @jit
-def latest_sample(words, sample_ns, adc_codes, out_codes, channels, tries):
+def copy_latest_sample(words, sample_ns, adc_codes, out_codes, channels, tries):
     """Copy the newest sample; returns its time in ns of CLOCK_MONOTONIC, or −1 where none could be had whole."""
     for _ in range(tries):
         sequence = load_acquire(words, SEQUENCE)

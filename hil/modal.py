@@ -15,7 +15,7 @@ import numpy.typing as npt
 Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 
-CLUSTER = 1e-6
+CLUSTER_TOLERANCE = 1e-6
 """Poles closer than this, relative to their magnitude, have no usable modal sum."""
 
 
@@ -33,24 +33,24 @@ class StateSpace(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Modal:
+class ModalSystem:
     """One input, m outputs, n modes: `poles` (n,), `residues` (m, n), `direct` (m,). In s or in z."""
 
     poles: Complex
     residues: Complex
     direct: Real
 
-    def response(self, at: npt.ArrayLike) -> Complex:
+    def response(self, complex_points: npt.ArrayLike) -> Complex:
         """Outputs' frequency response at complex points `at` (k,) of the s or z plane, shape (m, k)."""
-        points = np.asarray(at, dtype=complex)
+        points = np.asarray(complex_points, dtype=complex)
         return self.direct[:, None] + self.residues @ (1.0 / (points[None, :] - self.poles[:, None]))
 
-    def zero_order_hold(self, period_s: float) -> Modal:
+    def zero_order_hold(self, period_s: float) -> ModalSystem:
         """Exact discretisation for an input held constant over each period."""
         hold_factors = period_s * np.ones_like(self.poles)
         nonzero = self.poles != 0
         hold_factors[nonzero] = np.expm1(self.poles[nonzero] * period_s) / self.poles[nonzero]
-        return Modal(np.exp(self.poles * period_s), self.residues * hold_factors, self.direct)
+        return ModalSystem(np.exp(self.poles * period_s), self.residues * hold_factors, self.direct)
 
     def realise(self) -> StateSpace:
         """Real block-diagonal realisation: 1×1 blocks for real poles, rotation-scaling 2×2 blocks for pairs."""
@@ -91,7 +91,7 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
     return np.concatenate([real.astype(complex), np.asarray(pairs, dtype=complex)])
 
 
-def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Modal:
+def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalSystem:
     """Partial fractions of gain·Π(s − z)/Π(s − p), from the factors and never from expanded polynomials.
 
     Raises RepeatedPoles where two poles lie closer than CLUSTER, ValueError for an improper or complex system.
@@ -102,16 +102,16 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> Modal:
     residues = np.empty(denominator.size, dtype=complex)
     for i, pole in enumerate(denominator):
         other_poles = np.delete(denominator, i)
-        if np.any(np.abs(other_poles - pole) <= CLUSTER * max(abs(pole), 1e-300)):
+        if np.any(np.abs(other_poles - pole) <= CLUSTER_TOLERANCE * max(abs(pole), 1e-300)):
             raise RepeatedPoles(f"poles near {pole:.6g} are repeated")
         residues[i] = gain * _ratio_of_products(pole - numerator, pole - other_poles)
     direct = gain if numerator.size == denominator.size else 0.0
-    return Modal(denominator, residues[None, :], np.array([direct]))
+    return ModalSystem(denominator, residues[None, :], np.array([direct]))
 
 
-def _ratio_of_products(above: Complex, below: Complex) -> complex:
+def _ratio_of_products(numerators: Complex, denominators: Complex) -> complex:
     """Π above / Π below, a factor at a time so that nothing overflows."""
     ratio = 1.0 + 0.0j
-    for i in range(max(above.size, below.size)):
-        ratio *= (above[i] if i < above.size else 1.0) / (below[i] if i < below.size else 1.0)
+    for i in range(max(numerators.size, denominators.size)):
+        ratio *= (numerators[i] if i < numerators.size else 1.0) / (denominators[i] if i < denominators.size else 1.0)
     return ratio

@@ -28,13 +28,13 @@ LARGEST, SMALLEST = 1e100, 1e-100
 LARGEST_INTEGER = 2**63 - 1
 
 
-def _numbers(value: Any) -> Iterator[int | float]:
+def _nested_numbers(value: Any) -> Iterator[int | float]:
     """All numbers in lists within lists."""
     if isinstance(value, int | float):
         yield value
     elif isinstance(value, list | tuple):
         for part in value:
-            yield from _numbers(part)
+            yield from _nested_numbers(part)
 
 
 class Options(BaseModel):
@@ -44,9 +44,9 @@ class Options(BaseModel):
 
     @field_validator("*")
     @classmethod
-    def _computable(cls, value: Any) -> Any:
+    def _check_magnitudes(cls, value: Any) -> Any:
         """`value`. Raises ValueError for a number that nothing can be computed with."""
-        for number in _numbers(value):
+        for number in _nested_numbers(value):
             if isinstance(number, int):
                 if abs(number) > LARGEST_INTEGER:
                     raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; smaller ones are allowed")
@@ -62,7 +62,7 @@ class Options(BaseModel):
             del attributes[name]
         return copy
 
-    def _only_with(self, name: str, value: str, *fields: str) -> None:
+    def _require_unset(self, name: str, value: str, *fields: str) -> None:
         """Raise ValueError for a field that is set although it would be ignored."""
         for field in fields:
             if getattr(self, field) not in ((), None):
@@ -101,11 +101,11 @@ class HysteresisOptions(Options):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.truth != "bouc-wen":
-            self._only_with("truth", "bouc-wen", "bouc_wen")
+            self._require_unset("truth", "bouc-wen", "bouc_wen")
         elif self.bouc_wen is None:
             raise ValueError("bouc_wen: missing; truth = 'bouc-wen' needs its numbers")
         if self.truth != "custom":
-            self._only_with("truth", "custom", "thresholds_v", "weights_um_per_v")
+            self._require_unset("truth", "custom", "thresholds_v", "weights_um_per_v")
             return self
         thresholds, weights = self.thresholds_v, self.weights_um_per_v
         if not 1 <= len(thresholds) <= MAX_PLAYS:
@@ -132,9 +132,9 @@ class DynamicsOptions(Options):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.form != "factors":
-            self._only_with("form", "factors", "numerator", "denominator")
+            self._require_unset("form", "factors", "numerator", "denominator")
         if self.form != "zpk":
-            self._only_with("form", "zpk", "zeros", "poles")
+            self._require_unset("form", "zpk", "zeros", "poles")
         if (self.gain is None) != (self.form == "paper"):
             raise ValueError(
                 f"gain is {self.gain} with form {self.form!r}: allowed, and needed, with 'factors' and 'zpk'"
@@ -179,7 +179,7 @@ class SensorOptions(Options):
 
     @field_validator("um_per_v")
     @classmethod
-    def _measures(cls, um_per_v: float) -> float:
+    def _check_scale(cls, um_per_v: float) -> float:
         if um_per_v == 0:
             raise ValueError("0: a sensor that measures nothing; allowed are numbers other than 0")
         return um_per_v

@@ -64,8 +64,8 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
     state = np.zeros(len(axes), STATE).view(np.recarray)
     for i, axis in enumerate(axes):
         plant = options.plants.get(axis, options.plant)
-        with _naming(f"axis {axis}"):
-            fields = _coefficients_of(plant, period_s)
+        with _prefix_errors(f"axis {axis}"):
+            fields = _axis_coefficients(plant, period_s)
         for field, value in fields.items():
             coefficients[field][i] = value
         coefficients["latency_ticks"][i] = options.latency_ticks
@@ -73,8 +73,8 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
         state["disturbance_wait"][i] = round(plant.disturbance.start_s / period_s)
         state["cosine_um"][i] = plant.disturbance.sine_um
         if plant.hysteresis.history_v:
-            _rest_after(plant.hysteresis.history_v, coefficients[i], state[i])
-    _couple(options, axes, coefficients)
+            _settle_history(plant.hysteresis.history_v, coefficients[i], state[i])
+    _fill_coupling(options, axes, coefficients)
     uncoupled_um = state["hysteresis_um"]
     input_um = uncoupled_um + coefficients["coupling"][:, : len(axes)] @ uncoupled_um[:MAX_COUPLED]
     for i in np.flatnonzero(input_um):
@@ -82,7 +82,7 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
     return coefficients, state
 
 
-def _couple(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
+def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
     """Note what moves what. Raises ValueError for a name that is no axis, and for more axes than may be coupled."""
     for name, shares in options.coupling.items():
         for source in (name, *shares):
@@ -97,7 +97,7 @@ def _couple(options: RigOptions, axes: Sequence[str], coefficients: np.recarray)
             coefficients["coupling"][axes.index(name), axes.index(source)] = share
 
 
-def _rest_after(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
+def _settle_history(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
     """Leave the axis's actuator as the drives `history_v` and then a long rest at 0 V leave it."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
@@ -106,9 +106,9 @@ def _rest_after(history_v: Sequence[float], coefficients: np.record, state: np.r
     state.hysteresis_um = creep.step(coefficients, state, displacement_um)
 
 
-def _coefficients_of(plant: PlantOptions, period_s: float) -> dict[str, object]:
+def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object]:
     """Every coefficient of one axis except what all axes share. Raises ValueError, naming the part."""
-    thresholds_v, weights_um_per_v = hysteresis.TRUTHS.get(
+    thresholds_v, weights_um_per_v = hysteresis.NAMED_MODELS.get(
         plant.hysteresis.truth, (plant.hysteresis.thresholds_v, plant.hysteresis.weights_um_per_v)
     )
     padding = (0.0,) * (hysteresis.MAX_PLAYS - len(thresholds_v))
@@ -124,20 +124,20 @@ def _coefficients_of(plant: PlantOptions, period_s: float) -> dict[str, object]:
     if plant.hysteresis.bouc_wen is not None:
         fields |= {f"bw_{name}": value for name, value in plant.hysteresis.bouc_wen}
     for name, converter in (("adc", plant.adc), ("dac", plant.dac)):
-        span = converters.span(converter.range_v, converter.bits)
+        span = converters.lsb_and_range(converter.range_v, converter.bits)
         fields |= dict(zip((f"{name}_lsb_v", f"{name}_lowest_v", f"{name}_highest_v"), span, strict=True))
     fields |= creep.discretise(plant.creep.gains, plant.creep.time_constants_s, period_s)
-    with _naming("dynamics"):
+    with _prefix_errors("dynamics"):
         modal = modal_sum(*zeros_poles_gain(plant.dynamics))
-        fields |= dynamics.discretise(dynamics.with_sensor(modal, plant.sensor.bandwidth_hz), period_s)
-    with _naming("disturbance"):
+        fields |= dynamics.discretise(dynamics.add_sensor_output(modal, plant.sensor.bandwidth_hz), period_s)
+    with _prefix_errors("disturbance"):
         omega = plant.disturbance
         fields |= disturbance.discretise(omega.step_um, omega.sine_um, omega.sine_hz, period_s)
     return fields
 
 
 @contextmanager
-def _naming(culprit: str) -> Iterator[None]:
+def _prefix_errors(culprit: str) -> Iterator[None]:
     """A ValueError raised inside begins with whose it is."""
     try:
         yield
@@ -174,11 +174,11 @@ def sample(coefficients, state):
 def advance(coefficients, state, dac_v):
     """One period of all axes, `dac_v` [V] written to their DACs at its beginning; NaN holds what was written before."""
     for i in range(coefficients.shape[0]):
-        actuator_v = converters.drive(coefficients[i], state[i], dac_v[i])
+        actuator_v = converters.write_dac(coefficients[i], state[i], dac_v[i])
         displacement_um = _displacement_um(coefficients[i], state[i], actuator_v)
         state[i].hysteresis_um = creep.step(coefficients[i], state[i], displacement_um)
     for i in range(coefficients.shape[0]):
-        input_um = _moved_um(coefficients, state, i) + disturbance.step(coefficients[i], state[i])
+        input_um = _coupled_displacement_um(coefficients, state, i) + disturbance.step(coefficients[i], state[i])
         dynamics.step(coefficients[i], state[i], input_um)
 
 
@@ -191,7 +191,7 @@ def _displacement_um(coefficients, state, actuator_v):
 
 
 @jit
-def _moved_um(coefficients, state, i):
+def _coupled_displacement_um(coefficients, state, i):
     """Displacement of axis `i`, with what the others add to it [µm]."""
     total_um = state[i].hysteresis_um
     for j in range(coefficients[i].coupled_count):

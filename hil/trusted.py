@@ -5,8 +5,9 @@ nobody can exchange one meanwhile. A folder such as /tmp, where all may make thi
 stand above such a place; it is no such place itself.
 
 Recordings and reports lie where others may write too, such as a folder of a group. There a file is made or emptied only
-under a name that nobody else has laid (`make_file`, `remake_file`, `overwrite_file`), and opening one to read never
-waits (`open_named`, `open_found`, `open_own`). The product opens its files here; a test finds an open elsewhere.
+under a name that nobody else has laid (`make_file`, `replace_file`, `overwrite_file`), and opening one to read never
+waits (`open_user_file`, `open_without_link`, `open_own`). The product opens its files here; a test finds an open
+elsewhere.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _OVERWRITE = os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-_MOST_LINKS = 40
+_MAX_LINKS = 40
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
-class Untrusted(PermissionError):
+class UntrustedPath(PermissionError):
     """Somebody else made this, or may change it."""
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(errno.EPERM, reason, str(path))
 
 
-def release(fd: int) -> None:
+def close_descriptor(fd: int) -> None:
     """Close a descriptor through which nothing was written. An error is ignored: Linux frees the descriptor anyway."""
     with suppress(OSError):
         os.close(fd)
@@ -45,17 +46,17 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 
     What is missing on the way is made with `mode`. `shared` allows the folder itself to be one such as /tmp.
     """
-    fd, _, is_shared = _walk(path, mode)
+    fd, _, is_shared = _walk_path(path, mode)
     if is_shared and not shared:
-        release(fd)
-        raise Untrusted(path, "everybody may write there; a folder of its own is needed")
+        close_descriptor(fd)
+        raise UntrustedPath(path, "everybody may write there; a folder of its own is needed")
     return fd
 
 
-def owners(folder: Path) -> set[int]:
+def trusted_owners(folder: Path) -> set[int]:
     """Users whose files in `folder` count: we, root, and whom root gave it. Raises OSError, Untrusted."""
-    fd, owner_ids, _ = _walk(folder, None, given=True)
-    release(fd)
+    fd, owner_ids, _ = _walk_path(folder, None, trusts_grants=True)
+    close_descriptor(fd)
     return owner_ids
 
 
@@ -68,43 +69,43 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     try:
         fd = os.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode, dir_fd=folder)
     except OSError as error:
-        raise _without_link(error, path) from None
+        raise _explain_open_error(error, path) from None
     finally:
-        release(folder)
+        close_descriptor(folder)
     status = os.fstat(fd)
     is_group_file = group and status.st_gid in (os.getegid(), *os.getgroups())
     if not stat.S_ISREG(status.st_mode):
         reason = "not a regular file"
     elif not _is_own(status) and not is_group_file:
-        reason = _belongs(status)
+        reason = _owner_text(status)
     elif status.st_mode & (stat.S_IWOTH if is_group_file else _OTHERS_WRITE):
         reason = "others may write to it"
     else:
         return fd
-    release(fd)
-    raise Untrusted(path, reason)
+    close_descriptor(fd)
+    raise UntrustedPath(path, reason)
 
 
-def open_named(path: Path | str) -> int:
+def open_user_file(path: Path | str) -> int:
     """A regular file that a user named, to be read, through whatever links. Raises OSError."""
-    return _regular(os.open(path, _READ), path)
+    return _require_regular(os.open(path, _READ), path)
 
 
-def open_found(path: Path | str) -> int:
+def open_without_link(path: Path | str) -> int:
     """A regular file of anybody's that a folder was found to hold, to be read. Raises OSError, Untrusted for a link."""
     try:
         fd = os.open(path, _READ | os.O_NOFOLLOW)
     except OSError as error:
-        raise _without_link(error, path) from None
-    return _regular(fd, path)
+        raise _explain_open_error(error, path) from None
+    return _require_regular(fd, path)
 
 
 def open_own(path: Path | str) -> int:
-    """As `open_found`, a file of ours or root's. Raises OSError, Untrusted."""
-    fd = open_found(path)
+    """As `open_without_link`, a file of ours or root's. Raises OSError, Untrusted."""
+    fd = open_without_link(path)
     if not _is_own(status := os.fstat(fd)):
-        release(fd)
-        raise Untrusted(path, _belongs(status))
+        close_descriptor(fd)
+        raise UntrustedPath(path, _owner_text(status))
     return fd
 
 
@@ -119,30 +120,30 @@ def is_own(path: Path) -> bool:
 
 def make_file(path: Path, mode: int = 0o666) -> int:
     """A new file, to be written and read. Raises OSError, Untrusted; FileExistsError where anything has its name."""
-    with _folder_of(path) as folder:
+    with _open_parent(path) as folder:
         return os.open(path.name, _NEW, mode, dir_fd=folder)
 
 
-def remake_file(path: Path, mode: int = 0o666) -> int:
+def replace_file(path: Path, mode: int = 0o666) -> int:
     """As `make_file`; a file of ours that no process has locked gives way. Raises OSError, Untrusted.
 
     BlockingIOError: a process has it locked.
     """
-    with _folder_of(path) as folder:
+    with _open_parent(path) as folder:
         try:
             return os.open(path.name, _NEW, mode, dir_fd=folder)
         except FileExistsError:
             status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
         if not _is_own(status):
-            raise Untrusted(path, f"{_belongs(status)}; remove it")
+            raise UntrustedPath(path, f"{_owner_text(status)}; remove it")
         if not stat.S_ISREG(status.st_mode):
-            raise Untrusted(path, "not a regular file; remove it")
+            raise UntrustedPath(path, "not a regular file; remove it")
         abandoned = os.open(path.name, _READ | os.O_NOFOLLOW, dir_fd=folder)
         try:
             fcntl.flock(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.unlink(path.name, dir_fd=folder)
         finally:
-            release(abandoned)
+            close_descriptor(abandoned)
         return os.open(path.name, _NEW, mode, dir_fd=folder)
 
 
@@ -152,27 +153,29 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
     Links of ours and root's are followed. Untrusted stands for links and files of others, and where others may write
     also for a file that has more than one name.
     """
-    for _ in range(_MOST_LINKS):
-        with _folder_of(path) as folder:
+    for _ in range(_MAX_LINKS):
+        with _open_parent(path) as folder:
             try:
                 return os.open(path.name, _NEW, mode, dir_fd=folder)
             except FileExistsError:
                 status = os.stat(path.name, dir_fd=folder, follow_symlinks=False)
             if not _is_own(status):
-                raise Untrusted(path, _belongs(status))
+                raise UntrustedPath(path, _owner_text(status))
             if not stat.S_ISLNK(status.st_mode):
-                return _emptied(os.open(path.name, _OVERWRITE | os.O_NOFOLLOW, dir_fd=folder), path, os.fstat(folder))
+                return _empty_file(
+                    os.open(path.name, _OVERWRITE | os.O_NOFOLLOW, dir_fd=folder), path, os.fstat(folder)
+                )
             if status.st_dev == os.stat("/proc/self").st_dev:  # a descriptor of this process, as /dev/stdout leads to
                 return os.open(path.name, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, dir_fd=folder)
             path = Path(os.readlink(f"/proc/self/fd/{folder}")) / os.readlink(path.name, dir_fd=folder)
     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
 
-def _emptied(fd: int, path: Path, folder: os.stat_result) -> int:
+def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
     """An open file, emptied. Raises Untrusted, with the file closed and as it was."""
     status = os.fstat(fd)
     if not _is_own(status):
-        reason = _belongs(status)
+        reason = _owner_text(status)
     elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1 and folder.st_mode & _OTHERS_WRITE:
         reason = "has more than one name, in a folder where others may write; remove it"
     else:
@@ -180,37 +183,39 @@ def _emptied(fd: int, path: Path, folder: os.stat_result) -> int:
             os.ftruncate(fd, 0)
         os.set_blocking(fd, True)
         return fd
-    release(fd)
-    raise Untrusted(path, reason)
+    close_descriptor(fd)
+    raise UntrustedPath(path, reason)
 
 
-def _without_link(error: OSError, path: Path | str) -> OSError:
+def _explain_open_error(error: OSError, path: Path | str) -> OSError:
     """The error of an open that follows no link; Untrusted where that was the reason."""
-    return Untrusted(path, "a link, which is not followed here") if error.errno == errno.ELOOP else error
+    return UntrustedPath(path, "a link, which is not followed here") if error.errno == errno.ELOOP else error
 
 
-def _regular(fd: int, path: Path | str) -> int:
+def _require_regular(fd: int, path: Path | str) -> int:
     """The descriptor of a regular file. Raises OSError for another kind of file, which is closed."""
     mode = os.fstat(fd).st_mode
     if stat.S_ISREG(mode):
         return fd
-    release(fd)
+    close_descriptor(fd)
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     raise OSError(errno.EINVAL, "not a regular file", str(path))
 
 
 @contextmanager
-def _folder_of(path: Path) -> Iterator[int]:
+def _open_parent(path: Path) -> Iterator[int]:
     """Descriptor of the folder of `path`, whoever else may write there. Raises OSError, Untrusted."""
-    fd, _, _ = _walk(path.parent, None, believes=False)
+    fd, _, _ = _walk_path(path.parent, None, checks_trust=False)
     try:
         yield fd
     finally:
-        release(fd)
+        close_descriptor(fd)
 
 
-def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool = True) -> tuple[int, set[int], bool]:
+def _walk_path(
+    path: Path, mode: int | None, *, trusts_grants: bool = False, checks_trust: bool = True
+) -> tuple[int, set[int], bool]:
     """Descriptor of the folder, whose files count there, and whether everybody may make some.
 
     Without `believes` any folder will do, and a link also counts where its maker alone may write.
@@ -221,38 +226,40 @@ def _walk(path: Path, mode: int | None, *, given: bool = False, believes: bool =
     try:
         while remaining_names:
             name = remaining_names.pop()
-            status = _entry(name, fd, mode)
+            status = _stat_or_make(name, fd, mode)
             if stat.S_ISLNK(status.st_mode):
                 links += 1
-                if status.st_uid not in trusted_ids and (believes or not _is_alone(os.fstat(fd), status.st_uid)):
-                    raise Untrusted(path, f"leads through {_belongs(status)}")
-                if links > _MOST_LINKS:
+                if status.st_uid not in trusted_ids and (
+                    checks_trust or not _is_sole_writer(os.fstat(fd), status.st_uid)
+                ):
+                    raise UntrustedPath(path, f"leads through {_owner_text(status)}")
+                if links > _MAX_LINKS:
                     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
                 target = Path(os.readlink(name, dir_fd=fd))
                 if target.is_absolute():
-                    fd, by_root = _onward(fd, "/"), True
+                    fd, by_root = _open_subfolder(fd, "/"), True
                 remaining_names += reversed([part for part in target.parts if part != "/"])
                 continue
-            fd = _onward(fd, name)
-            if not believes:
+            fd = _open_subfolder(fd, name)
+            if not checks_trust:
                 continue
             status = os.fstat(fd)
-            if given and by_root:
+            if trusts_grants and by_root:
                 trusted_ids.add(status.st_uid)
             shared = bool(status.st_mode & stat.S_ISVTX and status.st_mode & _OTHERS_WRITE)
             location = Path(os.readlink(f"/proc/self/fd/{fd}"))
             if status.st_uid not in trusted_ids:
-                raise Untrusted(location, f"{_belongs(status)}, and what is in it is not believed")
+                raise UntrustedPath(location, f"{_owner_text(status)}, and what is in it is not believed")
             if status.st_mode & _OTHERS_WRITE and not shared:
-                raise Untrusted(location, "others may write there; it must be its owner's alone (chmod go-w)")
+                raise UntrustedPath(location, "others may write there; it must be its owner's alone (chmod go-w)")
             by_root = by_root and status.st_uid == 0 and not shared
     except BaseException:
-        release(fd)
+        close_descriptor(fd)
         raise
     return fd, trusted_ids, shared
 
 
-def _entry(name: str, folder: int, mode: int | None) -> os.stat_result:
+def _stat_or_make(name: str, folder: int, mode: int | None) -> os.stat_result:
     """What is there, made where it is missing and `mode` is given."""
     try:
         return os.stat(name, dir_fd=folder, follow_symlinks=False)
@@ -263,14 +270,14 @@ def _entry(name: str, folder: int, mode: int | None) -> os.stat_result:
     return os.stat(name, dir_fd=folder, follow_symlinks=False)
 
 
-def _onward(fd: int, name: str) -> int:
+def _open_subfolder(fd: int, name: str) -> int:
     """The folder `name` in `fd`, which is closed."""
     following = os.open(name, _FOLDER, dir_fd=fd)
-    release(fd)
+    close_descriptor(fd)
     return following
 
 
-def _is_alone(folder: os.stat_result, uid: int) -> bool:
+def _is_sole_writer(folder: os.stat_result, uid: int) -> bool:
     """Whether a folder belongs to a user who alone may write there."""
     return folder.st_uid == uid and not folder.st_mode & _OTHERS_WRITE
 
@@ -279,6 +286,6 @@ def _is_own(status: os.stat_result) -> bool:
     return status.st_uid in (0, os.geteuid())
 
 
-def _belongs(status: os.stat_result) -> str:
+def _owner_text(status: os.stat_result) -> str:
     link = "a link that " if stat.S_ISLNK(status.st_mode) else ""
     return f"{link}belongs to user {status.st_uid}, not to us or root"

@@ -16,9 +16,9 @@ import numpy as np
 from rtloop.hil.native.compiled import jit
 
 WINDOW_NS = 1_000_000
-LEVELS = 1024
+MAX_LEVELS = 1024
 """Voltages of an output that are remembered. More within one window are not judged but counted as unseen."""
-SEEN = np.dtype(
+EVIDENCE = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("written_v", np.float64), ("largest_step_v", np.float64),
      ("largest_window_v", np.float64), ("levels", np.int64), ("last_v", np.float64), ("moved_ns", np.int64),
      ("true_position_um", np.float64), ("largest_position_um", np.float64)]
@@ -30,41 +30,41 @@ from one write to the next, `largest_window_v` the largest change within WINDOW_
 output, which differs from `written_v` while the output is stuck; `moved_ns` is when it last changed, in ns of
 CLOCK_MONOTONIC.
 """
-PAST = np.dtype([("volts", np.float64), ("from_ns", np.int64)])
+LEVEL = np.dtype([("volts", np.float64), ("from_ns", np.int64)])
 """A voltage that an output had, and since when; before the first write 0 V, for ever."""
 
 
 @jit
-def see_write(seen, past, volts, written_ns, follows):
+def judge_write(evidence, levels, volts, written_ns, follows):
     """Judge one write to an output; returns 1 if so many writes fell into its window that it cannot be judged, else 0.
 
     `past` (LEVELS,) holds the output's voltages, number i at i modulo LEVELS. Where `follows` is not set, the output
     is stuck, and the write does not move it.
     """
-    if volts == seen.written_v:
+    if volts == evidence.written_v:
         return 0
-    newest = seen.levels
-    written_ns = max(written_ns, past[newest % LEVELS].from_ns)
-    is_unjudged = _judge(seen, past, volts, written_ns)
-    seen.levels = newest + 1
-    past[seen.levels % LEVELS].volts = volts
-    past[seen.levels % LEVELS].from_ns = written_ns
-    seen.written_v = volts
-    seen.lowest_v = min(seen.lowest_v, volts)
-    seen.highest_v = max(seen.highest_v, volts)
+    newest = evidence.levels
+    written_ns = max(written_ns, levels[newest % MAX_LEVELS].from_ns)
+    is_unjudged = _compare_with_window(evidence, levels, volts, written_ns)
+    evidence.levels = newest + 1
+    levels[evidence.levels % MAX_LEVELS].volts = volts
+    levels[evidence.levels % MAX_LEVELS].from_ns = written_ns
+    evidence.written_v = volts
+    evidence.lowest_v = min(evidence.lowest_v, volts)
+    evidence.highest_v = max(evidence.highest_v, volts)
     if follows:
-        move(seen, volts, written_ns)
+        record_level(evidence, volts, written_ns)
     return is_unjudged
 
 
 @jit
-def _judge(seen, past, volts, written_ns):
+def _compare_with_window(evidence, levels, volts, written_ns):
     """Compare a new voltage with those that the output had within the window; returns 1 if not all are remembered."""
-    seen.largest_step_v = max(seen.largest_step_v, abs(volts - seen.written_v))
-    i, first = seen.levels, max(seen.levels - LEVELS + 1, 0)
+    evidence.largest_step_v = max(evidence.largest_step_v, abs(volts - evidence.written_v))
+    i, first = evidence.levels, max(evidence.levels - MAX_LEVELS + 1, 0)
     while True:
-        level = past[i % LEVELS]
-        seen.largest_window_v = max(seen.largest_window_v, abs(volts - level.volts))
+        level = levels[i % MAX_LEVELS]
+        evidence.largest_window_v = max(evidence.largest_window_v, abs(volts - level.volts))
         if i == 0 or written_ns - level.from_ns > WINDOW_NS:
             return 0
         if i == first:
@@ -73,7 +73,7 @@ def _judge(seen, past, volts, written_ns):
 
 
 @jit
-def move(seen, volts, now_ns):
+def record_level(evidence, volts, now_ns):
     """Note that the output itself is at `volts` since `now_ns`."""
-    if volts != seen.last_v:
-        seen.last_v, seen.moved_ns = volts, now_ns
+    if volts != evidence.last_v:
+        evidence.last_v, evidence.moved_ns = volts, now_ns

@@ -26,13 +26,13 @@ LOW_SPACE = 1 << 16
 """Beyond every errno: less space is free than is to stay free."""
 
 
-def listed(source: str, faults: Sequence[str]) -> str:
+def fault_list(source: str, faults: Sequence[str]) -> str:
     """All faults of a file or request, a line each."""
     count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
     return "\n  ".join([f"{source}: {count}", *faults])
 
 
-def one_line(error: BaseException) -> str:
+def one_line_error(error: BaseException) -> str:
     """Type and message of an exception on one line, without characters that a terminal would obey."""
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {''.join(letter if letter.isprintable() else '?' for letter in words)}"
@@ -51,7 +51,7 @@ class ConfigError(RtloopError):
 
     def __init__(self, source: str, faults: Sequence[str]) -> None:
         self.source, self.faults = source, list(faults)
-        super().__init__(listed(source, self.faults))
+        super().__init__(fault_list(source, self.faults))
 
 
 class UnavailableError(RtloopError):
@@ -71,12 +71,12 @@ class OutputError(RtloopError):
 
 
 @contextmanager
-def writing(what: object) -> Iterator[None]:
+def output_errors(target: object) -> Iterator[None]:
     """Where the system refuses, OutputError says `what` is written and why not."""
     try:
         yield
     except OSError as error:
-        raise OutputError(f"{what}: {error.strerror or error}", error.errno or 0) from None
+        raise OutputError(f"{target}: {error.strerror or error}", error.errno or 0) from None
 
 
 class MissingExtra(RtloopError):
@@ -91,7 +91,7 @@ class NoDesign(RtloopError):
     exit_code = 1
 
 
-class HostRefused(RtloopError):
+class HostRefusal(RtloopError):
     """The host does not allow what the configuration requires."""
 
     exit_code = 77

@@ -19,7 +19,7 @@ class Signal(NamedTuple):
     meaning: str
 
 
-COMMON = (
+COMMON_SIGNALS = (
     Signal("tick", "1", "index of the executed tick, from 0"),
     Signal("deadline_ns", "ns", "when the tick was due, since the start of the run"),
     Signal("lateness_us", "µs", "wake after the deadline; NaN in virtual time"),
@@ -34,7 +34,7 @@ COMMON = (
     Signal("sample_age_us", "µs", "age of the sample as the driver knows it; 0 where it was taken by the read"),
     Signal("enable_v", "V", "enable input; 0 where none is wired"),
 )
-PER_AXIS = (
+AXIS_SIGNALS = (
     Signal("adc_v", "V", "raw input"),
     Signal("position_um", "µm", "measured position x"),
     Signal("reference_um", "µm", "reference sample x_d as generated; volts in raw mode"),
@@ -58,10 +58,10 @@ PER_AXIS = (
     DRIVER_STATUS,
     SAMPLE_AGE,
     ENABLE,
-) = range(len(COMMON))
-ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE, FEED = range(len(PER_AXIS))
-COMMON_COUNT = len(COMMON)
-PER_AXIS_COUNT = len(PER_AXIS)
+) = range(len(COMMON_SIGNALS))
+ADC, POSITION, REFERENCE, ERROR, COMMAND, DEMAND, DRIVE, FEED = range(len(AXIS_SIGNALS))
+COMMON_COUNT = len(COMMON_SIGNALS)
+PER_AXIS_COUNT = len(AXIS_SIGNALS)
 
 
 class Mode(IntEnum):
@@ -112,11 +112,11 @@ RAISED = 1
 TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 
-def columns(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
+def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
     """Names of a record's columns, in order: `tick`, …, `x_adc_v`, …, then extras and the observed ones as given."""
     return (
-        *(signal.name for signal in COMMON),
-        *(f"{axis}_{signal.name}" for axis in axes for signal in PER_AXIS),
+        *(signal.name for signal in COMMON_SIGNALS),
+        *(f"{axis}_{signal.name}" for axis in axes for signal in AXIS_SIGNALS),
         *extras,
         *observed,
     )

@@ -9,28 +9,28 @@ from pathlib import Path
 from typing import Any
 
 
-def fields_of(value: Any) -> dict[str, Any]:
+def dataclass_fields(value: Any) -> dict[str, Any]:
     """A dataclass's fields as they are."""
     return {name: getattr(value, name) for name in value.__dataclass_fields__}
 
 
-def plain(value: Any) -> Any:
+def to_jsonable(value: Any) -> Any:
     """For JSON: numbers, text, lists and dictionaries; roots as [real, imaginary], null for what is not finite.
 
     What has `for_json` says itself what it is there.
     """
     if hasattr(value, "for_json"):
-        return plain(value.for_json())
+        return to_jsonable(value.for_json())
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return plain(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
+        return to_jsonable(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
     if is_dataclass(value) and not isinstance(value, type):
-        return plain(fields_of(value))
+        return to_jsonable(dataclass_fields(value))
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_jsonable(item) for key, item in value.items()}
     if (as_list := getattr(value, "tolist", None)) is not None:  # of numpy, which is not imported for this
-        return plain(as_list())
+        return to_jsonable(as_list())
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_jsonable(item) for item in value]
     if isinstance(value, complex):
         return [value.real, value.imag]
     if isinstance(value, float):
@@ -38,12 +38,12 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def counted(number: int, one: str, many: str = "") -> str:
+def count_text(number: int, singular: str, plural: str = "") -> str:
     """The number and its noun, in the singular for 1; `many` where the plural is not made by an s."""
-    return f"{number:,} {one if number == 1 else many or f'{one}s'}"
+    return f"{number:,} {singular if number == 1 else plural or f'{singular}s'}"
 
 
-def rendered(package: str | None, **values: Any) -> str:
+def render_page(package: str | None, **values: Any) -> str:
     """The `page.html` of a package, a jinja2 template, filled in: text is escaped, bytes of a PNG go through `png`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 

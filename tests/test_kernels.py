@@ -14,7 +14,7 @@ from rtloop.hil.native import cache
 from rtloop.hil.native.cache import KERNELS, OPTIONS, source_digest
 
 PACKAGE = Path(rtloop.__file__).parent
-COMPILERS = {"jit", "cfunc", "inlined", "seldom", "intrinsic", "guarded", "seldom_guarded"}
+COMPILERS = {"jit", "cfunc", "jit_inline", "jit_rare", "intrinsic", "jit_checked", "jit_rare_checked"}
 
 
 def sources() -> list[Path]:

@@ -18,7 +18,7 @@ _FD_SLOW, _FD_HEAD, _FD_TAIL = 17, 5, 13
 _SHORT_CRC_BYTES, _SHORT_CRC_FIELD, _LONG_CRC_FIELD = 16, 17 + 4 + 6, 21 + 4 + 7
 
 
-def most_stuff_bits(bits: int) -> int:
+def max_stuff_bits(bits: int) -> int:
     """Stuff bits that `bits` bits in a row can need at most."""
     return (bits - 1) // 4
 
@@ -26,7 +26,7 @@ def most_stuff_bits(bits: int) -> int:
 def classic_frame_bits(length: int) -> int:
     """Bits of a classic frame of `length` bytes, at most."""
     stuffable_bits = _CLASSIC_STUFFED + 8 * length
-    return stuffable_bits + most_stuff_bits(stuffable_bits) + _CLASSIC_UNSTUFFED
+    return stuffable_bits + max_stuff_bits(stuffable_bits) + _CLASSIC_UNSTUFFED
 
 
 def fd_frame_bits(length: int) -> tuple[int, int]:
@@ -35,13 +35,13 @@ def fd_frame_bits(length: int) -> tuple[int, int]:
     As many stuff bits as there can be are taken to be slow.
     """
     stuffable_bits = _FD_SLOW + _FD_HEAD + 8 * length
-    slow_stuff = most_stuff_bits(_FD_SLOW)
+    slow_stuff = max_stuff_bits(_FD_SLOW)
     crc = _SHORT_CRC_FIELD if length <= _SHORT_CRC_BYTES else _LONG_CRC_FIELD
-    fast = _FD_HEAD + 8 * length + most_stuff_bits(stuffable_bits) - slow_stuff + crc
+    fast = _FD_HEAD + 8 * length + max_stuff_bits(stuffable_bits) - slow_stuff + crc
     return _FD_SLOW + slow_stuff + _FD_TAIL, fast
 
 
-def frame_s(length: int, fd: bool, bitrate: int, data_bitrate: int) -> float:
+def frame_duration_s(length: int, fd: bool, bitrate: int, data_bitrate: int) -> float:
     """How long a frame of `length` bytes takes at most."""
     if not fd:
         return classic_frame_bits(length) / bitrate

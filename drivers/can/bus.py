@@ -8,7 +8,7 @@ from rtloop.drivers.can.extra import can
 from rtloop.drivers.can.options import BusOptions
 from rtloop.drivers.errors import DriverError
 
-FAILURES = (can.CanError, OSError)
+BUS_ERRORS = (can.CanError, OSError)
 """What python-can's interfaces raise while they work."""
 
 
@@ -24,11 +24,11 @@ def open_bus(options: BusOptions) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)  # it says once more what its errors say
     try:
         return can.Bus(ignore_config=True, **options.keywords)
-    except (*FAILURES, ValueError, TypeError, NotImplementedError, ImportError) as error:
-        raise DriverError(f"{options.place}: {described(error)}") from error
+    except (*BUS_ERRORS, ValueError, TypeError, NotImplementedError, ImportError) as error:
+        raise DriverError(f"{options.label}: {error_text(error)}") from error
 
 
-def described(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """The message of an error, and of the one behind it where python-can hides the cause there."""
     cause = error.__cause__ or error.__context__
     texts = [str(part) or type(part).__name__ for part in (error, cause) if part is not None]

@@ -12,9 +12,9 @@ import time
 from collections.abc import Mapping, Sequence
 
 from rtloop.drivers.base import Channel, Facts, Wiring, require_channels
-from rtloop.drivers.can.bus import FAILURES, described, open_bus, require_interface
+from rtloop.drivers.can.bus import BUS_ERRORS, error_text, open_bus, require_interface
 from rtloop.drivers.can.extra import can
-from rtloop.drivers.can.frames import exchange, load_frames
+from rtloop.drivers.can.frames import choose_exchange, load_frames
 from rtloop.drivers.can.options import CanOptions
 from rtloop.drivers.can.stream import AnswerStream
 from rtloop.drivers.errors import DriverError
@@ -25,8 +25,8 @@ OBSERVED = (
 )  # fmt: skip
 LISTEN_S, RETRY_S, CONFIRM_S = 0.1, 0.05, 0.02
 CONFIRMATIONS = 25
-FRAMES_A_TICK = 64
-HELD = 1
+MAX_FRAMES_PER_TICK = 64
+STATUS_HELD = 1
 
 
 class CanDriver(PythonDriver):
@@ -39,7 +39,7 @@ class CanDriver(PythonDriver):
         super().__init__(options, wiring, rate_hz)
         self._options = options
         require_interface(options)
-        self._exchange = exchange(load_frames(options), len(wiring), options)
+        self._exchange = choose_exchange(load_frames(options), len(wiring), options)
         self._bus: can.BusABC | None = None
         require_channels(wiring, self.facts)
 
@@ -60,21 +60,21 @@ class CanDriver(PythonDriver):
         """Open the bus and wait for the node's first answer. Raises DriverError."""
         self._stream = AnswerStream(self._exchange.highest_sequence)
         self._sent_ns = [0] * (self._exchange.highest_sequence + 1)
-        self._sent = [b""] * (self._exchange.highest_sequence + 1)
+        self._sent_frames = [b""] * (self._exchange.highest_sequence + 1)
         self._volts = [0.0] * self._exchange.channels
-        self._age_us, self._held, self._held_in_all = 0.0, 0, 0
-        self._idle = [0.0] * (self._exchange.room - self._exchange.channels)
-        self._message = self._exchange.drive.message(self._options, [0.0] * (1 + self._exchange.room))
+        self._age_us, self._held_ticks, self._total_held_ticks = 0.0, 0, 0
+        self._padding = [0.0] * (self._exchange.channel_capacity - self._exchange.channels)
+        self._message = self._exchange.drive.message(self._options, [0.0] * (1 + self._exchange.channel_capacity))
         self._bus = open_bus(self._options)
         try:
             self._listen(LISTEN_S)  # another controller shows itself
             self._stream = AnswerStream(self._exchange.highest_sequence)
             self._await_node()
-        except FAILURES as error:
-            self._shut()
-            raise DriverError(f"{self._options.place}: {described(error)}") from error
+        except BUS_ERRORS as error:
+            self._close_bus()
+            raise DriverError(f"{self._options.label}: {error_text(error)}") from error
         except DriverError:
-            self._shut()
+            self._close_bus()
             raise
 
     def read(self) -> Sequence[float]:
@@ -82,26 +82,26 @@ class CanDriver(PythonDriver):
         if self._stream.sent == 0:  # between `open` and the first tick much time may pass
             while self._receive(0.0) is not None:
                 pass
-            self._open_node()
+            self._send_opening_frame()
             self._listen(RETRY_S)
-        for _ in range(FRAMES_A_TICK):
+        for _ in range(MAX_FRAMES_PER_TICK):
             message = self._receive(0.0)
             if message is None:
                 break
-            self._take(message)
+            self._process_frame(message)
         stream = self._stream
-        self._held = 0 if stream.newest == stream.sent else self._held + 1
-        self._held_in_all += self._held > 0
-        self.status = HELD if self._held else 0
+        self._held_ticks = 0 if stream.newest == stream.sent else self._held_ticks + 1
+        self._total_held_ticks += self._held_ticks > 0
+        self.status = STATUS_HELD if self._held_ticks else 0
         sent_ns = self._sent_ns[stream.sequence(stream.newest) if stream.newest else 0]
         age_us = (time.monotonic_ns() - sent_ns) * 1e-3 + self._age_us
-        self.sample_age_us = math.inf if self._held > self._options.hold_ticks else age_us
+        self.sample_age_us = math.inf if self._held_ticks > self._options.hold_ticks else age_us
         return self._volts
 
     def observe(self) -> Sequence[float]:
         """What was wrong with the frames so far."""
         stream = self._stream
-        return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._held_in_all
+        return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._total_held_ticks
 
     def write(self, volts: Sequence[float]) -> None:
         """Drive frame with the next number."""
@@ -116,16 +116,20 @@ class CanDriver(PythonDriver):
                 deadline_s = time.monotonic() + CONFIRM_S
                 while (remaining_s := deadline_s - time.monotonic()) > 0:
                     message = self._receive(remaining_s)
-                    if message is not None and self._take(message) and self._stream.newest == self._stream.sent:
+                    if (
+                        message is not None
+                        and self._process_frame(message)
+                        and self._stream.newest == self._stream.sent
+                    ):
                         return
                 self.write([channel.safe_v for channel in self.facts.outputs])
-            raise DriverError(f"{self._options.place}: the node does not confirm its safe outputs; its watchdog must")
-        except FAILURES as error:
-            raise DriverError(f"{self._options.place}: {described(error)}") from error
+            raise DriverError(f"{self._options.label}: the node does not confirm its safe outputs; its watchdog must")
+        except BUS_ERRORS as error:
+            raise DriverError(f"{self._options.label}: {error_text(error)}") from error
         finally:
-            self._shut()
+            self._close_bus()
 
-    def _shut(self) -> None:
+    def _close_bus(self) -> None:
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
@@ -133,30 +137,30 @@ class CanDriver(PythonDriver):
     def _await_node(self) -> None:
         deadline_s = time.monotonic() + self._options.wait_s
         while time.monotonic() < deadline_s:
-            self._open_node()
+            self._send_opening_frame()
             if self._listen(RETRY_S):
                 return
         raise DriverError(
-            f"{self._options.place}: no node has answered within {self._options.wait_s:g} s; "
+            f"{self._options.label}: no node has answered within {self._options.wait_s:g} s; "
             "for a simulated one: `rtloop hil serve CONFIG --can`"
         )
 
-    def _open_node(self) -> None:
+    def _send_opening_frame(self) -> None:
         self._send(0, [channel.safe_v for channel in self.facts.outputs])
 
-    def _listen(self, for_s: float) -> bool:
+    def _listen(self, duration_s: float) -> bool:
         """Whether the answer to an opening frame came within `for_s`."""
-        deadline_s = time.monotonic() + for_s
+        deadline_s = time.monotonic() + duration_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             message = self._receive(remaining_s)
-            if message is not None and self._take(message):
+            if message is not None and self._process_frame(message):
                 return True
         return False
 
     def _send(self, sequence: int, volts: Sequence[float]) -> None:
         assert self._bus is not None
-        self._sent[sequence] = self._exchange.drive.pack((sequence, *volts, *self._idle))
-        self._message.data[:] = self._sent[sequence]
+        self._sent_frames[sequence] = self._exchange.drive.pack((sequence, *volts, *self._padding))
+        self._message.data[:] = self._sent_frames[sequence]
         self._sent_ns[sequence] = time.monotonic_ns()
         self._bus.send(self._message)
 
@@ -164,18 +168,18 @@ class CanDriver(PythonDriver):
         assert self._bus is not None
         return self._bus.recv(timeout_s)
 
-    def _take(self, message: can.Message) -> bool:
+    def _process_frame(self, message: can.Message) -> bool:
         """Look at a frame; True for a sample newer than all before. Raises DriverError for a second controller."""
         drive, sample = self._exchange.drive, self._exchange.sample
         if message.arbitration_id == drive.identifier and drive.fits(message):
             sequence = int(drive.unpack(message.data)[0])
-            if bytes(message.data) != self._sent[sequence]:  # some interfaces hand back what was sent
-                raise DriverError(f"{self._options.place}: another controller drives this node")
+            if bytes(message.data) != self._sent_frames[sequence]:  # some interfaces hand back what was sent
+                raise DriverError(f"{self._options.label}: another controller drives this node")
         elif message.is_error_frame or (message.arbitration_id == sample.identifier and not sample.fits(message)):
             self._stream.invalid += 1
         elif message.arbitration_id == sample.identifier:
             sequence, age_us, *volts = sample.unpack(message.data)
-            if self._stream.sent == 0 if sequence == 0 else self._stream.take(int(sequence)):
+            if self._stream.sent == 0 if sequence == 0 else self._stream.count_answer(int(sequence)):
                 self._volts, self._age_us = volts[: self._exchange.channels], age_us
                 return True
         return False

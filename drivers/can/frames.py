@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtloop.drivers.can.bits import FD_LENGTHS, frame_s
+from rtloop.drivers.can.bits import FD_LENGTHS, frame_duration_s
 from rtloop.drivers.can.extra import UnsupportedDatabaseFormatError, can, load_file
 from rtloop.drivers.can.options import BusOptions
 
@@ -78,14 +78,14 @@ class Exchange(NamedTuple):
         return _raw_range(self.drive.signals["Sequence"])[1]
 
     @property
-    def room(self) -> int:
+    def channel_capacity(self) -> int:
         """Channels that the frames have; those beyond `channels` carry 0."""
         return len(self.drive.signals) - 1
 
     def max_rate_hz(self, options: BusOptions) -> float:
         """Ticks a second at which both frames fill the bus."""
         rates = options.bitrate, options.data_phase_bitrate
-        return 1.0 / sum(frame_s(frame.length, frame.fd, *rates) for frame in (self.drive, self.sample))
+        return 1.0 / sum(frame_duration_s(frame.length, frame.fd, *rates) for frame in (self.drive, self.sample))
 
 
 def load_frames(options: BusOptions) -> dict[str, Frame]:
@@ -103,14 +103,14 @@ def load_frames(options: BusOptions) -> dict[str, Frame]:
         raise ValueError(f"dbc: {path}: {error}") from None
 
 
-def exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
+def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
     """The shortest pair Drive…, Sample… that has room for `channels`. Raises ValueError where there is none."""
     pairs = [
         Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
         for name, frame in frames.items()
         if name.startswith("Drive") and frame.fd == options.fd
     ]
-    pairs = [pair for pair in pairs if pair.room >= channels]
+    pairs = [pair for pair in pairs if pair.channel_capacity >= channels]
     if not pairs:
         kind = "CAN FD" if options.fd else "classic CAN"
         raise ValueError(f"channels: {channels} axes; the DBC has no frames of {kind} for so many")

@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rtloop.drivers.can.bus import FAILURES, described, open_bus, require_interface
+from rtloop.drivers.can.bus import BUS_ERRORS, error_text, open_bus, require_interface
 from rtloop.drivers.can.driver import LISTEN_S
 from rtloop.drivers.can.extra import can
-from rtloop.drivers.can.frames import Frame, exchange, load_frames
+from rtloop.drivers.can.frames import Frame, choose_exchange, load_frames
 from rtloop.drivers.can.options import CanOptions
 from rtloop.drivers.errors import DriverError
 from rtloop.hil.native.compiled import jit
@@ -34,24 +34,24 @@ class RigNode:
         """Raises ValueError where rig, axes and DBC do not fit together."""
         self._bus, self._options = bus, options
         frames = load_frames(options)
-        self._exchange = exchange(frames, len(axes), options)
-        self._present: Frame = frames["Node"]
+        self._exchange = choose_exchange(frames, len(axes), options)
+        self._announcement: Frame = frames["Node"]
         self._coefficients, self._state = build_rig(options, axes, 1.0 / RIG_RATE_HZ)
         self.drive_v = np.full(len(axes), SAFE_V)
-        self._wanted_v = self.drive_v.copy()
+        self._target_v = self.drive_v.copy()
         self._sample_v = np.zeros(len(axes))
-        self._idle = [0.0] * (self._exchange.room - len(axes))
+        self._padding = [0.0] * (self._exchange.channel_capacity - len(axes))
         self.samples = self.ignored = self.parked = 0
         self._following, self._newest = False, 0
         self._serving, self._identity = False, secrets.randbits(32)
-        _run(self._coefficients, self._state, self.drive_v, self._sample_v, 0)  # compiles
-        self._start_s = self._moved_s = self._heard_s = time.monotonic()
+        _advance_rig(self._coefficients, self._state, self.drive_v, self._sample_v, 0)  # compiles
+        self._start_s = self._last_move_s = self._last_frame_s = time.monotonic()
         self._index = 0
 
     def announce(self) -> None:
         """Say that this node is here."""
         values = (self._exchange.channels, self._serving, self._options.watchdog_ms, self._identity)
-        self._bus.send(self._present.message(self._options, values))
+        self._bus.send(self._announcement.message(self._options, values))
 
     def require_alone(self) -> None:
         """Raises DriverError where another node answers, or is about to start."""
@@ -61,34 +61,37 @@ class RigNode:
             message = self._bus.recv(remaining_s)
             if message is None:
                 break
-            if message.arbitration_id == self._exchange.sample.identifier or self._other(message) is not None:
-                raise DriverError(f"{self._options.place}: another node is there already")
+            if (
+                message.arbitration_id == self._exchange.sample.identifier
+                or self._other_node_state(message) is not None
+            ):
+                raise DriverError(f"{self._options.label}: another node is there already")
         self._serving = True
 
-    def _other(self, message: can.Message) -> float | None:
+    def _other_node_state(self, message: can.Message) -> float | None:
         """What another node says of itself: STARTING, or 1; None where the message is none, or this node's own."""
-        if message.arbitration_id != self._present.identifier or not self._present.fits(message):
+        if message.arbitration_id != self._announcement.identifier or not self._announcement.fits(message):
             return None
-        _, serving, _, identity = self._present.unpack(message.data)
+        _, serving, _, identity = self._announcement.unpack(message.data)
         return None if identity == self._identity else serving
 
     def step(self) -> None:
         """Answer the next drive frame, or see how long there has been none. Raises python-can's errors."""
         message = self._bus.recv(IDLE_S if self._following else RAMP_S)
         now_s = time.monotonic()
-        self._move(now_s)
+        self._advance_to(now_s)
         if message is not None and message.arbitration_id == self._exchange.drive.identifier:
-            if self._obey(message):
-                self._heard_s = now_s
+            if self._apply_drive_frame(message):
+                self._last_frame_s = now_s
                 return
             self.ignored += 1
-        elif message is not None and self._other(message) == STARTING:
+        elif message is not None and self._other_node_state(message) == STARTING:
             self.announce()
-        if self._following and now_s - self._heard_s > self._options.watchdog_ms * 1e-3:
+        if self._following and now_s - self._last_frame_s > self._options.watchdog_ms * 1e-3:
             self.parked += bool(np.any(self.drive_v != SAFE_V))
-            self._wanted_v[:], self._following, self._newest = SAFE_V, False, 0
+            self._target_v[:], self._following, self._newest = SAFE_V, False, 0
 
-    def _obey(self, message: can.Message) -> bool:
+    def _apply_drive_frame(self, message: can.Message) -> bool:
         """Set the outputs and answer; False for a frame that is malformed or not newer than the last."""
         drive, highest = self._exchange.drive, self._exchange.highest_sequence
         if not drive.fits(message):
@@ -97,30 +100,33 @@ class RigNode:
         if sequence and self._newest and not 0 < (sequence - self._newest) % highest <= highest // 2:
             return False
         self._newest = int(sequence)
-        self._wanted_v[:] = volts[: self.drive_v.size]
+        self._target_v[:] = volts[: self.drive_v.size]
         if sequence == 0:
-            self._following = bool(np.all(self.drive_v == self._wanted_v))
+            self._following = bool(np.all(self.drive_v == self._target_v))
         if self._following:
-            self.drive_v[:] = self._wanted_v
-        values = (sequence, 0.0, *self._sample_v, *self._idle)
+            self.drive_v[:] = self._target_v
+        values = (sequence, 0.0, *self._sample_v, *self._padding)
         self._bus.send(self._exchange.sample.message(self._options, values))
         self.samples += 1
         return True
 
-    def _move(self, now_s: float) -> None:
+    def _advance_to(self, now_s: float) -> None:
         """Let the time that has passed pass for the rig too, and for a ramp of its outputs."""
         index = int((now_s - self._start_s) * RIG_RATE_HZ)
-        _run(self._coefficients, self._state, self.drive_v, self._sample_v, index - self._index)
+        _advance_rig(self._coefficients, self._state, self.drive_v, self._sample_v, index - self._index)
         self._index = index
         if not self._following:
-            step_v = self._options.park_slew_v_per_s * (now_s - self._moved_s)
-            self.drive_v[:] = np.clip(self._wanted_v, self.drive_v - step_v, self.drive_v + step_v)
-            self._following = self._newest > 0 and bool(np.all(self.drive_v == self._wanted_v))
-        self._moved_s = now_s
+            step_v = self._options.park_slew_v_per_s * (now_s - self._last_move_s)
+            self.drive_v[:] = np.clip(self._target_v, self.drive_v - step_v, self.drive_v + step_v)
+            self._following = self._newest > 0 and bool(np.all(self.drive_v == self._target_v))
+        self._last_move_s = now_s
 
 
 def serve(
-    options: CanOptions, axes: Sequence[str], stopped: Callable[[], bool], ready: Callable[[], None] = lambda: None
+    options: CanOptions,
+    axes: Sequence[str],
+    is_stopped: Callable[[], bool],
+    on_ready: Callable[[], None] = lambda: None,
 ) -> str:
     """Be the node until `stopped`; what it did, in words. Raises ValueError, DriverError."""
     require_interface(options)
@@ -128,16 +134,16 @@ def serve(
         node = RigNode(bus, options, axes)
         try:
             node.require_alone()
-            ready()
-            while not stopped():
+            on_ready()
+            while not is_stopped():
                 node.step()
-        except FAILURES as error:
-            raise DriverError(f"{options.place}: {described(error)}") from error
+        except BUS_ERRORS as error:
+            raise DriverError(f"{options.label}: {error_text(error)}") from error
     return f"{node.samples} samples, {node.ignored} drive frames ignored, parked {node.parked} times by the watchdog"
 
 
 @jit
-def _run(coefficients, state, drive_v, sample_v, periods):
+def _advance_rig(coefficients, state, drive_v, sample_v, periods):
     """The rig after `periods` of its grid with the outputs held, and what its converters read then."""
     for _ in range(periods):
         advance(coefficients, state, drive_v)

@@ -44,7 +44,7 @@ class BusOptions(Options):
         return self.data_phase_bitrate != self.bitrate
 
     @property
-    def place(self) -> str:
+    def label(self) -> str:
         """The bus in a message."""
         return f"CAN bus {self.interface} {self.channel}"
 

@@ -29,7 +29,7 @@ class AnswerStream:
         """How `count`, from 1, is written in a frame."""
         return (count - 1) % self._highest + 1
 
-    def take(self, sequence: int) -> bool:
+    def count_answer(self, sequence: int) -> bool:
         """Count an answer; True where it is newer than all before it."""
         age = (self.sent - sequence) % self._highest
         count = self.sent - age
@@ -38,7 +38,7 @@ class AnswerStream:
             return False
         if count > self.newest:
             if count > self.newest + 1:
-                self._pass_over(count)
+                self._record_missing(count)
             self.newest = count
             return True
         if count in self._missing:
@@ -49,7 +49,7 @@ class AnswerStream:
             self.duplicated += 1
         return False
 
-    def _pass_over(self, count: int) -> None:
+    def _record_missing(self, count: int) -> None:
         """Everything between the newest and `count` is missing; only what could still be taken is remembered."""
         oldest = count - WINDOW
         self._missing = {number for number in self._missing if number > oldest}

@@ -19,7 +19,7 @@ def _element_pointer(compiler: Any, context: Any, builder: Any, array_type: Any,
     return compiler.cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
 
 
-def _is_words(types: Any, array: Any) -> bool:
+def _is_word_array(types: Any, array: Any) -> bool:
     return isinstance(array, types.Array) and array.dtype == types.uint64 and array.ndim == 1
 
 
@@ -27,7 +27,7 @@ def _is_words(types: Any, array: Any) -> bool:
 def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
     """Word `index` of a uint64 array, ordered before every later load and store."""
     types = compiler.types
-    if not _is_words(types, array):
+    if not _is_word_array(types, array):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -41,7 +41,7 @@ def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
 def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
     """Set word `index` of a uint64 array, ordered after every earlier load and store."""
     types = compiler.types
-    if not _is_words(types, array):
+    if not _is_word_array(types, array):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -53,13 +53,13 @@ def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
-def exchanged(compiler: Any, array: Any, index: Any, expected: Any, wanted: Any) -> Any:
+def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, replacement: Any) -> Any:
     """Set word `index` of a uint64 array to `wanted` if it is `expected`, at once; whether it was.
 
     Of several that try, in whatever processes, exactly one gets True.
     """
     types = compiler.types
-    if not _is_words(types, array):
+    if not _is_word_array(types, array):
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

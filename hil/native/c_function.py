@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.hil.native import machine_code
-from rtloop.hil.native.uncompiled import as_written, runs_as_written
+from rtloop.hil.native.uncompiled import allow_uncompiled, is_uncompiled_allowed
 
 C_TYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_uint64, "intp": ctypes.c_ssize_t}
 C_TYPES |= {"voidptr": ctypes.c_ssize_t, "CPointer(float64)": ctypes.c_ssize_t}
@@ -25,7 +25,7 @@ FAILED = -1
 """What a C function returns that raised in Python: to clocks and drivers a failure."""
 
 
-class Outward:
+class ExportedKernel:
     """A kernel and its signature, such as "int64(intp, uint64)"; addresses are integers to Python."""
 
     def __init__(self, function: Callable[..., Any], signature: str) -> None:
@@ -37,19 +37,19 @@ class Outward:
     def address(self) -> int:
         """Where its machine code is, which is compiled if need be."""
         if self._machine_code is None:
-            self._machine_code = machine_code.loaded(self._name) or self._compiled()
+            self._machine_code = machine_code.load(self._name) or self._compile()
         return self._machine_code
 
-    def _compiled(self) -> int:
+    def _compile(self) -> int:
         raise NotImplementedError
 
     @property
-    def _types(self) -> list[Any]:
+    def _c_types(self) -> list[Any]:
         """Of its result, and of what it is given."""
         return [C_TYPES[type_name] for type_name in re.findall(r"\w+\(float64\)|\w+", self._signature)]
 
 
-class CFunction(Outward):
+class CFunction(ExportedKernel):
     """A kernel as a C function. It raises nothing, or numba's own C function says so where nobody can catch it.
 
     Within `as_written`, where there is no machine code, it is the kernel as it is written, called back.
@@ -58,9 +58,9 @@ class CFunction(Outward):
     @property
     def address(self) -> int:
         """Where a C function is: machine code, compiled if need be, or the kernel as it is written."""
-        if self._machine_code is None and runs_as_written():
-            self._machine_code = machine_code.loaded(self._name)
-            return self._machine_code or self._written[1]
+        if self._machine_code is None and is_uncompiled_allowed():
+            self._machine_code = machine_code.load(self._name)
+            return self._machine_code or self._python_callback[1]
         return super().address
 
     def __call__(self, *arguments: int) -> Any:
@@ -70,16 +70,16 @@ class CFunction(Outward):
     @cached_property
     def _prototype(self) -> Any:
         """With the interpreter waiting, as for every kernel."""
-        result, *argument_types = self._types
+        result, *argument_types = self._c_types
         return ctypes.PYFUNCTYPE(result, *argument_types)
 
     @cached_property
-    def _written(self) -> tuple[Any, int]:
+    def _python_callback(self) -> tuple[Any, int]:
         """The kernel as it is written, as a C function, and its address. What it raises is returned as FAILED."""
 
         def run(*arguments: int) -> Any:
             try:
-                with as_written(), np.errstate(all="ignore"):
+                with allow_uncompiled(), np.errstate(all="ignore"):
                     return self._function(*arguments)
             except Exception:  # nothing may propagate into C
                 return FAILED
@@ -87,41 +87,41 @@ class CFunction(Outward):
         function = self._prototype(run)
         return function, ctypes.cast(function, ctypes.c_void_p).value or 0
 
-    def _compiled(self) -> int:
+    def _compile(self) -> int:
         from rtloop.hil.native.compiler import numba
-        from rtloop.hil.native.standalone import c_function
+        from rtloop.hil.native.standalone import c_function_object_code
 
-        self._made = numba.cfunc(self._signature, error_model="numpy")(self._function)
-        if code := c_function(self._made, self._name):
-            machine_code.keep(self._name, code)
-        address: Any = self._made.address
+        self._cfunc = numba.cfunc(self._signature, error_model="numpy")(self._function)
+        if code := c_function_object_code(self._cfunc, self._name):
+            machine_code.store(self._name, code)
+        address: Any = self._cfunc.address
         return address
 
 
-class Entry(Outward):
+class Entry(ExportedKernel):
     """A kernel that Python calls. What is raised within it is raised."""
 
     def __call__(self, *arguments: int) -> Any:
         """Run it."""
-        result, raised = self._types[0](), ctypes.c_void_p()
+        result, raised = self._c_types[0](), ctypes.c_void_p()
         status = self._callable(ctypes.byref(result), ctypes.byref(raised), *arguments)
         if status:
-            raise _what_was(raised.value or 0)
+            raise _exception_at(raised.value or 0)
         return result.value
 
     @cached_property
     def _callable(self) -> Any:
         """As compiled functions call each other: places for result and exception, and a status."""
-        _, *argument_types = self._types
+        _, *argument_types = self._c_types
         return ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(self.address)
 
-    def _compiled(self) -> int:
+    def _compile(self) -> int:
         from rtloop.hil.native.compiler import signature_of
 
-        return kernel_address(self._function, signature_of(self._signature), self._name, ENTRY, raises=True)
+        return compile_kernel(self._function, signature_of(self._signature), self._name, ENTRY, raises=True)
 
 
-def kernel_address(
+def compile_kernel(
     function: Callable[..., Any], signature: Any, name: str, options: dict[str, Any], raises: bool = False
 ) -> int:
     """Compile a kernel, and keep it under `name` for `machine_code` to load.
@@ -129,28 +129,28 @@ def kernel_address(
     Whoever calls one that `raises` looks at its status.
     """
     from rtloop.hil.native.compiler import numba
-    from rtloop.hil.native.standalone import kernel
+    from rtloop.hil.native.standalone import kernel_object_code
 
     dispatcher: Any = numba.njit(**options)(function)
     dispatcher.compile(signature)
     overload = dispatcher.overloads[signature.args]
-    if code := kernel(overload.library, overload.fndesc.llvm_func_name, name, raises):
-        machine_code.keep(name, code)
-    _made.append(dispatcher)
+    if code := kernel_object_code(overload.library, overload.fndesc.llvm_func_name, name, raises):
+        machine_code.store(name, code)
+    _dispatchers.append(dispatcher)
     return overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name)
 
 
-_made: list[Any] = []
+_dispatchers: list[Any] = []
 """Compiled code lives as long as its dispatcher."""
 
 
-class _Raised(ctypes.Structure):
+class _PickledException(ctypes.Structure):
     """The begin of numba's description of an exception."""
 
     _fields_ = (("pickled", ctypes.c_void_p), ("size", ctypes.c_int32))
 
 
-def _what_was(raised: int) -> Exception:
-    record = _Raised.from_address(raised)
+def _exception_at(address: int) -> Exception:
+    record = _PickledException.from_address(address)
     kind, arguments, *_ = pickle.loads(ctypes.string_at(record.pickled, record.size))
     return kind(*(arguments or ()))

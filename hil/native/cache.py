@@ -17,7 +17,7 @@ from pathlib import Path
 
 import llvmlite.binding
 
-from rtloop.hil.trusted import open_folder, release
+from rtloop.hil.trusted import close_descriptor, open_folder
 
 PACKAGE = Path(__file__).parents[2]
 KERNELS = ("hil", "drivers", "law", "laws", "engine", "signals.py")
@@ -45,10 +45,10 @@ def cpu_identity() -> str:
     return llvmlite.binding.get_host_cpu_name() + " " + llvmlite.binding.get_host_cpu_features().flatten()
 
 
-def _owned_folder(path: Path) -> bool:
+def _make_private_folder(path: Path) -> bool:
     """Make `path` if needed; True when it is ours alone to write, so that nobody else's code is loaded from it."""
     try:
-        release(open_folder(path, 0o700))
+        close_descriptor(open_folder(path, 0o700))
     except OSError:
         return False
     return os.access(path, os.W_OK | os.X_OK)
@@ -58,10 +58,10 @@ def _cache_folder() -> tuple[Path, bool]:
     """The cache's folder, and whether it survives a restart of the machine."""
     digest = source_digest()
     home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
-    if home and _owned_folder(Path(home) / "rtloop" / digest):
+    if home and _make_private_folder(Path(home) / "rtloop" / digest):
         return Path(home) / "rtloop" / digest, True
     shared = Path(tempfile.gettempdir()) / f"rtloop-{os.getuid()}"
-    if _owned_folder(shared) and _owned_folder(shared / digest):
+    if _make_private_folder(shared) and _make_private_folder(shared / digest):
         return shared / digest, False
     return Path(tempfile.mkdtemp(prefix="rtloop-")), False
 

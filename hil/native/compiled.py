@@ -13,10 +13,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from rtloop.hil.native import machine_code
-from rtloop.hil.native.c_function import CFunction, Entry, kernel_address
-from rtloop.hil.native.uncompiled import address_of, runs_as_written
+from rtloop.hil.native.c_function import CFunction, Entry, compile_kernel
+from rtloop.hil.native.uncompiled import is_uncompiled_allowed, register_function
 
-OURS = "rtloop."
+PACKAGE_PREFIX = "rtloop."
 """Modules whose sources name the cache; what stands in others is numba's to cache."""
 UNCOMPILED = bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
 """Whether kernels are to run as they are written, which NUMBA_DISABLE_JIT=1 asks for."""
@@ -39,7 +39,7 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run it."""
-        return (self.py_func if runs_as_written() else self._dispatcher)(*arguments)
+        return (self.py_func if is_uncompiled_allowed() else self._dispatcher)(*arguments)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # what Python asks of any object is no reason to import the compiler
@@ -47,14 +47,16 @@ class Kernel:
         return getattr(self._dispatcher, name)
 
 
-class Name:
+class KernelSymbol:
     """A name in kernels that stands for no kernel; `meaning` gives its type, once there is a compiler to ask for it.
 
     `uncompiled` is what it does in a kernel that runs as it is written; without one it cannot be called there.
     """
 
-    def __init__(self, name: str, meaning: Callable[[Any], Any], uncompiled: Callable[..., Any] | None = None) -> None:
-        self.__name__, self._meaning, self._uncompiled = name, meaning, uncompiled
+    def __init__(
+        self, name: str, resolve_type: Callable[[Any], Any], uncompiled: Callable[..., Any] | None = None
+    ) -> None:
+        self.__name__, self._resolve_type, self._uncompiled = name, resolve_type, uncompiled
 
     def __call__(self, *arguments: Any) -> Any:
         """Do what it stands for, in Python."""
@@ -66,10 +68,10 @@ class Name:
     def _numba_type_(self) -> Any:
         from rtloop.hil.native import compiler
 
-        return self._meaning(compiler)
+        return self._resolve_type(compiler)
 
 
-def _kernel(function: Callable[..., Any], **options: Any) -> Any:
+def _make_kernel(function: Callable[..., Any], **options: Any) -> Any:
     return function if UNCOMPILED else Kernel(function, options)
 
 
@@ -78,45 +80,47 @@ def jit(function: Callable[..., Any]) -> Any:
 
     Its indices run up to counts that are checked where they are let in: checks of each cost a tenth of the law's time.
     """
-    return _kernel(function, cache=True, error_model="numpy", forceinline=True)
+    return _make_kernel(function, cache=True, error_model="numpy", forceinline=True)
 
 
-def guarded(function: Callable[..., Any]) -> Any:
+def jit_checked(function: Callable[..., Any]) -> Any:
     """As `jit`, for what is told its indices: one beyond its array is an IndexError, and no write to somewhere."""
-    return _kernel(function, cache=True, error_model="numpy", forceinline=True, boundscheck=True)
+    return _make_kernel(function, cache=True, error_model="numpy", forceinline=True, boundscheck=True)
 
 
-def checked(function: Callable[..., Any]) -> Any:
+def jit_strict(function: Callable[..., Any]) -> Any:
     """Compile somebody else's kernel: an index beyond its array, or a division by zero, is an exception."""
-    return _kernel(function, error_model="python", boundscheck=True)
+    return _make_kernel(function, error_model="python", boundscheck=True)
 
 
-def seldom(function: Callable[..., Any]) -> Any:
+def jit_rare(function: Callable[..., Any]) -> Any:
     """A kernel for what most ticks do not do: called, so that it does not crowd its callers."""
-    return _kernel(function, cache=True, error_model="numpy")
+    return _make_kernel(function, cache=True, error_model="numpy")
 
 
-def seldom_guarded(function: Callable[..., Any]) -> Any:
+def jit_rare_checked(function: Callable[..., Any]) -> Any:
     """As `seldom`, with checked indices; not for what the law calls, which would be slower for an error to pass on."""
-    return _kernel(function, cache=True, error_model="numpy", boundscheck=True)
+    return _make_kernel(function, cache=True, error_model="numpy", boundscheck=True)
 
 
-def inlined(function: Callable[..., Any]) -> Any:
+def jit_inline(function: Callable[..., Any]) -> Any:
     """A piece of a kernel, put into its callers before anything is compiled, so that they are optimised as one."""
-    return _kernel(function, inline="always", error_model="numpy")
+    return _make_kernel(function, inline="always", error_model="numpy")
 
 
 def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | None = None) -> Any:
     """A function that writes its own LLVM code; its first parameter is the module `compiler`, with what that takes."""
 
-    def meaning(compiler: Any) -> Any:
+    def resolve_type(compiler: Any) -> Any:
         @wraps(function)
-        def typed(_: Any, *arguments: Any) -> Any:
+        def typing_function(_: Any, *arguments: Any) -> Any:
             return function(compiler, *arguments)
 
-        return compiler.types.Function(compiler.make_intrinsic_template(symbol, typed, function.__name__))
+        return compiler.types.Function(compiler.make_intrinsic_template(symbol, typing_function, function.__name__))
 
-    symbol: Any = Name(function.__name__, meaning, uncompiled)  # as Any, for its callers leave out that parameter
+    symbol: Any = KernelSymbol(
+        function.__name__, resolve_type, uncompiled
+    )  # as Any, for its callers leave out that parameter
     return symbol
 
 
@@ -125,36 +129,36 @@ def intrinsic_like(uncompiled: Callable[..., Any]) -> Callable[[Callable[..., An
     return lambda function: intrinsic(function, uncompiled)
 
 
-def borrowed(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
+def numba_function(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
     """A function of numba's own, for kernels."""
-    return Name(name, lambda compiler: compiler.type_of(getattr(compiler.numba, name)), uncompiled)
+    return KernelSymbol(name, lambda compiler: compiler.type_of(getattr(compiler.numba, name)), uncompiled)
 
 
-def external(name: str, signature: str, uncompiled: Callable[..., Any] | None = None) -> Any:
+def c_library_function(name: str, signature: str, uncompiled: Callable[..., Any] | None = None) -> Any:
     """A function of the C library, for kernels; `uncompiled` does the same where they run as they are written."""
 
-    def meaning(compiler: Any) -> Any:
+    def resolve_type(compiler: Any) -> Any:
         return compiler.types.ExternalFunction(name, compiler.signature_of(signature))
 
-    return Name(name, meaning, uncompiled)
+    return KernelSymbol(name, resolve_type, uncompiled)
 
 
 def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
     """Compile a kernel to a C function whose `.address` other compiled code may call."""
 
-    def made(function: Callable[..., Any]) -> Any:
+    def compile_function(function: Callable[..., Any]) -> Any:
         if UNCOMPILED:
-            return SimpleNamespace(address=address_of(function))
-        if function.__module__.startswith(OURS):
+            return SimpleNamespace(address=register_function(function))
+        if function.__module__.startswith(PACKAGE_PREFIX):
             return CFunction(function, signature)
         from rtloop.hil.native.compiler import numba
 
         return numba.cfunc(signature, cache=True, error_model="numpy")(function)
 
-    return made
+    return compile_function
 
 
-def entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
+def python_entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
     """Compile a kernel that Python calls with numbers and addresses."""
     return lambda function: Entry(function, signature)
 
@@ -165,12 +169,12 @@ def native_address(kernel: Any, signature: Any) -> int:
     Raises numba's TypingError and what it raises otherwise for what it cannot compile.
     """
     if UNCOMPILED:
-        return address_of(kernel)
+        return register_function(kernel)
     kernel.compile(signature)
     overload = kernel.overloads[signature.args]
     return overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name)
 
 
-def kept_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
+def cached_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
     """As `native_address`, for a kernel that the cache keeps as machine code under a name of its own."""
-    return machine_code.loaded(name) or kernel_address(kernel.py_func, signature(), name, kernel.options)
+    return machine_code.load(name) or compile_kernel(kernel.py_func, signature(), name, kernel.options)

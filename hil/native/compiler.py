@@ -17,7 +17,7 @@ from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import make_intrinsic_template
 
 from rtloop.hil.native.cache import CACHE_FOLDER
-from rtloop.hil.native.whole_files import WholeFiles
+from rtloop.hil.native.whole_files import CheckedCacheFile
 
 __all__ = ["cgutils", "ir", "make_intrinsic_template", "numba", "signature_of", "type_of", "types"]
 
@@ -28,7 +28,7 @@ def _load_arrays_without_blas() -> None:
     No kernel here uses linear algebra. Whose does finds it as ever: scipy is required, and imported where it is used.
     """
     ensure_blas = numba.np.linalg.ensure_blas
-    numba.np.linalg.ensure_blas = _absent  # pyright: ignore[reportAttributeAccessIssue]
+    numba.np.linalg.ensure_blas = _report_no_blas  # pyright: ignore[reportAttributeAccessIssue]
     try:
         from numba.np import arraymath
     finally:
@@ -36,12 +36,12 @@ def _load_arrays_without_blas() -> None:
     arraymath._HAVE_BLAS = True
 
 
-def _absent() -> None:
+def _report_no_blas() -> None:
     raise ImportError
 
 
 _load_arrays_without_blas()
-caching.IndexDataCacheFile = WholeFiles  # pyright: ignore[reportAttributeAccessIssue]
+caching.IndexDataCacheFile = CheckedCacheFile  # pyright: ignore[reportAttributeAccessIssue]
 config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIssue]
 # Four equal operations written side by side become one vector operation, which reorders no sum. Loops are left as they
 # are: they run over an axis, five states or fifteen plays, and their vector forms cost more than they save.

@@ -17,12 +17,12 @@ _engines: list[Any] = []
 """They own the machine code, one each: several may hold copies of one kernel."""
 
 
-def keep(name: str, machine_code: bytes) -> None:
+def store(name: str, machine_code: bytes) -> None:
     """Keep it under the name of its symbol, if that can be."""
     stored.write(_path(name), machine_code)
 
 
-def loaded(name: str) -> int | None:
+def load(name: str) -> int | None:
     """Address of what was kept; None where nothing was, or not the whole of it."""
     try:
         machine_code = stored.read(_path(name))
@@ -30,22 +30,22 @@ def loaded(name: str) -> int | None:
         return None
     if machine_code is None:
         return None
-    engine = _engine("")
+    engine = _create_engine("")
     engine.add_object_file(llvm.ObjectFileRef.from_data(machine_code))
     engine.finalize_object()
     return engine.get_function_address(name)
 
 
-def assembled(text: str, name: str) -> int:
+def assemble(text: str, name: str) -> int:
     """Address of a function in a text in LLVM's language, compiled here: a millisecond for a few lines."""
-    engine = _engine(text)
+    engine = _create_engine(text)
     engine.finalize_object()
     return engine.get_function_address(name)
 
 
-def _engine(text: str) -> Any:
+def _create_engine(text: str) -> Any:
     """A linker that holds a text in LLVM's language."""
-    machine = _machine()  # first: the text is parsed for this processor
+    machine = _target_machine()  # first: the text is parsed for this processor
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
     _engines.append(engine)
     return engine
@@ -58,7 +58,7 @@ def _path(name: str) -> Path:
 
 
 @cache
-def _machine() -> Any:
+def _target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple().create_target_machine(jit=True)

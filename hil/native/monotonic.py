@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from rtloop.hil.native import uncompiled
-from rtloop.hil.native.compiled import external, jit
+from rtloop.hil.native.compiled import c_library_function, jit
 from rtloop.hil.native.pointers import address_pointer, carray
 
 CLOCK_MONOTONIC = 1
@@ -25,8 +25,8 @@ def _gettime_in_python(clock: int, timespec_address: int) -> int:
     return 0
 
 
-_clock_gettime = external("clock_gettime", "int32(int32, intp)", _gettime_in_python)
-_clock_nanosleep = external("clock_nanosleep", "int32(int32, int32, intp, intp)")
+_clock_gettime = c_library_function("clock_gettime", "int32(int32, intp)", _gettime_in_python)
+_clock_nanosleep = c_library_function("clock_nanosleep", "int32(int32, int32, intp, intp)")
 
 
 @jit

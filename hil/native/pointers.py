@@ -9,14 +9,14 @@ from __future__ import annotations
 from typing import Any
 
 from rtloop.hil.native import uncompiled
-from rtloop.hil.native.compiled import borrowed, external, intrinsic_like
+from rtloop.hil.native.compiled import c_library_function, intrinsic_like, numba_function
 
-carray: Any = borrowed("carray", uncompiled.carray)
+carray: Any = numba_function("carray", uncompiled.carray)
 """numba's array view of a pointer."""
 SIGNATURE = "int32(voidptr, CPointer(float64))"
 """numba's signature of `int32 function(void *context, double *values)`."""
 
-copy: Any = external("memcpy", "intp(intp, intp, intp)")
+copy_bytes: Any = c_library_function("memcpy", "intp(intp, intp, intp)")
 """`memcpy`: to, from, bytes."""
 
 
@@ -39,7 +39,9 @@ def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
 
 
 @intrinsic_like(uncompiled.call_law)
-def call_law(compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, told: Any) -> Any:
+def call_law(
+    compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, law_input: Any
+) -> Any:
     """Call a compiled function of two records and a third or a number; its status, 0 where it came to its end.
 
     Function and records are given as integers, as are the places where it may write what it returns and what it
@@ -57,7 +59,7 @@ def call_law(compiler: Any, function: Any, result: Any, raised: Any, coefficient
             target, [*record_pointers, arguments[5] if number else builder.inttoptr(arguments[5], pointer)]
         )
 
-    number = isinstance(told, types.Float)
+    number = isinstance(law_input, types.Float)
     return types.int32(*[types.intp] * 5, types.float64 if number else types.intp), codegen
 
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-RAISES = ".const.pickle"
+EXCEPTION_PREFIX = ".const.pickle"
 """How constants are called that describe an exception."""
-C_FUNCTION = """
+WRAPPER_TEMPLATE = """
 target datalayout = "{layout}"
 target triple = "{triple}"
 declare i32 @"{kernel}"({all_types})
@@ -28,25 +28,25 @@ define {result} @"{name}"({arguments}) {{
 """A kernel wants places for its result and for what it raises, and returns a status."""
 
 
-def kernel(library: Any, symbol: str, name: str, raises: bool) -> bytes | None:
+def kernel_object_code(library: Any, symbol: str, name: str, raises: bool) -> bytes | None:
     """Object code of a compiled kernel, its symbol named `name`; None for one that needs numba where it runs.
 
     One that `raises` may hold what describes an exception.
     """
     module = llvm.parse_bitcode(library._final_module.as_bitcode())
     module.get_function(symbol).name = name
-    return _object_code(module, name, library._codegen._tm, raises)
+    return _emit_object_code(module, name, library._codegen._tm, raises)
 
 
-def c_function(made: Any, name: str) -> bytes | None:
+def c_function_object_code(cfunc: Any, name: str) -> bytes | None:
     """As `kernel`, for a compiled numba.cfunc, whose shape it has; None also for one that may raise."""
-    library = made._library
+    library = cfunc._library
     module = llvm.parse_bitcode(library._final_module.as_bitcode())
-    module.link_in(llvm.parse_assembly(_around_kernel(module, made.native_name, name)))
-    return _object_code(module, name, library._codegen._tm, raises=False)
+    module.link_in(llvm.parse_assembly(_wrapper_text(module, cfunc.native_name, name)))
+    return _emit_object_code(module, name, library._codegen._tm, raises=False)
 
 
-def _object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
+def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
     for symbol in (*module.functions, *module.global_variables):
         if symbol.name != name and not symbol.is_declaration:
             symbol.linkage = "internal"
@@ -57,15 +57,15 @@ def _object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | 
     undefined_names = [symbol.name for symbol in (*module.functions, *module.global_variables) if symbol.is_declaration]
     if not all(symbol.startswith("llvm.") or hasattr(process, symbol) for symbol in undefined_names):
         return None
-    if not raises and any(symbol.name.startswith(RAISES) for symbol in module.global_variables):
+    if not raises and any(symbol.name.startswith(EXCEPTION_PREFIX) for symbol in module.global_variables):
         return None
     return machine.emit_object(module)
 
 
-def _around_kernel(module: Any, theirs: str, name: str) -> str:
+def _wrapper_text(module: Any, numba_name: str, name: str) -> str:
     """The text of a C function `name`, of the shape of `theirs`, which is numba's for the same kernel."""
-    kernel, function = module.get_function(theirs.removeprefix("cfunc.")), module.get_function(theirs)
-    return C_FUNCTION.format(
+    kernel, function = module.get_function(numba_name.removeprefix("cfunc.")), module.get_function(numba_name)
+    return WRAPPER_TEMPLATE.format(
         layout=module.data_layout,
         triple=module.triple,
         kernel=kernel.name,

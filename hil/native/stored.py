@@ -22,7 +22,7 @@ SUFFIXES = (MACHINE_CODE, ".nbi", ".nbc")
 DAMAGED = ".damaged"
 """Suffix of a file that is set aside."""
 STDERR = 2
-_named: list[Path] = []
+_quarantined: list[Path] = []
 """Files that this process has set aside."""
 
 
@@ -47,7 +47,7 @@ def read(path: Path) -> bytes | None:
     except OSError:
         data = b""
     if not _is_whole(data):
-        _set_aside(path)
+        _quarantine(path)
         return None
     return data[:-DIGEST_BYTES]
 
@@ -58,7 +58,7 @@ def damaged_files(folder: Path) -> list[Path]:
     return [path for path in files if not _is_whole(_contents(path))]
 
 
-def set_aside_files(folder: Path) -> list[Path]:
+def quarantined_files(folder: Path) -> list[Path]:
     """Files in or below `folder` that were damaged. Raises OSError."""
     return sorted(folder.rglob(f"*{DAMAGED}"))
 
@@ -73,16 +73,16 @@ def _is_whole(data: bytes) -> bool:
     return hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
 
 
-def _set_aside(path: Path) -> None:
+def _quarantine(path: Path) -> None:
     """Rename a damaged file, so that a new one takes its place, and say so once in a process."""
     with contextlib.suppress(OSError):
         os.replace(path, f"{path}{DAMAGED}")
-    if not _named:
-        _say(f"rtloop: the cache of compiled code is damaged: {path}; damaged files are renamed and compiled anew\n")
-    _named.append(path)
+    if not _quarantined:
+        _warn(f"rtloop: the cache of compiled code is damaged: {path}; damaged files are renamed and compiled anew\n")
+    _quarantined.append(path)
 
 
-def _say(line: str) -> None:
+def _warn(line: str) -> None:
     """Write a line to stderr, unless nobody reads there: an output may be waiting to be parked."""
     with contextlib.suppress(OSError):
         if select.select([], [STDERR], [], 0)[1]:

@@ -1,7 +1,7 @@
 """What compiled code does with addresses, in Python: for kernels that run as they are written, without the compiler.
 
 With NUMBA_DISABLE_JIT=1 every kernel is an ordinary function, to be looked into. An address is then still one of
-memory, and that of a function a number under which `address_of` has noted it.
+memory, and that of a function a number under which `register_function` has noted it.
 
 Within `as_written` kernels whose machine code is not at hand are ordinary functions: parking waits for no compiler.
 """
@@ -22,7 +22,7 @@ from rtloop.hil.native import words
 _functions: dict[int, Callable[..., Any]] = {}
 _numbers = itertools.count(1)
 OK, RAISED = 0, -1
-raised: list[Exception] = []
+raised_exceptions: list[Exception] = []
 """What functions of laws have raised, the newest last."""
 
 
@@ -30,21 +30,21 @@ _thread = threading.local()
 
 
 @contextmanager
-def as_written() -> Iterator[None]:
+def allow_uncompiled() -> Iterator[None]:
     """In this thread, run kernels as they are written if their machine code is not at hand: slower, the same bits."""
-    previous, _thread.as_written = runs_as_written(), True
+    previous, _thread.as_written = is_uncompiled_allowed(), True
     try:
         yield
     finally:
         _thread.as_written = previous
 
 
-def runs_as_written() -> bool:
+def is_uncompiled_allowed() -> bool:
     """Whether this thread is within `as_written`."""
     return getattr(_thread, "as_written", False)
 
 
-def address_of(function: Callable[..., Any]) -> int:
+def register_function(function: Callable[..., Any]) -> int:
     """A number under which `function` can be called."""
     number = next(_numbers)
     _functions[number] = function
@@ -72,12 +72,12 @@ def call(function: int, context: int, values: int) -> Any:
     return _functions[int(function)](int(context), int(values))
 
 
-def call_law(function: int, result: int, place: int, coefficients: int, state: int, told: Any) -> int:
+def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: Any) -> int:
     """As the compiled one; what is raised is kept in `raised`."""
     try:
-        value = _functions[int(function)](int(coefficients), int(state), told)
+        value = _functions[int(function)](int(coefficients), int(state), law_input)
     except Exception as error:
-        raised.append(error)
+        raised_exceptions.append(error)
         return RAISED
     if value is not None:
         carray(result, 1, np.float64)[0] = value

@@ -14,7 +14,7 @@ from numba.core.caching import IndexDataCacheFile
 from rtloop.hil.native import stored
 
 
-class WholeFiles(IndexDataCacheFile):
+class CheckedCacheFile(IndexDataCacheFile):
     """Index and data of one kernel. A damaged file counts as none, and is written anew."""
 
     def _load_index(self) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 
 from rtloop.hil.native import machine_code
 
-_TEXT = """
+_LLVM_TEXT = """
 define i64 @load_acquire(i64 %address) {
   %word = inttoptr i64 %address to ptr
   %value = load atomic i64, ptr %word acquire, align 8
@@ -35,21 +35,21 @@ _WORD = ctypes.c_uint64
 
 
 @cache
-def _function(name: str, result: Any, count: int) -> Any:
+def _assembled_function(name: str, result: Any, count: int) -> Any:
     """A function of the text above, of so many words; the interpreter waits for it."""
-    return ctypes.PYFUNCTYPE(result, *[_WORD] * count)(machine_code.assembled(_TEXT, name))
+    return ctypes.PYFUNCTYPE(result, *[_WORD] * count)(machine_code.assemble(_LLVM_TEXT, name))
 
 
 def load_acquire(address: int) -> int:
     """The uint64 at an address, loaded before every later load and store."""
-    return _function("load_acquire", _WORD, 1)(address)
+    return _assembled_function("load_acquire", _WORD, 1)(address)
 
 
 def store_release(address: int, value: int) -> None:
     """Set the uint64 at an address, after every earlier load and store."""
-    _function("store_release", None, 2)(address, value)
+    _assembled_function("store_release", None, 2)(address, value)
 
 
-def exchanged(address: int, expected: int, wanted: int) -> int:
+def compare_exchange(address: int, expected: int, replacement: int) -> int:
     """Set the uint64 at an address to `wanted` if it is `expected`, at once; 1 if it was, 0 otherwise."""
-    return _function("exchanged", ctypes.c_int32, 3)(address, expected, wanted)
+    return _assembled_function("exchanged", ctypes.c_int32, 3)(address, expected, replacement)

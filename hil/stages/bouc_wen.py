@@ -8,7 +8,7 @@ integrated is the drive's way, in steps of no more than STEP_V by the midpoint r
 
 from __future__ import annotations
 
-from rtloop.hil.native.compiled import inlined, jit
+from rtloop.hil.native.compiled import jit, jit_inline
 
 STEP_V = 0.1
 """Of the drive, in one step: h is then exact to some 1e-5 of itself where B is up to 1 per V."""
@@ -23,13 +23,13 @@ COEFFICIENTS = [
 STATE = [("bw_drive_v", "f8"), ("bw_left_um", "f8")]
 
 
-@inlined
-def _slope(coefficients, left_um, sign):
+@jit_inline
+def _slope(coefficients, hysteretic_um, sign):
     """dh/du while the drive goes up (`sign` 1) or down (−1)."""
-    magnitude_um = left_um if left_um > 0.0 else -left_um
+    magnitude_um = hysteretic_um if hysteretic_um > 0.0 else -hysteretic_um
     return (
         coefficients.bw_rise_um_per_v
-        - coefficients.bw_decay_per_v * sign * left_um
+        - coefficients.bw_decay_per_v * sign * hysteretic_um
         - coefficients.bw_lean_per_v * magnitude_um
     )
 

@@ -28,7 +28,7 @@ COEFFICIENTS = [
 STATE = [("dac_v", "f8"), ("queue_v", "f8", (MAX_LATENCY,)), ("queue_head", "i8")]
 
 
-def span(range_v: float, bits: int) -> tuple[float, float, float]:
+def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
     """LSB (0 for an ideal converter), lowest and highest value [V]."""
     if bits == 0:
         return 0.0, -range_v, range_v
@@ -37,7 +37,7 @@ def span(range_v: float, bits: int) -> tuple[float, float, float]:
 
 
 @jit
-def convert(lsb_v, lowest_v, highest_v, value_v):
+def quantise(lsb_v, lowest_v, highest_v, value_v):
     """`value_v` as the converter renders it [V]. NaN stays NaN."""
     if lsb_v > 0.0:
         value_v = np.rint(value_v / lsb_v) * lsb_v
@@ -51,18 +51,18 @@ def convert(lsb_v, lowest_v, highest_v, value_v):
 @jit
 def digitise(coefficients, value_v):
     """The ADC's reading [V] of `value_v`."""
-    return convert(coefficients.adc_lsb_v, coefficients.adc_lowest_v, coefficients.adc_highest_v, value_v)
+    return quantise(coefficients.adc_lsb_v, coefficients.adc_lowest_v, coefficients.adc_highest_v, value_v)
 
 
 @jit
-def drive(coefficients, state, value_v):
+def write_dac(coefficients, state, value_v):
     """Write `value_v` to the DAC and return the voltage at the actuator for the period that begins [V].
 
     NaN holds the value written before. With a latency of n the actuator gets what was written n periods ago, and
     0 V before there was any.
     """
     if not math.isnan(value_v):
-        state.dac_v = convert(coefficients.dac_lsb_v, coefficients.dac_lowest_v, coefficients.dac_highest_v, value_v)
+        state.dac_v = quantise(coefficients.dac_lsb_v, coefficients.dac_lowest_v, coefficients.dac_highest_v, value_v)
     latency = coefficients.latency_ticks
     if latency == 0:
         return state.dac_v

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import CLUSTER, Modal, RepeatedPoles, modal_sum
-from rtloop.hil.native.compiled import inlined, jit
+from rtloop.hil.modal import CLUSTER_TOLERANCE, ModalSystem, RepeatedPoles, modal_sum
+from rtloop.hil.native.compiled import jit, jit_inline
 
 MAX_MODES = 16
 
@@ -99,23 +99,23 @@ def shift_resonance(
     return shifted, gain * (1 + shift) ** 2
 
 
-def with_sensor(modal: Modal, bandwidth_hz: float | None) -> Modal:
+def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSystem:
     """Two outputs from D's one: the true position, and that behind a first-order lag of `bandwidth_hz` (None: none).
 
     Raises RepeatedPoles where the lag's pole lies on one of D's.
     """
     if bandwidth_hz is None:
-        return Modal(modal.poles, np.vstack([modal.residues] * 2), np.concatenate([modal.direct] * 2))
+        return ModalSystem(modal.poles, np.vstack([modal.residues] * 2), np.concatenate([modal.direct] * 2))
     corner = 2 * np.pi * bandwidth_hz
-    if np.any(np.abs(modal.poles + corner) <= CLUSTER * corner):
+    if np.any(np.abs(modal.poles + corner) <= CLUSTER_TOLERANCE * corner):
         raise RepeatedPoles(f"a sensor bandwidth of {bandwidth_hz:g} Hz repeats the pole at {-corner:.6g} rad/s")
     lag = corner * modal.response([-corner])[0].real
     true = np.append(modal.residues[0], 0.0)
     sensed = np.append(modal.residues[0] * corner / (modal.poles + corner), lag)
-    return Modal(np.append(modal.poles, -corner), np.vstack([true, sensed]), np.append(modal.direct, 0.0))
+    return ModalSystem(np.append(modal.poles, -corner), np.vstack([true, sensed]), np.append(modal.direct, 0.0))
 
 
-def discretise(modal: Modal, period_s: float) -> dict[str, object]:
+def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
     """The kernel's coefficients for a two-output system in s, exact at the sampling instants of a held input.
 
     Raises ValueError where there are more than MAX_MODES modes or the period makes a number overflow.
@@ -192,16 +192,16 @@ def step(coefficients, state, input_um):
     real, imag = state.modes_real, state.modes_imag
     for block in range((coefficients.mode_count + 3) // 4):
         i = 4 * block
-        real_0, imag_0 = _moved(coefficients, real[i], imag[i], i, input_um)
-        real_1, imag_1 = _moved(coefficients, real[i + 1], imag[i + 1], i + 1, input_um)
-        real_2, imag_2 = _moved(coefficients, real[i + 2], imag[i + 2], i + 2, input_um)
-        real_3, imag_3 = _moved(coefficients, real[i + 3], imag[i + 3], i + 3, input_um)
+        real_0, imag_0 = _next_mode(coefficients, real[i], imag[i], i, input_um)
+        real_1, imag_1 = _next_mode(coefficients, real[i + 1], imag[i + 1], i + 1, input_um)
+        real_2, imag_2 = _next_mode(coefficients, real[i + 2], imag[i + 2], i + 2, input_um)
+        real_3, imag_3 = _next_mode(coefficients, real[i + 3], imag[i + 3], i + 3, input_um)
         real[i], real[i + 1], real[i + 2], real[i + 3] = real_0, real_1, real_2, real_3
         imag[i], imag[i + 1], imag[i + 2], imag[i + 3] = imag_0, imag_1, imag_2, imag_3
 
 
-@inlined
-def _moved(coefficients, real, imag, i, input_um):
+@jit_inline
+def _next_mode(coefficients, real, imag, i, input_um):
     """Mode i after a period: λz + u."""
     pole_real, pole_imag = coefficients.mode_real[i], coefficients.mode_imag[i]
     return pole_real * real - pole_imag * imag + input_um, pole_imag * real + pole_real * imag

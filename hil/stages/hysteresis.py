@@ -10,7 +10,7 @@ analytical model for the output of the inverse compensation". This module must n
 
 from __future__ import annotations
 
-from rtloop.hil.native.compiled import inlined, jit
+from rtloop.hil.native.compiled import jit, jit_inline
 
 MAX_PLAYS = 64
 
@@ -27,7 +27,7 @@ RESIDUAL_WEIGHTS_UM_PER_V = (2.3834, *_INNER_UM_PER_V, 0.25452, *_OUTER_UM_PER_V
 """Eq (4) with p_0 and p_6 changed, so that an inverse computed from (4) leaves a loop of h/H = 3.75 % at 40 µm: the
 real actuator differs from its model, and the paper's problem is what that leaves."""
 
-TRUTHS = {
+NAMED_MODELS = {
     "nominal": (THRESHOLDS_V, NOMINAL_WEIGHTS_UM_PER_V),
     "residual": (THRESHOLDS_V, RESIDUAL_WEIGHTS_UM_PER_V),
 }
@@ -41,8 +41,8 @@ COEFFICIENTS = [
 STATE = [("plays_v", "f8", (MAX_PLAYS,)), ("sums_um", "f8", (4,))]
 
 
-@inlined
-def play(drive_v, threshold_v, held_v):
+@jit_inline
+def play_output(drive_v, threshold_v, held_v):
     """The play operator's next output [V]: `held_v` unless the drive pushes one of the two sides of the gap."""
     low_v, high_v = drive_v - threshold_v, drive_v + threshold_v
     lowered_v = high_v if high_v < held_v else held_v
@@ -56,10 +56,10 @@ def step(coefficients, state, drive_v):
     first_um, second_um, third_um, fourth_um = 0.0, 0.0, 0.0, 0.0
     for block in range((coefficients.play_count + 3) // 4):  # the weights beyond the last play are 0
         i = 4 * block
-        first_v = play(drive_v, thresholds_v[i], plays_v[i])
-        second_v = play(drive_v, thresholds_v[i + 1], plays_v[i + 1])
-        third_v = play(drive_v, thresholds_v[i + 2], plays_v[i + 2])
-        fourth_v = play(drive_v, thresholds_v[i + 3], plays_v[i + 3])
+        first_v = play_output(drive_v, thresholds_v[i], plays_v[i])
+        second_v = play_output(drive_v, thresholds_v[i + 1], plays_v[i + 1])
+        third_v = play_output(drive_v, thresholds_v[i + 2], plays_v[i + 2])
+        fourth_v = play_output(drive_v, thresholds_v[i + 3], plays_v[i + 3])
         first_um += weights[i] * first_v
         second_um += weights[i + 1] * second_v
         third_um += weights[i + 2] * third_v

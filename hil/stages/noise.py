@@ -21,7 +21,7 @@ _SHIFTS = np.uint64(13), np.uint64(7), np.uint64(17)
 _16, _32 = np.uint64(16), np.uint64(32)
 _LANES = np.uint64(0x0000_FFFF_0000_FFFF)
 _LOW = np.uint64(0xFFFF_FFFF)
-_NOTHING = np.uint64(0)
+_ZERO = np.uint64(0)
 _MEAN = 393210.0
 _DEVIATION = float(np.sqrt(2.0**32 - 1.0))
 
@@ -37,9 +37,9 @@ def seed_word(seed: int, stream: str) -> int:
 
 
 @jit
-def draw(word):
+def draw_normal(word):
     """A number of mean 0 and variance 1, and the next state."""
-    lanes = _NOTHING
+    lanes = _ZERO
     for _ in range(3):
         word = word ^ (word << _SHIFTS[0])
         word = word ^ (word >> _SHIFTS[1])

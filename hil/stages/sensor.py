@@ -26,7 +26,7 @@ def read(coefficients, state, position_um):
     """Volts that the sensor puts out for `position_um`; draws from the axis's noise once."""
     reading_um = position_um + coefficients.sensor_offset_um
     if coefficients.sensor_noise_um > 0.0:
-        value, state.noise_word = noise.draw(state.noise_word)
+        value, state.noise_word = noise.draw_normal(state.noise_word)
         reading_um += coefficients.sensor_noise_um * value
     resolution_um = coefficients.sensor_resolution_um
     if resolution_um > 0.0:

@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.analysis.held_plant import Between, held_plant
-from rtloop.analysis.reference import AS_IT_IS, ReferencePath
+from rtloop.analysis.held_plant import IntersampleOutput, hold_plant
+from rtloop.analysis.reference import UNFILTERED, ReferencePath
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.discretise import DiscreteController
-from rtloop.linear.realisation import System, beside_imaginary_axis, realise
+from rtloop.linear.realisation import System, imaginary_axis_points, realise
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
@@ -47,8 +47,8 @@ class Loop:
     static_gain: float
     roots: Complex
     period_s: float | None = None
-    between: Between | None = None
-    reference: ReferencePath = AS_IT_IS
+    between: IntersampleOutput | None = None
+    reference: ReferencePath = UNFILTERED
 
     def open(self, hz: npt.ArrayLike) -> Complex:
         """L at frequencies (k,) in Hz."""
@@ -69,7 +69,7 @@ class Loop:
         """|C·S|, from the reference to the command, at frequencies (k,) in Hz."""
         return np.abs(self.controller.response(self._points(hz))) * self.sensitivity(hz)
 
-    def from_command(self, hz: npt.ArrayLike) -> Complex:
+    def response_from_command(self, hz: npt.ArrayLike) -> Complex:
         """From what is added to the command to the position, at frequencies (k,) in Hz."""
         a, _, c, _ = self.matrices
         return System(a, self.injection.b, c[0], 0.0).response(self._points(hz))
@@ -84,14 +84,16 @@ class Loop:
         return a, np.concatenate([bc, dc * bp]), c, np.array([0.0, dc])
 
     @cached_property
-    def positions(self) -> Between:
+    def positions(self) -> IntersampleOutput:
         """Within a period, of the closed loop's states and of what the error is made of; the samples alone if so."""
         _, _, c, d = self.matrices
         if self.between is None:
-            return Between(c[:1], d[:1])
+            return IntersampleOutput(c[:1], d[:1])
         _, _, cc, dc = self.controller
         rows, direct = self.between
-        return Between(np.hstack([np.outer(direct, cc), rows - dc * np.outer(direct, self.plant.c)]), dc * direct)
+        return IntersampleOutput(
+            np.hstack([np.outer(direct, cc), rows - dc * np.outer(direct, self.plant.c)]), dc * direct
+        )
 
     @property
     def injection(self) -> Injection:
@@ -100,7 +102,7 @@ class Loop:
         return Injection(np.concatenate([np.zeros(self.controller.b.size), self.plant.b]), between)
 
     @cached_property
-    def final(self) -> tuple[float, float]:
+    def final_values(self) -> tuple[float, float]:
         """Where position and command of a stable loop come to rest after a unit step of the reference."""
         a, b, c, d = self.matrices
         toward_error, toward_command = (float(gain[0].real) for gain in self.reference.response(1.0))
@@ -109,14 +111,14 @@ class Loop:
         position, command = c @ states + toward_error * d
         return float(position), float(command) + toward_command
 
-    def from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
+    def response_from_reference(self, hz: npt.ArrayLike) -> tuple[Complex, Complex]:
         """To position and command, at frequencies (k,) in Hz, with what the reference passes."""
         a, b, c, d = self.matrices
         points = self._points(hz)
         toward_error, toward_command = self.reference.response(points)
         position, command = (toward_error * System(a, b, c[i], float(d[i])).response(points) for i in (0, 1))
-        if self.reference.commands:
-            position = position + toward_command * self.from_command(hz)
+        if self.reference.has_command_path:
+            position = position + toward_command * self.response_from_command(hz)
             command = command + toward_command * System(a, self.injection.b, c[1], 1.0).response(points)
         return position, command
 
@@ -156,24 +158,24 @@ class Loop:
 
 def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
     """The loop of C(s) and D(s). Raises ValueError for a plant with direct feedthrough."""
-    _check(plant)
+    _require_strictly_proper(plant)
     roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
-    return Loop(realised(controller), realised(plant), (controller * plant).dc_gain, roots)
+    return Loop(realise_transfer(controller), realise_transfer(plant), (controller * plant).dc_gain, roots)
 
 
 def discrete_loop(
     controller: DiscreteController | Sampled,
     plant: Transfer,
     delay_ticks: int = 0,
-    reference: ReferencePath = AS_IT_IS,
+    reference: ReferencePath = UNFILTERED,
 ) -> Loop:
     """The loop as it runs: D(s) behind a zero-order hold at the controller's period, `delay_ticks` samples before it.
 
     Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """
-    _check(plant)
+    _require_strictly_proper(plant)
     period_s = controller.period_s
-    sampled, between = held_plant(plant, period_s, delay_ticks)
+    sampled, between = hold_plant(plant, period_s, delay_ticks)
     images = np.concatenate([controller.zeros, controller.poles])
     roots = np.concatenate([_rates(images, period_s), plant.poles])
     static_gain = controller.dc_gain * plant.dc_gain
@@ -182,7 +184,7 @@ def discrete_loop(
 
 def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
     """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
-    return held_plant(plant, period_s, delay_ticks).system
+    return hold_plant(plant, period_s, delay_ticks).system
 
 
 def _rates(images: Complex, period_s: float) -> Complex:
@@ -190,13 +192,13 @@ def _rates(images: Complex, period_s: float) -> Complex:
     return (np.log(images[np.abs(images) > 1e-9].astype(complex)) / period_s).astype(complex)
 
 
-def realised(transfer: Transfer) -> System:
+def realise_transfer(transfer: Transfer) -> System:
     """A real, well-conditioned state space of a transfer function in s."""
-    points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
+    points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     return realise(transfer.zeros, transfer.poles, transfer.gain, points)[0]
 
 
-def _check(plant: Transfer) -> None:
+def _require_strictly_proper(plant: Transfer) -> None:
     if not plant.is_strictly_proper:
         raise ValueError(
             f"plant: {plant.zeros.size} zeros and {plant.order} poles give it direct feedthrough; "

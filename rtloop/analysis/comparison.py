@@ -21,7 +21,7 @@ LIGHT_DAMPING = 0.2
 
 
 @dataclass(frozen=True)
-class Shift:
+class RootShift:
     """Where a lightly damped pair stood and where it stands: undamped natural frequencies in Hz (NaN: gone)."""
 
     kind: Literal["notch", "resonance"]
@@ -36,27 +36,29 @@ class Shift:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ControllerComparison:
     """`max_deviation` is the largest |C(z) − C(s)|/|C(s)|, at `max_deviation_hz`, over frequencies below `up_to_hz`."""
 
     max_deviation: float
     max_deviation_hz: float
     up_to_hz: float
-    shifts: tuple[Shift, ...]
+    shifts: tuple[RootShift, ...]
     warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self) | {"shifts": [asdict(s) | {"discrete_hz": _or_none(s.discrete_hz)} for s in self.shifts]}
+        return asdict(self) | {
+            "shifts": [asdict(s) | {"discrete_hz": _finite_or_none(s.discrete_hz)} for s in self.shifts]
+        }
 
 
-def compare(
+def compare_controllers(
     transfer: Transfer,
     discrete: DiscreteController,
     up_to_hz: float | None = None,
     largest_shift: float = 0.002,
     largest_part_of_half_width: float = 0.5,
-) -> Comparison:
+) -> ControllerComparison:
     """Deviation below `up_to_hz` (default: half the sampling rate) and shifts of notches and resonances.
 
     A warning for each that moves by more than `largest_shift` of its frequency, or by more than
@@ -69,11 +71,13 @@ def compare(
     error = np.abs(discrete.response(hz) - reference)
     deviation = np.divide(error, np.abs(reference), out=np.zeros_like(error), where=reference != 0)
     worst_index = int(np.argmax(deviation))
-    shifts = _shifts("notch", transfer.zeros, discrete.zeros, discrete.period_s)
-    shifts += _shifts("resonance", transfer.poles, discrete.poles, discrete.period_s)
-    large_shifts = [shift for shift in shifts if not _within(shift, largest_shift, largest_part_of_half_width)]
+    shifts = _root_shifts("notch", transfer.zeros, discrete.zeros, discrete.period_s)
+    shifts += _root_shifts("resonance", transfer.poles, discrete.poles, discrete.period_s)
+    large_shifts = [shift for shift in shifts if not _is_tolerable(shift, largest_shift, largest_part_of_half_width)]
     warnings = [_warning(shift, discrete) for shift in large_shifts]
-    return Comparison(float(deviation[worst_index]), float(hz[worst_index]), limit_hz, tuple(shifts), warnings)
+    return ControllerComparison(
+        float(deviation[worst_index]), float(hz[worst_index]), limit_hz, tuple(shifts), warnings
+    )
 
 
 def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
@@ -89,24 +93,26 @@ def _light_pairs(roots: Complex) -> list[complex]:
     return [complex(root) for root in roots if root.imag > 0 and abs(root.real) < LIGHT_DAMPING * abs(root)]
 
 
-def _shifts(kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float) -> list[Shift]:
+def _root_shifts(
+    kind: Literal["notch", "resonance"], roots: Complex, images: Complex, period_s: float
+) -> list[RootShift]:
     """Each lightly damped pair beside the nearest image, brought back to s by log(z)/T; an image serves once."""
     candidate_roots = list(np.log(images[images.imag > 0]) / period_s)
-    shifts: list[Shift] = []
+    shifts: list[RootShift] = []
     for root in _light_pairs(roots):
         image = min(candidate_roots, key=lambda candidate, root=root: abs(candidate - root), default=complex(math.nan))
         candidate_roots = [candidate for candidate in candidate_roots if candidate is not image]
         hz, image_hz = abs(root) / (2 * math.pi), float(abs(image)) / (2 * math.pi)
-        shifts.append(Shift(kind, hz, image_hz if hz < 0.5 / period_s else math.nan, abs(root.real) / abs(root)))
+        shifts.append(RootShift(kind, hz, image_hz if hz < 0.5 / period_s else math.nan, abs(root.real) / abs(root)))
     return shifts
 
 
-def _within(shift: Shift, largest_shift: float, largest_part: float) -> bool:
+def _is_tolerable(shift: RootShift, largest_shift: float, largest_part: float) -> bool:
     max_shift = min(largest_shift, max(largest_part * shift.damping, 1e-5))  # 1e-5: undamped pairs have no width
     return abs(shift.relative) <= max_shift  # False for NaN
 
 
-def _warning(shift: Shift, discrete: DiscreteController) -> str:
+def _warning(shift: RootShift, discrete: DiscreteController) -> str:
     name = f"{discrete.method} at {1 / discrete.period_s:g} Hz"
     if math.isnan(shift.discrete_hz):
         return f"{name} cannot keep the {shift.kind} at {shift.frequency_hz:.1f} Hz; it needs a higher sampling rate"
@@ -117,5 +123,5 @@ def _warning(shift: Shift, discrete: DiscreteController) -> str:
     )
 
 
-def _or_none(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None

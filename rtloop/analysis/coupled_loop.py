@@ -20,19 +20,19 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.analysis.closed_loop import Injection, Loop
-from rtloop.analysis.held_plant import Between, HeldPlant, held_plant
-from rtloop.analysis.margins import highest
-from rtloop.analysis.reference import AS_IT_IS, ReferencePath
+from rtloop.analysis.held_plant import HeldPlant, IntersampleOutput, hold_plant
+from rtloop.analysis.margins import find_maximum
+from rtloop.analysis.reference import UNFILTERED, ReferencePath
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import System
-from rtloop.linear.together import BESIDE_ONE, SampledTogether, SystemTogether, beside_each_other
+from rtloop.linear.together import DC_OFFSET, CoupledSystem, SampledCoupledSystem, block_diagonal_system
 from rtloop.linear.transfer import Transfer
 
-NOTHING = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
+UNIT_SYSTEM = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
 """What leaves a signal as it is."""
 NO_INJECTION = Injection(np.empty(0), np.empty(0))
 BALANCINGS = 30
-INTEGRATES = 1e6
+INTEGRATOR_GAIN = 1e6
 """A loop whose gain beside z = 1 is above this is without limit there."""
 
 
@@ -44,7 +44,7 @@ class CoupledPlant:
     delay_ticks: tuple[int, ...]
     coupling: Real
 
-    def changed(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
+    def with_axis_replaced(self, number: int, dynamics: Transfer, delay_ticks: int) -> CoupledPlant:
         """Another D and another delay of one axis."""
         return replace(
             self,
@@ -52,13 +52,13 @@ class CoupledPlant:
             delay_ticks=(*self.delay_ticks[:number], delay_ticks, *self.delay_ticks[number + 1 :]),
         )
 
-    def held(self, period_s: float) -> list[HeldPlant]:
+    def held_plants(self, period_s: float) -> list[HeldPlant]:
         """Each axis behind a zero-order hold. Raises ValueError for one with direct feedthrough."""
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
                 raise ValueError("plant: it has direct feedthrough; one with fewer zeros than poles is allowed")
         pairs = zip(self.dynamics, self.delay_ticks, strict=True)
-        return [held_plant(plant, period_s, ticks) for plant, ticks in pairs]
+        return [hold_plant(plant, period_s, ticks) for plant, ticks in pairs]
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
@@ -74,13 +74,13 @@ class BrokenLoop(Loop):
     `added` is what is added to its command.
     """
 
-    command: System = NOTHING
-    added: Injection = NO_INJECTION
+    command: System = UNIT_SYSTEM
+    command_injection: Injection = NO_INJECTION
 
     @property
     def injection(self) -> Injection:
         """What is added to its command."""
-        return self.added
+        return self.command_injection
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
         """From its reference to its command."""
@@ -94,7 +94,7 @@ class BrokenLoop(Loop):
         return a - np.outer(b, c), b, np.vstack([c, command_row - direct * c]), np.array([0.0, direct])
 
 
-class TogetherMargins(NamedTuple):
+class SimultaneousMargins(NamedTuple):
     """The largest singular value of S and of T, and the disk margins α of all sensors and of all commands at once.
 
     Every axis's gain may change within a factor (1 − α/2)/(1 + α/2) … (1 + α/2)/(1 − α/2), and every one's phase by
@@ -117,18 +117,20 @@ class TogetherMargins(NamedTuple):
 class CoupledLoop:
     """C(z) and G(z), joined."""
 
-    def __init__(self, controller: SampledTogether, plant: CoupledPlant) -> None:
+    def __init__(self, controller: SampledCoupledSystem, plant: CoupledPlant) -> None:
         self.period_s = controller.period_s
-        self._held, self._coupling = plant.held(controller.period_s), plant.coupling
+        self._held, self._coupling = plant.held_plants(controller.period_s), plant.coupling
         self._controller = controller.system
-        self._plant = beside_each_other([plant_of_axis.system for plant_of_axis in self._held]).mixed(plant.coupling)
-        self.count = controller.count
+        self._plant = block_diagonal_system([plant_of_axis.system for plant_of_axis in self._held]).transform(
+            plant.coupling
+        )
+        self.axis_count = controller.count
 
-    def alone(self, number: int, reference: ReferencePath = AS_IT_IS) -> BrokenLoop:
+    def axis_loop(self, number: int, reference: ReferencePath = UNFILTERED) -> BrokenLoop:
         """The loop of one axis, broken at its sensor, the others closed."""
         ac, bc, cc, dc = self._controller
         ap, bp, cp, _ = self._plant
-        closed_axes = np.eye(self.count)
+        closed_axes = np.eye(self.axis_count)
         closed_axes[number, number] = 0.0
         a = np.block([[ap - bp @ dc @ closed_axes @ cp, bp @ cc], [-bc @ closed_axes @ cp, ac]])
         b = np.concatenate([bp @ dc[:, number], bc[:, number]])
@@ -137,27 +139,33 @@ class CoupledLoop:
         command = System(a, b, np.concatenate([-dc[number] @ closed_axes @ cp, cc[number]]), float(dc[number, number]))
         poles = np.linalg.eigvals(a).astype(np.complex128)
         rates = np.asarray(np.log(poles[np.abs(poles) > 1e-9]) / self.period_s, np.complex128)
-        static_response = float(plant.response(1.0 + BESIDE_ONE)[0].real)
-        static = static_response if abs(static_response) < INTEGRATES else np.copysign(np.inf, static_response)
+        static_response = float(plant.response(1.0 + DC_OFFSET)[0].real)
+        static = static_response if abs(static_response) < INTEGRATOR_GAIN else np.copysign(np.inf, static_response)
         injection = Injection(np.concatenate([bp[:, number], np.zeros(ac.shape[0])]), self._held[number].between.direct)
-        between = self._between(number, closed_axes)
-        return BrokenLoop(NOTHING, plant, float(static), rates, self.period_s, between, reference, command, injection)
+        between = self._intersample_rows(number, closed_axes)
+        return BrokenLoop(
+            UNIT_SYSTEM, plant, float(static), rates, self.period_s, between, reference, command, injection
+        )
 
-    def _between(self, number: int, closed: Real) -> Between:
+    def _intersample_rows(self, number: int, closed_axes: Real) -> IntersampleOutput:
         """Positions of one axis within a period, of all states and of its error; `closed` are the other axes."""
         _, _, cc, dc = self._controller
         rows, direct = self._held[number].between
         states_before = sum(axis_plant.system.b.size for axis_plant in self._held[:number])
         states_after = self._plant.a.shape[0] - states_before - rows.shape[1]
         command_columns = np.outer(direct, self._coupling[number])
-        plants = np.pad(rows, ((0, 0), (states_before, states_after))) - command_columns @ dc @ closed @ self._plant.c
+        plants = (
+            np.pad(rows, ((0, 0), (states_before, states_after))) - command_columns @ dc @ closed_axes @ self._plant.c
+        )
         state_rows = np.hstack([plants, command_columns @ cc])
-        return Between(np.asarray(state_rows, np.float64), np.asarray(command_columns @ dc[:, number], np.float64))
+        return IntersampleOutput(
+            np.asarray(state_rows, np.float64), np.asarray(command_columns @ dc[:, number], np.float64)
+        )
 
     @cached_property
     def poles(self) -> Complex:
         """Of the whole, closed."""
-        return self.alone(0).poles
+        return self.axis_loop(0).poles
 
     @property
     def is_stable(self) -> bool:
@@ -166,37 +174,39 @@ class CoupledLoop:
 
     def sensitivity(self, hz: npt.ArrayLike) -> Complex:
         """S = (I + G C)⁻¹ at frequencies (k,) in Hz, (k, axes, axes): from references to errors."""
-        return self._inverse(hz, self._plant, self._controller)
+        return self._return_inverse(hz, self._plant, self._controller)
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Complex:
         """(I + C G)⁻¹, from what is added to the commands to what goes out, (k, axes, axes)."""
-        return self._inverse(hz, self._controller, self._plant)
+        return self._return_inverse(hz, self._controller, self._plant)
 
-    def _inverse(self, hz: npt.ArrayLike, first: SystemTogether, second: SystemTogether) -> Complex:
+    def _return_inverse(self, hz: npt.ArrayLike, first: CoupledSystem, second: CoupledSystem) -> Complex:
         points = np.exp(2 * np.pi * (1e-12 + 1j) * np.atleast_1d(np.asarray(hz, float)) * self.period_s)
         open_loop = first.response(points) @ second.response(points)
-        return np.asarray(np.linalg.inv(np.eye(self.count) + open_loop), np.complex128)
+        return np.asarray(np.linalg.inv(np.eye(self.axis_count) + open_loop), np.complex128)
 
     @cached_property
-    def margins(self) -> TogetherMargins:
+    def margins(self) -> SimultaneousMargins:
         """What all axes together may bear."""
         if not self.is_stable:
-            return TogetherMargins(*[np.nan] * len(TogetherMargins._fields))
-        hz = np.unique(np.concatenate([self.alone(i).frequencies for i in range(self.count)]))
-        identity = np.eye(self.count)
-        peak, peak_hz = highest(lambda f: _largest(self.sensitivity(f)), hz)
-        tracking, _ = highest(lambda f: _largest(identity - self.sensitivity(f)), hz)
-        disk, disk_hz = highest(lambda f: _structured(self.sensitivity(f) - identity / 2), hz)
-        command, command_hz = highest(lambda f: _structured(self.command_sensitivity(f) - identity / 2), hz)
-        return TogetherMargins(peak, peak_hz, tracking, 1 / disk, disk_hz, 1 / command, command_hz)
+            return SimultaneousMargins(*[np.nan] * len(SimultaneousMargins._fields))
+        hz = np.unique(np.concatenate([self.axis_loop(i).frequencies for i in range(self.axis_count)]))
+        identity = np.eye(self.axis_count)
+        peak, peak_hz = find_maximum(lambda f: _largest_singular_value(self.sensitivity(f)), hz)
+        tracking, _ = find_maximum(lambda f: _largest_singular_value(identity - self.sensitivity(f)), hz)
+        disk, disk_hz = find_maximum(lambda f: _structured_singular_value(self.sensitivity(f) - identity / 2), hz)
+        command, command_hz = find_maximum(
+            lambda f: _structured_singular_value(self.command_sensitivity(f) - identity / 2), hz
+        )
+        return SimultaneousMargins(peak, peak_hz, tracking, 1 / disk, disk_hz, 1 / command, command_hz)
 
 
-def _largest(matrices: Complex) -> Real:
+def _largest_singular_value(matrices: Complex) -> Real:
     """Largest singular value of each of (k, m, m)."""
     return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, 0], np.float64)
 
 
-def _structured(matrices: Complex) -> Real:
+def _structured_singular_value(matrices: Complex) -> Real:
     """μ of each of (k, m, m) for a diagonal of complex changes, from above: σ̄ after scaling, which is exact for two.
 
     The scaling makes the norms of each row and column beside the diagonal equal (Osborne, 1960): the Frobenius norm
@@ -212,4 +222,4 @@ def _structured(matrices: Complex) -> Real:
             scale = np.sqrt(np.where((row > 0) & (column > 0), column / np.where(row > 0, row, 1.0), 1.0))
             balanced[:, i, :] *= scale[:, None]
             balanced[:, :, i] /= scale[:, None]
-    return _largest(balanced)
+    return _largest_singular_value(balanced)

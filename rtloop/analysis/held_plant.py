@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.linear.discretise import held
+from rtloop.linear.discretise import zero_order_hold
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
 
@@ -19,7 +19,7 @@ POINTS = 8
 """Of time within a period at which a position is known, that of the sample included."""
 
 
-class Between(NamedTuple):
+class IntersampleOutput(NamedTuple):
     """Positions at the `POINTS` of a period: `rows` (POINTS, n) on the states, `direct` (POINTS,) on the input."""
 
     rows: Real
@@ -30,24 +30,24 @@ class HeldPlant(NamedTuple):
     """From sample to sample, and the positions between, of the same states."""
 
     system: System
-    between: Between
+    between: IntersampleOutput
 
 
-def held_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
+def hold_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
     """D(s) behind a zero-order hold and a chain of `delay_ticks` samples. Raises ValueError for a negative delay."""
     if delay_ticks < 0:
         raise ValueError(f"delay_ticks: {delay_ticks}; 0 or more samples are allowed")
-    fine = held(plant, period_s / POINTS)
+    fine = zero_order_hold(plant, period_s / POINTS)
     row, state, input_state = fine.c, np.eye(fine.b.size), np.zeros_like(fine.b)
     rows, direct = [], []
     for _ in range(POINTS):
         rows.append(row @ state)
         direct.append(float(row @ input_state))
         state, input_state = fine.a @ state, fine.a @ input_state + fine.b
-    system, between = System(state, input_state, row, fine.d), Between(np.array(rows), np.array(direct))
+    system, between = System(state, input_state, row, fine.d), IntersampleOutput(np.array(rows), np.array(direct))
     for _ in range(delay_ticks):
         n = system.b.size
         a = np.block([[system.a, system.b[:, None]], [np.zeros((1, n + 1))]])
-        between = Between(np.hstack([between.rows, between.direct[:, None]]), np.zeros(POINTS))
+        between = IntersampleOutput(np.hstack([between.rows, between.direct[:, None]]), np.zeros(POINTS))
         system = System(a, np.eye(n + 1)[-1], np.append(system.c, 0.0), 0.0)
     return HeldPlant(system, between)

@@ -24,19 +24,19 @@ LARGEST_CONTRACTION = 0.8
 LEAST_RESPONSE = 0.1
 """Of the position to reference and command: of less, noise would be learned, and large commands for little."""
 
-SETTLE_S, MEASURED_S = 0.1, 0.2
+SETTLE_S, EVALUATION_S = 0.1, 0.2
 """Of a cycle at least so long, in whole periods, to settle and to be judged."""
-GROWN = 1.1
+MAX_ERROR_GROWTH = 1.1
 """An error larger by this factor than the least so far is not learned from: the table goes back to that one's."""
 
 
-def periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
+def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
     """Of a cycle: how many to settle, and how many are judged."""
     period_s = period_ticks / rate_hz
-    return math.ceil(SETTLE_S / period_s), math.ceil(MEASURED_S / period_s)
+    return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)
 
 
-def untaught(wanted_um: Real) -> Real:
+def unlearned_table(wanted_um: Real) -> Real:
     """The table (period, 2) of which nothing is learned: it adds nothing to the command."""
     return np.column_stack([wanted_um, np.zeros_like(wanted_um)])
 
@@ -47,7 +47,7 @@ def rms(values: Real) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Learning:
+class LearningGains:
     """`gains` (harmonics, 2) from an error to both columns; `contraction` (harmonics,), the worst of all loops."""
 
     period_ticks: int
@@ -55,17 +55,17 @@ class Learning:
     contraction: Real
 
     @property
-    def learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    def is_learned(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """Which harmonics, from 0 Hz on."""
         return self.contraction < LARGEST_CONTRACTION
 
-    def improved(self, table: Real, error_um: Real) -> Real:
+    def improve(self, table: Real, error_um: Real) -> Real:
         """The table (period, 2) after a cycle that was wrong by `error_um` (period,), wanted minus measured."""
-        change = (self.gains * self.learned[:, None]).T * np.fft.rfft(error_um)
+        change = (self.gains * self.is_learned[:, None]).T * np.fft.rfft(error_um)
         return table + np.fft.irfft(change, self.period_ticks).T
 
 
-def learning(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Learning:
+def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> LearningGains:
     """How a table of so many ticks learns in named loops of one rate.
 
     Raises ValueError, which says why, where the error of the period itself would not shrink in each of them.
@@ -76,12 +76,12 @@ def learning(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Learning:
     unstable = [name for name, loop in loops if not loop.is_stable]
     if unstable:
         raise ValueError(f"{unstable[0]}: the loop is unstable there, and no table can be learned in it")
-    paths = np.array([np.column_stack(_paths(loop, hz)) for _, loop in loops])
-    gains = _inverse(paths)
+    paths = np.array([np.column_stack(_position_responses(loop, hz)) for _, loop in loops])
+    gains = _regularised_inverse(paths)
     contractions = np.abs(1 - np.einsum("shc,hc->sh", paths, gains))
-    result = Learning(period_ticks, gains, contractions.max(axis=0))
-    if not result.learned[:2].all():
-        harmonic = int(np.argmax(~result.learned[:2]))
+    result = LearningGains(period_ticks, gains, contractions.max(axis=0))
+    if not result.is_learned[:2].all():
+        harmonic = int(np.argmax(~result.is_learned[:2]))
         worst_loop = loops[int(np.argmax(contractions[:, harmonic]))][0]
         raise ValueError(
             f"{worst_loop}: a cycle leaves {result.contraction[harmonic]:.2f} of the error at {hz[harmonic]:g} Hz; "
@@ -90,12 +90,12 @@ def learning(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Learning:
     return result
 
 
-def _paths(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
+def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
     """To the position: from the reference, and from what is added to the command."""
-    return loop.from_reference(hz)[0], loop.from_command(hz)
+    return loop.response_from_reference(hz)[0], loop.response_from_command(hz)
 
 
-def _inverse(paths: Complex) -> Complex:
+def _regularised_inverse(paths: Complex) -> Complex:
     """L (harmonics, 2) of least Σ |1 − [T, G] L|² over the loops of `paths` (loops, harmonics, 2)."""
     adjoint = np.conj(paths)
     normal = np.einsum("shi,shj->hij", adjoint, paths) + len(paths) * LEAST_RESPONSE**2 * np.eye(2)

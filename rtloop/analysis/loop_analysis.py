@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
-from rtloop.analysis.margins import Margins, margins
+from rtloop.analysis.margins import Margins, loop_margins
 from rtloop.analysis.step_response import step_metrics
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
@@ -52,13 +52,13 @@ class LoopAnalysis:
     def as_dict(self) -> dict[str, Any]:
         """For JSON: poles as [real, imaginary], null for what is undefined or without limit."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: _plain(value) for name, value in values.items()}
+        return {name: _json_value(value) for name, value in values.items()}
 
 
 def analyse_continuous(controller: Transfer, plant: Transfer, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
     """C(s) and D(s) without sampling or delay. Raises ValueError for a plant with direct feedthrough."""
     loop = continuous_loop(controller, plant)
-    return analyse(loop, margins(loop), 0, times_s)
+    return analyse_loop(loop, loop_margins(loop), 0, times_s)
 
 
 def analyse_discrete(
@@ -70,10 +70,12 @@ def analyse_discrete(
     a plant with direct feedthrough.
     """
     loop = discrete_loop(controller, plant, delay_ticks)
-    return analyse(loop, margins(loop), delay_ticks, times_s)
+    return analyse_loop(loop, loop_margins(loop), delay_ticks, times_s)
 
 
-def analyse(loop: Loop, found: Margins, delay_ticks: int, times_s: Sequence[float] = TIMES_S) -> LoopAnalysis:
+def analyse_loop(
+    loop: Loop, margin_values: Margins, delay_ticks: int, times_s: Sequence[float] = TIMES_S
+) -> LoopAnalysis:
     """A loop that is put together already, with the margins that were found of it."""
     continuous = loop.period_s is None
     poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]
@@ -92,13 +94,13 @@ def analyse(loop: Loop, found: Margins, delay_ticks: int, times_s: Sequence[floa
         step_times_s=tuple(float(t) for t in times_s),
         step_position=step.position_at,
         poles=tuple(complex(p) for p in poles),
-        **found._asdict(),
+        **margin_values._asdict(),
     )
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     if isinstance(value, tuple):
-        return [_plain(item) for item in value]
+        return [_json_value(item) for item in value]
     if isinstance(value, complex):
         return [value.real, value.imag]
     return None if isinstance(value, float) and not math.isfinite(value) else value

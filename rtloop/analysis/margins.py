@@ -52,19 +52,19 @@ class Margins(NamedTuple):
     max_sensitivity_hz: float
 
 
-def margins(loop: OpenLoop) -> Margins:
+def loop_margins(loop: OpenLoop) -> Margins:
     """The lowest crossover, the smallest phase margin of all, the smallest factor > 1 that reaches −1, max |S|."""
     hz = loop.frequencies
     response = loop.open(hz)
-    crossover_frequencies = crossings(loop)
+    crossover_frequencies = gain_crossovers(loop)
     phases = [180 - abs(math.degrees(np.angle(loop.open(f)[0]))) for f in crossover_frequencies]
     gain, gain_hz = _gain_margin(loop, hz, response)
-    peak, peak_hz = highest(loop.sensitivity, hz)
+    peak, peak_hz = find_maximum(loop.sensitivity, hz)
     crossover = crossover_frequencies[0] if crossover_frequencies else math.nan
     return Margins(crossover, min(phases, default=math.inf), gain, gain_hz, peak, peak_hz)
 
 
-def crossings(loop: OpenLoop) -> list[float]:
+def gain_crossovers(loop: OpenLoop) -> list[float]:
     """Frequencies in Hz at which |L| = 1, rising."""
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
@@ -90,16 +90,16 @@ def _sign_changes(hz: Real, values: Real) -> list[tuple[float, float]]:
     return [(float(hz[i]), float(hz[i + 1])) for i in indices]
 
 
-def highest(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
+def find_maximum(function: Callable[[Real], Real], hz: Real) -> tuple[float, float]:
     """Maximum of `function` and where: every peak of the grid that comes near the highest is refined by itself."""
     values = function(hz)
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
     candidates = [i for i in inner if values[i] > 0.9 * values.max()]
     grid_maximum = (float(values.max()), float(hz[np.argmax(values)]))
-    return max([grid_maximum, *(_refined(function, float(hz[i - 1]), float(hz[i + 1])) for i in candidates)])
+    return max([grid_maximum, *(_refine_maximum(function, float(hz[i - 1]), float(hz[i + 1])) for i in candidates)])
 
 
-def _refined(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
+def _refine_maximum(function: Callable[[Real], Real], low: float, high: float) -> tuple[float, float]:
     """The peak between two points, by narrowing the grid around its highest point six times."""
     maximum = (-math.inf, low)
     for _ in range(6):
@@ -111,10 +111,10 @@ def _refined(function: Callable[[Real], Real], low: float, high: float) -> tuple
     return maximum
 
 
-def delay_tolerated(loop: OpenLoop) -> tuple[float, float]:
+def delay_margin(loop: OpenLoop) -> tuple[float, float]:
     """The smallest further delay, in s, that takes a stable loop to its limit, and the crossover in Hz where it does.
 
     L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ. inf, NaN: none does.
     """
-    phases = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in crossings(loop)]
+    phases = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in gain_crossovers(loop)]
     return min(((phase_deg % 360 / (360 * f), f) for phase_deg, f in phases), default=(math.inf, math.nan))

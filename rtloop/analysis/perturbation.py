@@ -13,23 +13,23 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
-from rtloop.analysis.search import reach
+from rtloop.analysis.search import find_limit
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
-Maker = Callable[[Transfer], Loop]
+LoopBuilder = Callable[[Transfer], Loop]
 """The loop of one controller with any plant."""
 
 
-class Range(NamedTuple):
+class PercentRange(NamedTuple):
     """Percent downwards and upwards; `None` where the direction's end was reached without a failure."""
 
     down: float | None
     up: float | None
 
 
-class Change(NamedTuple):
+class PlantChange(NamedTuple):
     """`apply(plant, percent)`; the search ends at `down` and `up` percent and takes steps of `step`."""
 
     apply: Callable[[Transfer, float], Transfer]
@@ -38,42 +38,46 @@ class Change(NamedTuple):
     step: float
 
 
-def maker(controller: Transfer | DiscreteController | Sampled, delay_ticks: int = 0) -> Maker:
+def loop_builder(controller: Transfer | DiscreteController | Sampled, delay_ticks: int = 0) -> LoopBuilder:
     """Loops of one controller with any plant, in continuous time or as it runs."""
     if isinstance(controller, Transfer):
         return lambda plant: continuous_loop(controller, plant)
     return lambda plant: discrete_loop(controller, plant, delay_ticks)
 
 
-def until_unstable(make: Maker, plant: Transfer, change: Change) -> Range:
+def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
     """The range over which `make(plant)` stays stable; (0, 0) if it is not as it stands."""
-    return until_bad(lambda changed_plant: make(changed_plant).is_stable, plant, change)
+    return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
 
 
-def until_bad(
-    good: Callable[[Transfer], bool], plant: Transfer, change: Change, coarse: float = 1.0, tolerance: float = 1e-4
-) -> Range:
+def holding_range(
+    holds: Callable[[Transfer], bool],
+    plant: Transfer,
+    change: PlantChange,
+    coarse: float = 1.0,
+    tolerance: float = 1e-4,
+) -> PercentRange:
     """The range over which `good(plant)` holds; (0, 0) if it does not as it stands. Nearest failures count."""
-    if not good(plant):
-        return Range(0.0, 0.0)
+    if not holds(plant):
+        return PercentRange(0.0, 0.0)
     ends = []
     for sign, largest in ((-1, change.down), (1, change.up)):
-        limit = reach(
-            lambda percent, sign=sign: good(change.apply(plant, sign * percent)),
+        limit = find_limit(
+            lambda percent, sign=sign: holds(change.apply(plant, sign * percent)),
             largest, coarse * change.step, tolerance,
         )  # fmt: skip
         ends.append(None if limit >= largest else limit)
-    return Range(*ends)
+    return PercentRange(*ends)
 
 
-def with_gain_changed(plant: Transfer, percent: float) -> Transfer:
+def change_gain(plant: Transfer, percent: float) -> Transfer:
     """The plant with another gain."""
     return Transfer(plant.zeros, plant.poles, plant.gain * (1 + percent / 100))
 
 
-def with_damping_changed(plant: Transfer, percent: float) -> Transfer:
+def change_damping(plant: Transfer, percent: float) -> Transfer:
     """The plant with the damping ratio of its most lightly damped pair of poles changed; |pole| and D(0) are kept."""
-    pair = lightest_pair(plant)
+    pair = least_damped_pole(plant)
     size, damping = abs(pair), -pair.real / abs(pair) * (1 + percent / 100)
     new_pole = size * complex(-damping, math.sqrt(1 - damping**2))
     poles = np.where(
@@ -82,42 +86,42 @@ def with_damping_changed(plant: Transfer, percent: float) -> Transfer:
     return Transfer(plant.zeros, poles, plant.gain)
 
 
-def changes(plant: Transfer) -> dict[str, Change]:
+def plant_changes(plant: Transfer) -> dict[str, PlantChange]:
     """What may move: the resonance, if there is one, its damping, the gain."""
-    changes_by_name = {"gain": Change(with_gain_changed, 99.9, 900.0, 10.0)}
+    changes_by_name = {"gain": PlantChange(change_gain, 99.9, 900.0, 10.0)}
     if np.any(plant.poles.imag > 0):
-        pair = lightest_pair(plant)
+        pair = least_damped_pole(plant)
         max_percent = 100 * (0.999 * abs(pair) / -pair.real - 1) if pair.real < 0 else 0.0
         changes_by_name = {
-            "resonance": Change(with_resonance_shifted, 50.0, 50.0, 0.25),
-            "damping": Change(with_damping_changed, 99.9, min(900.0, max_percent), 10.0),
+            "resonance": PlantChange(shift_resonance, 50.0, 50.0, 0.25),
+            "damping": PlantChange(change_damping, 99.9, min(900.0, max_percent), 10.0),
             **changes_by_name,
         }
     return changes_by_name
 
 
-def with_resonance_shifted(plant: Transfer, percent: float) -> Transfer:
+def shift_resonance(plant: Transfer, percent: float) -> Transfer:
     """The plant with its most lightly damped pole pair's frequency changed, damping ratio and static gain kept.
 
     Raises ValueError for a plant without complex poles.
     """
-    pole = lightest_pair(plant)
+    pole = least_damped_pole(plant)
     is_resonant = (plant.poles == pole) | (plant.poles == np.conj(pole))
     factor = 1 + percent / 100
     gain = plant.gain * factor ** int(is_resonant.sum())
     return Transfer(plant.zeros, np.where(is_resonant, factor * plant.poles, plant.poles), gain)
 
 
-def around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
+def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple[str, Transfer]]:
     """The plant, and with its resonance shifted to `count` places within ±`percent`; itself alone where it has none."""
     plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):
         shifts = [float(shift) for shift in np.linspace(-percent, percent, count) if shift]
-        plants += [(f"resonance {shift:+g} %", with_resonance_shifted(plant, shift)) for shift in shifts]
+        plants += [(f"resonance {shift:+g} %", shift_resonance(plant, shift)) for shift in shifts]
     return plants
 
 
-def lightest_pair(plant: Transfer) -> complex:
+def least_damped_pole(plant: Transfer) -> complex:
     """The pole of positive imaginary part with the least damping ratio. Raises ValueError where all poles are real."""
     upper = plant.poles[plant.poles.imag > 0]
     if not upper.size:
@@ -129,5 +133,5 @@ def resonance_hz(plant: Transfer) -> tuple[float, float] | None:
     """Frequency and half width of the most lightly damped pair of poles; None where all poles are real."""
     if not np.any(plant.poles.imag > 0):
         return None
-    pair = lightest_pair(plant)
+    pair = least_damped_pole(plant)
     return abs(pair) / (2 * math.pi), -pair.real / (2 * math.pi)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from rtloop.hil.modal import Complex, Real
 
-FORGOTTEN = 1e-12
+MEMORY_TOLERANCE = 1e-12
 """A section's memory counts until this part of it is left."""
 
 
@@ -25,30 +25,30 @@ class ReferencePath:
     sections: Real = field(default_factory=lambda: np.empty((0, 5)))
 
     @property
-    def commands(self) -> bool:
+    def has_command_path(self) -> bool:
         """Whether the reference goes past the controller, too."""
         return bool(np.any(self.command_taps))
 
     @property
-    def ticks(self) -> int:
+    def settling_ticks(self) -> int:
         """Until its answer to a step stands still."""
         poles = [np.abs(np.roots([1.0, *section[3:]])).max(initial=0.0) for section in self.sections]
         slowest = max(poles, default=0.0)
-        ringing = np.log(FORGOTTEN) / np.log(slowest) if 0 < slowest < 1 else 2.0
+        ringing = np.log(MEMORY_TOLERANCE) / np.log(slowest) if 0 < slowest < 1 else 2.0
         return max(self.taps.size, self.command_taps.size) + len(self.sections) * int(np.ceil(ringing))
 
-    def toward_error(self, values: npt.ArrayLike) -> Real:
+    def error_input(self, values: npt.ArrayLike) -> Real:
         """Values (…, ticks) behind taps and sections, from rest."""
-        filtered = _convolved(self.taps, values)
+        filtered = _convolve(self.taps, values)
         if len(self.sections):
             from scipy.signal import sosfilt  # a second of import, for the few who have sections
 
             filtered = sosfilt(np.insert(self.sections, 3, 1.0, axis=1), filtered)
         return np.asarray(filtered, np.float64)
 
-    def toward_command(self, values: npt.ArrayLike) -> Real:
+    def command_input(self, values: npt.ArrayLike) -> Real:
         """Values (…, ticks) behind the command's taps, from rest."""
-        return _convolved(self.command_taps, values)
+        return _convolve(self.command_taps, values)
 
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:
         """F_x and F_v at points (k,) of the z plane."""
@@ -59,10 +59,10 @@ class ReferencePath:
         return np.asarray(error_response, complex), np.polyval(self.command_taps[::-1], back) + 0j * back
 
 
-AS_IT_IS = ReferencePath()
+UNFILTERED = ReferencePath()
 
 
-def _convolved(taps: Real, values: npt.ArrayLike) -> Real:
+def _convolve(taps: Real, values: npt.ArrayLike) -> Real:
     """Values (…, ticks) behind taps, from rest."""
     signals = np.asarray(values, np.float64)
     return np.apply_along_axis(lambda signal: np.convolve(taps, signal)[: signal.size], -1, signals)

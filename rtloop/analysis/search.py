@@ -12,7 +12,7 @@ GROWTH = 1.1
 """Far from the model nobody asks to a quarter of a percent, and a loop that tolerates much would take minutes."""
 
 
-def reach(holds: Callable[[float], bool], largest: float, step: float, tolerance: float) -> float:
+def find_limit(holds: Callable[[float], bool], largest: float, step: float, tolerance: float) -> float:
     """The smallest value in (0, `largest`] at which `holds` fails: stepwise outwards, then by bisection.
 
     `largest` where it holds throughout. `holds` is taken to be true at 0. The first step is `step`, each further one a

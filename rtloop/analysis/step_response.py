@@ -16,7 +16,7 @@ from rtloop.analysis.closed_loop import Loop
 from rtloop.hil.modal import Real
 
 SETTLING_BAND = 0.05
-COUNT = 1 << 16
+SAMPLE_COUNT = 1 << 16
 """Samples of a response; the first 1/64 of continuous time is sampled 64 times as densely once more."""
 
 
@@ -49,9 +49,12 @@ class StepMetrics(NamedTuple):
 def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
     """Until the slowest closed-loop pole has died away, or for `duration_s`."""
     if loop.period_s is not None:
-        return _sampled(loop, loop.period_s, duration_s)
-    duration_s = duration_s or _duration(loop)
-    fine, coarse = _continuous(loop, duration_s / COUNT / 64), _continuous(loop, duration_s / COUNT)
+        return _discrete_response(loop, loop.period_s, duration_s)
+    duration_s = duration_s or _response_duration_s(loop)
+    fine, coarse = (
+        _continuous_response(loop, duration_s / SAMPLE_COUNT / 64),
+        _continuous_response(loop, duration_s / SAMPLE_COUNT),
+    )
     is_later = coarse.time_s > fine.time_s[-1]
     return StepResponse(*(np.concatenate([early, late[is_later]]) for early, late in zip(fine, coarse, strict=True)))
 
@@ -61,18 +64,18 @@ def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
     if not loop.is_stable:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
-    final, command = loop.final
+    final, command = loop.final_values
     follows = abs(1 - final) <= SETTLING_BAND
     return StepMetrics(
-        _settling(response, final) if follows else math.nan,
+        _settling_time_s(response, final) if follows else math.nan,
         100 * max(0.0, float(np.max(response.position / final)) - 1) if follows else math.nan,
         100 * abs(1 - final),
         float(np.max(np.abs(response.command), initial=abs(command))),
-        tuple(position_at(loop, t) for t in times_s),
+        tuple(position_after_step(loop, t) for t in times_s),
     )
 
 
-def position_at(loop: Loop, time_s: float) -> float:
+def position_after_step(loop: Loop, time_s: float) -> float:
     """x at one time after a unit step; of a discrete loop at the last point of its response before it."""
     if loop.period_s is None:
         a, b, c, _ = loop.matrices
@@ -83,7 +86,7 @@ def position_at(loop: Loop, time_s: float) -> float:
     return float(response.position[np.flatnonzero(response.time_s <= time_s + 1e-9 * loop.period_s)[-1]])
 
 
-def _settling(response: StepResponse, final: float) -> float:
+def _settling_time_s(response: StepResponse, final: float) -> float:
     """Where the response enters the band of ±5 % for the last time, between samples by a straight line."""
     excess = np.abs(response.position - final) - SETTLING_BAND * abs(final)
     last = np.flatnonzero(excess > 0)
@@ -96,42 +99,42 @@ def _settling(response: StepResponse, final: float) -> float:
     return float(response.time_s[i] + part * (response.time_s[i + 1] - response.time_s[i]))
 
 
-def _continuous(loop: Loop, interval_s: float) -> StepResponse:
+def _continuous_response(loop: Loop, interval_s: float) -> StepResponse:
     """COUNT samples from rest."""
     a, b, c, d = loop.matrices
     joint = np.zeros((b.size + 1, b.size + 1))
     joint[:-1, :-1], joint[:-1, -1] = a, b
-    states = _doubled(np.asarray(expm(joint * interval_s), dtype=float), COUNT)
+    states = _state_sequence(np.asarray(expm(joint * interval_s), dtype=float), SAMPLE_COUNT)
     position, command = c @ states + d[:, None]
-    return StepResponse(interval_s * np.arange(COUNT, dtype=float), position, command)
+    return StepResponse(interval_s * np.arange(SAMPLE_COUNT, dtype=float), position, command)
 
 
-def _sampled(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
+def _discrete_response(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
     """From rest: what a step toward the error and one toward the command do, each behind what the reference passes."""
     a, b, c, d = loop.matrices
     reference, (rows, direct), injection = loop.reference, loop.positions, loop.injection
-    duration_s = duration_s or _duration(loop) + reference.ticks * period_s
-    count = min(math.ceil(duration_s / period_s) + 1, COUNT)
-    states = _stepped(a, b, count)
-    position = reference.toward_error(rows @ states + direct[:, None])
-    command = reference.toward_error(c[1] @ states + d[1])
-    if reference.commands:
-        states = _stepped(a, injection.b, count)
-        position += reference.toward_command(rows @ states + injection.between[:, None])
-        command += reference.toward_command(c[1] @ states + 1.0)
+    duration_s = duration_s or _response_duration_s(loop) + reference.settling_ticks * period_s
+    count = min(math.ceil(duration_s / period_s) + 1, SAMPLE_COUNT)
+    states = _unit_step_states(a, b, count)
+    position = reference.error_input(rows @ states + direct[:, None])
+    command = reference.error_input(c[1] @ states + d[1])
+    if reference.has_command_path:
+        states = _unit_step_states(a, injection.b, count)
+        position += reference.command_input(rows @ states + injection.between[:, None])
+        command += reference.command_input(c[1] @ states + 1.0)
     points = rows.shape[0]
     time_s = period_s / points * np.arange(count * points, dtype=float)
     return StepResponse(time_s, position.T.ravel(), np.repeat(command, points))
 
 
-def _stepped(a: Real, b: Real, count: int) -> Real:
+def _unit_step_states(a: Real, b: Real, count: int) -> Real:
     """States (n, count) of a discrete system from rest whose input is 1."""
     joint = np.eye(b.size + 1)
     joint[:-1, :-1], joint[:-1, -1] = a, b
-    return _doubled(joint, count)
+    return _state_sequence(joint, count)
 
 
-def _doubled(power: Real, count: int) -> Real:
+def _state_sequence(power: Real, count: int) -> Real:
     """Powers of a matrix on its last unit vector, (n − 1, count), the last row of 1 left out: in blocks that double."""
     states = np.eye(power.shape[0])[:, -1:]
     while states.shape[1] < count:
@@ -140,7 +143,7 @@ def _doubled(power: Real, count: int) -> Real:
     return states[:-1, :count]
 
 
-def _duration(loop: Loop) -> float:
+def _response_duration_s(loop: Loop) -> float:
     """Ten time constants of the slowest closed-loop pole; 1 s where none is defined."""
     slowest = float(np.min(np.abs(loop.rates.real), initial=math.inf))
     return 10 / slowest if 0 < slowest < math.inf else 1.0

@@ -55,7 +55,7 @@ def import_command(
     other commands look for; the first word is the axis.
     """
     from rtloop.commands.importing import Shown, import_file
-    from rtloop.interchange.wanted import Wanted, wanted_by
+    from rtloop.interchange.wanted import ColumnSelection, extend_selection
     from rtloop.terminal.interchange import print_import, print_listing
     from rtloop.terminal.progress import Counter
 
@@ -63,7 +63,10 @@ def import_command(
         raise click.UsageError("--out and --json are for one FILE")
     if time is not None and rate_hz is not None:
         raise click.UsageError("--time and --rate: one of them is allowed")
-    given, code = wanted_by(maps, Wanted(everything=everything, time=time, rate_hz=rate_hz, group=group)), 0
+    given, code = (
+        extend_selection(maps, ColumnSelection(everything=everything, time=time, rate_hz=rate_hz, group=group)),
+        0,
+    )
     for file in files:
         with Counter("ticks imported", sys.stderr) as counter:
             report = import_file(file, given, mapping, out, counter.show)

@@ -50,9 +50,9 @@ def require_text(file: Path) -> None:
 def _with_lines(error: Any) -> str:
     """The faults of a configuration with the lines of its file."""
     from rtloop.configuration.toml_lines import numbered
-    from rtloop.errors import listed
+    from rtloop.errors import fault_list
 
-    return listed(error.source, numbered(error.faults, error.source))
+    return fault_list(error.source, numbered(error.faults, error.source))
 
 
 class UnreadableInput(click.ClickException):

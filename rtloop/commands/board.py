@@ -16,7 +16,7 @@ from rtloop.engine.realtime import prepare_realtime
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.hil.board import serve
 from rtloop.service.notify import Notifier
-from rtloop.values import counted
+from rtloop.values import count_text
 
 BOARD_PRIORITY = 85
 
@@ -33,7 +33,9 @@ def serve_board(config: Path) -> int:
     axes = _axes_by_output(configuration)
     stopped = _stop_signals()
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
-    click.echo(f"board at {options.file}: {counted(len(axes), 'channel')} at {rate_hz:g} Hz; Ctrl-C ends it", err=True)
+    click.echo(
+        f"board at {options.file}: {count_text(len(axes), 'channel')} at {rate_hz:g} Hz; Ctrl-C ends it", err=True
+    )
     try:
         ready = lambda: Notifier().send(READY=1)
         samples = serve(Path(options.file), options, axes, rate_hz, stopped, ready)
@@ -59,14 +61,14 @@ def serve_node(config: Path) -> int:
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def ready() -> None:
-        click.echo(f"node on {options.place}: {counted(len(axes), 'channel')}; Ctrl-C ends it", err=True)
+        click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends it", err=True)
         Notifier().send(READY=1)
 
     try:
         did = serve_can(options, axes, stopped, ready)
     except ValueError as error:
         raise ConfigError(str(config), [f"driver.{error}"]) from None
-    click.echo(f"node on {options.place}: {did}", err=True)
+    click.echo(f"node on {options.label}: {did}", err=True)
     return 0
 
 

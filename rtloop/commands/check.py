@@ -12,19 +12,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from rtloop.analysis.loop_analysis import LoopAnalysis
-from rtloop.analysis.perturbation import Range, changes, maker, until_unstable
+from rtloop.analysis.perturbation import PercentRange, loop_builder, plant_changes, stability_range
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.checks import AxisCheck, Together
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import Prepared, prepare
-from rtloop.design.verification.text import answer, span, together
+from rtloop.design.verification.text import answer, format_range, together
 from rtloop.design.verification.verify import Verification
 from rtloop.errors import ConfigError
 from rtloop.supervision.host_delay import SpentMargin, measured_delay, spent_margin
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.table import console as _console
 from rtloop.terminal.table import figure
-from rtloop.values import counted
+from rtloop.values import count_text
 
 ROWS = (
     ("stable", lambda loop: "yes" if loop.stable else "NO"),
@@ -55,7 +55,7 @@ def check_configuration(config: Path, strict: bool, as_json: bool) -> int:
     console = _console()
     plan, facts = prepared.plan, prepared.facts
     console.print(
-        f"[bold]{escape(plan.name)}[/]: {counted(len(plan.axes), 'axis', 'axes')} at {plan.pacing.rate_hz:g} Hz, "
+        f"[bold]{escape(plan.name)}[/]: {count_text(len(plan.axes), 'axis', 'axes')} at {plan.pacing.rate_hz:g} Hz, "
         f"mode {plan.mode.name.lower()}, driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
     )
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
@@ -90,7 +90,7 @@ def _judged(prepared: Prepared, check: AxisCheck) -> Verification | None:
     return verified(prepared.configuration, check, None)[0]
 
 
-def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) -> None:
+def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, PercentRange]) -> None:
     if check.law is None:
         console.print("no controller: feedforward, raw and off only")
         return
@@ -112,7 +112,7 @@ def _print_axis(console: Console, check: AxisCheck, shifts: dict[str, Range]) ->
     for label, show in ROWS:
         table.add_row(label, *(show(one) for _, one in found.values() if one is not None))
     if shifts:
-        table.add_row("resonance may move by", *(span(shifts[key]) for key, _ in found.values()))
+        table.add_row("resonance may move by", *(format_range(shifts[key]) for key, _ in found.values()))
     console.print(table)
     if check.together is not None and check.together.margins is not None and check.together.place == 0:
         heading = f"{' and '.join(check.together.axes)} together"
@@ -130,24 +130,24 @@ def _described_together(found: Together) -> str:
     return f"law {found.law.kind!r} of axes {', '.join(found.axes)}{order}"
 
 
-def _shifts(check: AxisCheck) -> dict[str, Range]:
+def _shifts(check: AxisCheck) -> dict[str, PercentRange]:
     """Shift of the model's resonance that the loop survives."""
     if check.plant is None or check.on_model is None:
         return {}
-    resonance = changes(check.plant).get("resonance")
+    resonance = plant_changes(check.plant).get("resonance")
     if resonance is None:
         return {}
-    runs = until_unstable(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
+    runs = stability_range(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
     running = {"running": runs}
     if check.controller is None:
         return running
-    return {"continuous": until_unstable(maker(check.controller), check.plant, resonance), **running}
+    return {"continuous": stability_range(loop_builder(check.controller), check.plant, resonance), **running}
 
 
 def _report(
     prepared: Prepared,
     warnings: list[str],
-    shifts: dict[str, dict[str, Range]],
+    shifts: dict[str, dict[str, PercentRange]],
     judged: dict[str, Verification | None],
     spent: dict[str, SpentMargin | None],
 ) -> dict[str, Any]:
@@ -167,7 +167,7 @@ def _report(
                 "continuous": _analysis(check.continuous),
                 "running": _analysis(check.running),
                 "together": check.together and _together(check.together),
-                "missed": None if (found := judged[check.name]) is None else [row.label for row in found.missed],
+                "missed": None if (found := judged[check.name]) is None else [row.label for row in found.missed_rows],
                 "resonance_shift_tolerated_percent": {name: list(value) for name, value in shifts[check.name].items()},
             }
             for check in prepared.checks

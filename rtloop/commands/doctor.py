@@ -16,13 +16,13 @@ from rtloop.doctor.remedy import Write, apply
 from rtloop.doctor.software import versions
 from rtloop.doctor.verdict import AxisDelay, axis_delays, reasons
 from rtloop.engine.plan import Pacing
-from rtloop.recording.views.histogram import Histogram
+from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.supervision.host_delay import note_host_delay
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.run import bars
 from rtloop.terminal.table import console, table
-from rtloop.values import plain
+from rtloop.values import to_jsonable
 
 MARKS = {True: "[green]good[/]", False: "[red]BAD[/]", None: "[dim]?[/]"}
 DEFAULT_RATE_HZ = 10_000.0
@@ -110,9 +110,9 @@ def _print_latency(latency: Latency) -> None:
 
 
 def _classes(latency: Latency) -> list[dict[str, Any]]:
-    histogram = Histogram()
+    histogram = TimeHistogram()
     histogram.add(latency.lateness_us)
-    return histogram.classes()
+    return histogram.class_counts()
 
 
 def _time(us: float) -> str:
@@ -121,7 +121,7 @@ def _time(us: float) -> str:
 
 def _report(examination: Examination, delays: list[AxisDelay], found: list[str], writes: list[Write]) -> dict[str, Any]:
     latency = examination.latency
-    return plain(
+    return to_jsonable(
         {
             "suitable": not found,
             "reasons": found,

@@ -11,12 +11,12 @@ import numpy as np
 
 from rtloop.configuration.file import load as load_configuration
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
-from rtloop.design.identification.dynamics.identify_delay import delayed
+from rtloop.design.identification.dynamics.identify_delay import delay_input
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion
-from rtloop.design.identification.dynamics.identify_in_loop import identified_dynamics
+from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
 from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
-from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, recorded_loop
-from rtloop.design.identification.frequency_response import agreement, measured_response
+from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, find_closed_loop
+from rtloop.design.identification.frequency_response import compare_responses, recording_response
 from rtloop.design.identification.hysteresis.from_rest import begins_at_rest
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import (
@@ -25,25 +25,25 @@ from rtloop.design.identification.hysteresis.identify_hysteresis import (
     identify_hysteresis,
     unexplained_um,
 )
-from rtloop.design.identification.hysteresis.judgement import Judgement, judged_from_rest, together
+from rtloop.design.identification.hysteresis.judgement import Judgement, combine_errors, evaluate_from_rest
 from rtloop.design.identification.hysteresis.thresholds import Placement
 from rtloop.design.identification.identified import (
     dynamics_provenance,
-    feedforward_of,
     feedforward_section,
     hysteresis_provenance,
     model_section,
+    parse_feedforward,
     read_feedforward,
-    with_gain,
-    write_new,
+    scale_hysteresis,
+    write_new_file,
 )
-from rtloop.design.identification.measured import Measured, UnsuitableData, distinct, measured
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData, distinct, read_axis_recording
 from rtloop.errors import ConfigError
 from rtloop.hil.modal import Real
-from rtloop.hysteresis.compensation import compensated, residual_operator
+from rtloop.hysteresis.compensation import compensated_output, residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.play_model import PlayModel
-from rtloop.values import fields_of, plain
+from rtloop.values import dataclass_fields, to_jsonable
 
 Input = Literal["hysteresis", "command", "drive"]
 Memory = Literal["auto", "rest", "unknown"]
@@ -70,21 +70,21 @@ def hysteresis_report(
     try:
         if known:
             fit = identify_hysteresis(runs, count, placement, thresholds_v, weights)
-            judged = judged_from_rest(runs, fit, others)
+            judged = evaluate_from_rest(runs, fit, others)
             more: dict[str, Any] = {"unexplained_um": unexplained_um(runs, fit)}
         else:
             found = identify_from_parts(runs, count, placement, thresholds_v, weights, others)
-            fit, judged, more = found.shape, (found.judgements, found.others), _chosen(found)
+            fit, judged, more = found.hysteresis, (found.judgements, found.other_judgements), _chosen(found)
     except ValueError as fault:
         raise ConfigError("identify hysteresis", [str(fault)]) from None
     rows = [_judged(one, fitted) for fitted, group in zip((True, False), judged, strict=True) for one in group]
     if out is not None:
-        write_new(out, feedforward_section(fit.model, [*hysteresis_provenance(fit, runs), *_held_out(rows, more)]))
+        write_new_file(out, feedforward_section(fit.model, [*hysteresis_provenance(fit, runs), *_held_out(rows, more)]))
     if plot is not None:
         from rtloop.design.identification.plots import plot_hysteresis
 
         plot_hysteresis(fit, [*judged[0], *judged[1]], plot)
-    return plain(
+    return to_jsonable(
         _hysteresis(runs, fit)
         | {"unexplained_um": None}
         | more
@@ -92,23 +92,25 @@ def hysteresis_report(
     )
 
 
-def _distinct_runs(paths: Sequence[Path], axis: str | None, others: Sequence[Measured] = ()) -> list[Measured]:
+def _distinct_runs(
+    paths: Sequence[Path], axis: str | None, others: Sequence[AxisRecording] = ()
+) -> list[AxisRecording]:
     """Read the recordings; copies are left out, and named on stderr. Raises RtloopError."""
-    runs, sentences = distinct([measured(path, axis) for path in paths], others)
+    runs, sentences = distinct([read_axis_recording(path, axis) for path in paths], others)
     for sentence in sentences:
         click.echo(f"warning: {sentence}", err=True)
     return runs
 
 
-def _hysteresis(runs: Sequence[Measured], fit: HysteresisFit) -> dict[str, Any]:
+def _hysteresis(runs: Sequence[AxisRecording], fit: HysteresisFit) -> dict[str, Any]:
     return (
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs]}
-        | fields_of(fit)
+        | dataclass_fields(fit)
         | {
             "max_error_percent": 100 * fit.max_error_um / fit.range_um,
             "measured_h_percent": fit.measured_loop.percent,
             "model_h_percent": fit.model_loop.percent,
-            "invertible": fit.invertible,
+            "invertible": fit.is_invertible,
         }
     )
 
@@ -116,20 +118,21 @@ def _hysteresis(runs: Sequence[Measured], fit: HysteresisFit) -> dict[str, Any]:
 def _chosen(found: PartsFit) -> dict[str, Any]:
     return {
         "terms": found.terms,
-        "tried_um": dict(found.tried),
+        "tried_um": dict(found.trial_errors_um),
         "stroke_v": found.stroke_v,
-        "missing": found.missing,
+        "missing": found.missing_drive,
     } | {"creep_um": found.creep_um if "creep" in found.terms else 0.0}
 
 
 def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
     """A row of the report."""
     return {
-        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "as_written_rms_um": one.as_written_rms_um,
+        "recording": one.name, "fitted": fitted, "rms_error_um": one.rms_um, "as_written_rms_um": one.written_rms_um,
         "max_error_um": one.max_um,
         "max_error_percent": 100 * one.max_um / one.range_um, "range_um": one.range_um, "offset_um": one.offset_um,
-        "drift_um": one.drift_um, "memory": "rest" if one.from_rest else "unknown", "known_from_s": one.known_from_s,
-        "unsettled": one.unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.judged_part,
+        "drift_um": one.drift_um, "memory": "rest" if one.starts_from_rest else "unknown",
+        "known_from_s": one.known_from_s,
+        "unsettled": one.is_unsettled, "unsettled_um": one.unsettled_um, "judged_percent": 100 * one.judged_share,
         "early_max_error_percent": 100 * one.early_max_um / one.range_um,
     }  # fmt: skip
 
@@ -137,8 +140,8 @@ def _judged(one: Judgement, fitted: bool) -> dict[str, Any]:
 def _all(judged: Sequence[Judgement]) -> dict[str, Any]:
     """Of all recordings together, with standard errors."""
     return {
-        "error": together([one.rms_um for one in judged])._asdict(),
-        "as_written": together([one.as_written_rms_um for one in judged])._asdict(),
+        "error": combine_errors([one.rms_um for one in judged])._asdict(),
+        "as_written": combine_errors([one.written_rms_um for one in judged])._asdict(),
     }
 
 
@@ -158,7 +161,7 @@ def _held_out(rows: Sequence[dict[str, Any]], more: dict[str, Any]) -> list[str]
     return lines
 
 
-def excitation(run: Measured, how: Input, feedforward: PlayModel | None, loop: RecordedLoop | None) -> Excitation:
+def excitation(run: AxisRecording, how: Input, feedforward: PlayModel | None, loop: RecordedLoop | None) -> Excitation:
     """The input to D and its output. `feedforward` is the actuator's model, needed for "hysteresis".
 
     Of a `loop` that was closed, the stretch and what moved it.
@@ -201,30 +204,32 @@ def dynamics_report(
 ) -> dict[str, Any]:
     """Identify from the first recording, judge with the others, write what was asked for. Raises RtloopError."""
     runs = _distinct_runs(paths, axis)
-    loops = [recorded_loop(Path(run.name), axis, state, outside) for run in runs]
+    loops = [find_closed_loop(Path(run.name), axis, state, outside) for run in runs]
     actuator = _actuator(runs[0], hysteresis, axis) if how == "hysteresis" else None
     inputs = [excitation(run, how, actuator, loop) for run, loop in zip(runs, loops, strict=True)]
     try:
-        fit = identified_dynamics(inputs[0], order, largest_order, criterion, inputs[1:], delay_ticks)
+        fit = identify_recorded_dynamics(inputs[0], order, largest_order, criterion, inputs[1:], delay_ticks)
     except ValueError as fault:
         raise ConfigError("identify dynamics", [str(fault)]) from None
     found, compared = None, None
     if compare is not None:
-        loop = recorded_loop(compare, axis, state, outside)
-        found = measured_response(delayed(excitation(measured(compare, axis), how, actuator, loop), fit.delay_ticks))
-        compared = agreement(fit.model, found)
+        loop = find_closed_loop(compare, axis, state, outside)
+        found = recording_response(
+            delay_input(excitation(read_axis_recording(compare, axis), how, actuator, loop), fit.delay_ticks)
+        )
+        compared = compare_responses(fit.model, found)
     if out is not None:
-        write_new(out, _sections(fit, runs[0], how, actuator))
+        write_new_file(out, _sections(fit, runs[0], how, actuator))
     if plot is not None:
         from rtloop.design.identification.plots import plot_dynamics
 
-        plot_dynamics(fit, delayed(inputs[0], fit.delay_ticks), found, plot)
-    tests = {"white": fit.tests.white, "independent": fit.tests.independent}
-    return plain(
+        plot_dynamics(fit, delay_input(inputs[0], fit.delay_ticks), found, plot)
+    tests = {"white": fit.tests.is_white, "independent": fit.tests.is_independent}
+    return to_jsonable(
         {"recordings": [run.name for run in runs], "digests": [run.digest for run in runs], "input": how}
         | {"loop": loops[0] and {"from_tick": loops[0].start, "to_tick": loops[0].end, "outside": loops[0].names}}
-        | {key: value for key, value in fields_of(fit).items() if key != "model"}
-        | {"order": fit.model.order, "tests": fields_of(fit.tests) | tests}
+        | {key: value for key, value in dataclass_fields(fit).items() if key != "model"}
+        | {"order": fit.model.order, "tests": dataclass_fields(fit.tests) | tests}
         | {"frequency_response": compared, "output": out, "plot": plot}
     )
 
@@ -262,7 +267,7 @@ def compensation_report(
         from rtloop.design.identification.plots import plot_compensation
 
         plot_compensation(residual, actuator, inverse, plot)
-    return plain(
+    return to_jsonable(
         {
             "config": config,
             "identified": identified,
@@ -278,7 +283,7 @@ def compensation_report(
     )
 
 
-def _actuator(run: Measured, hysteresis: Path | None, axis: str | None) -> PlayModel:
+def _actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None) -> PlayModel:
     """From the file given, else from the configuration that the recording was made with. Raises UnsuitableData."""
     if hysteresis is not None:
         return read_feedforward(hysteresis, axis).actuator()
@@ -287,16 +292,16 @@ def _actuator(run: Measured, hysteresis: Path | None, axis: str | None) -> PlayM
             f"{run.name}: it was imported, and says nothing of hysteresis: --hysteresis names a file that does, "
             "--input drive takes the drive as it is"
         )
-    return feedforward_of(run.configuration, f"{run.name}: configuration", axis).actuator()
+    return parse_feedforward(run.configuration, f"{run.name}: configuration", axis).actuator()
 
 
-def _sections(fit: DynamicsFit, run: Measured, how: Input, actuator: PlayModel | None) -> str:
+def _sections(fit: DynamicsFit, run: AxisRecording, how: Input, actuator: PlayModel | None) -> str:
     content = model_section(fit, dynamics_provenance(fit, run, how))
     if actuator is None:
         return content
     comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below put into it"]
-    return feedforward_section(with_gain(actuator, fit.static_gain), comments) + "\n" + content
+    return feedforward_section(scale_hysteresis(actuator, fit.static_gain), comments) + "\n" + content
 
 
 def _largest(actuator: PlayModel, inverse: PlayModel, command: Real, gain: float) -> float:
-    return float(np.abs(compensated(actuator, inverse, command) - gain * command).max())
+    return float(np.abs(compensated_output(actuator, inverse, command) - gain * command).max())

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.interchange.aside import read_table
-from rtloop.interchange.importing import import_data, listing
-from rtloop.interchange.sampling import came_from_a_recording
-from rtloop.interchange.wanted import Wanted, mapping_beside, read_mapping
+from rtloop.interchange.importing import import_data, list_columns
+from rtloop.interchange.sampling import is_from_recording
+from rtloop.interchange.wanted import ColumnSelection, find_mapping, read_mapping
 
 
 class Shown(dict[str, Any]):
@@ -18,22 +18,22 @@ class Shown(dict[str, Any]):
 
 
 def import_file(
-    file: Path, given: Wanted, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
+    file: Path, given: ColumnSelection, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
 ) -> dict[str, Any]:
     """What was written, by options and mapping, of which options go first; or else what is in the file, `Shown`.
 
     Raises what reading and writing do, and ConfigError for a mapping that is wrong.
     """
-    beside = mapping or (None if given else mapping_beside(file))
+    beside = mapping or (None if given else find_mapping(file))
     wanted = given if beside is None else _both(given, read_mapping(beside))
     table = read_table(file, wanted.group)
-    if not wanted and not came_from_a_recording(table):
-        return Shown(listing(file, table, wanted))
+    if not wanted and not is_from_recording(table):
+        return Shown(list_columns(file, table, wanted))
     report = import_data(file, wanted, output, table=table, progress=progress)
     return report | {"mapping": None if beside is None else str(beside)}
 
 
-def _both(given: Wanted, kept: Wanted) -> Wanted:
+def _both(given: ColumnSelection, kept: ColumnSelection) -> ColumnSelection:
     """What a mapping's file says, but for what is given."""
     by_hand = given.time is not None or given.rate_hz is not None
     return replace(

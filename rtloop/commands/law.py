@@ -7,10 +7,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import ConfigError, OutputError, writing
+from rtloop.errors import ConfigError, OutputError, output_errors
 from rtloop.hil.trusted import make_file
-from rtloop.laws.limited.first import try_first
-from rtloop.laws.registry import BUILT_IN, kinds, law_class, reference
+from rtloop.laws.limited.first import try_limited
+from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class
 
 LAW = '''"""{title}: what it does, and where its equation is from.
 
@@ -108,8 +108,8 @@ def known_laws() -> list[dict[str, Any]]:
         }
         try:
             if kind not in BUILT_IN:
-                try_first(f"law {kind!r}", reference, kind)
-            law = law_class(reference(kind))
+                try_limited(f"law {kind!r}", find_law, kind)
+            law = law_class(find_law(kind))
             about = next(iter((law.__doc__ or "").strip().splitlines()), None)
             entry |= {"slot": law.records().slot, "about": about}
         except ValueError as error:
@@ -128,7 +128,7 @@ def new_law(name: str, folder: Path) -> list[Path]:
     for path in paths:
         if os.path.lexists(path):
             raise OutputError(f"{path}: is there already; it is not overwritten", errno.EEXIST)
-    with writing(folder):
+    with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in zip(paths, texts.values(), strict=True):
             with os.fdopen(make_file(path), "w", encoding="utf-8") as file:

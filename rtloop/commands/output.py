@@ -7,13 +7,13 @@ from pathlib import Path
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.errors import writing
+from rtloop.errors import output_errors
 from rtloop.hil.trusted import overwrite_file
 
 
 def write_over(path: Path, content: bytes) -> None:
     """Write a file, and its folder where there is none. Raises OutputError."""
-    with writing(path):
+    with output_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with os.fdopen(overwrite_file(path), "wb") as file:
             file.write(content)

@@ -17,12 +17,12 @@ from rtloop.configuration.text_files import read_text
 from rtloop.drivers.base import Driver
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
-from rtloop.laws.limited.first import try_first
+from rtloop.laws.limited.first import try_limited
 from rtloop.laws.registry import laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
-from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws, require_law
-from rtloop.recording.replay.whatif import Law, other_law, recorded_law, resimulate
+from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws, require_law
+from rtloop.recording.replay.whatif import LawWithCoefficients, compare_law, recorded_law, resimulate
 
 Progress = Callable[[int], None]
 
@@ -31,11 +31,11 @@ def replay_with_other_law(files: Sequence[Path], other: Path, progress: Progress
     """Differences between the recorded outputs and those of another configuration's law on the recorded inputs."""
     recording = _opened(files)
     law = _law(config.load(other), recording)
-    return {**_about(recording, other), **other_law(recording, law, progress)}
+    return {**_about(recording, other), **compare_law(recording, law, progress)}
 
 
 def replay_on_the_rig(
-    files: Sequence[Path], other: Path | None, progress: Progress | None = None, trust: Trust = NOTHING
+    files: Sequence[Path], other: Path | None, progress: Progress | None = None, trust: TrustedLaws = NO_TRUST
 ) -> dict[str, Any]:
     """The recorded reference through a law on a simulated rig: those of `other`, or the recorded ones."""
     recording = _opened(files)
@@ -51,19 +51,19 @@ def replay_on_the_rig(
     return {**_about(recording, other), **resimulate(recording, law, driver, progress)}
 
 
-def trust_in(files: Sequence[Path], recorded: bool) -> Trust:
+def trust_in(files: Sequence[Path], recorded: bool) -> TrustedLaws:
     """What a replay may run: the laws in these files, and those in the recording itself.
 
     Raises RecordingError, and ConfigError for a law that does not come to an end, or ends the process.
     """
     texts = {str(path): read_text(path) for path in files}
     for file, text in texts.items():
-        try_first(file, laws_in, text, file)
+        try_limited(file, laws_in, text, file)
     try:
         laws = [law for file, text in texts.items() for law in laws_in(text, file)]
     except ValueError as error:
         raise RecordingError(str(error)) from None
-    return Trust(tuple(laws), recorded)
+    return TrustedLaws(tuple(laws), recorded)
 
 
 def _opened(files: Sequence[Path]) -> Recording:
@@ -72,7 +72,7 @@ def _opened(files: Sequence[Path]) -> Recording:
     return recording
 
 
-def _recorded_library(recording: Recording, trust: Trust) -> Library:
+def _recorded_library(recording: Recording, trust: TrustedLaws) -> Library:
     """The recorded laws under the file names that the recorded configuration has. Raises RecordingError."""
     laws = recorded_laws(recording, trust)
     files = {law["name"]: str(law["file"]) for law in recording.header["law"].get("laws", ()) if "file" in law}
@@ -84,7 +84,7 @@ def _about(recording: Recording, other: Path | None) -> dict[str, Any]:
     return {"recording": str(recording.paths[0]), "config": None if other is None else str(other)}
 
 
-def _law(configuration: Configuration, recording: Recording) -> Law:
+def _law(configuration: Configuration, recording: Recording) -> LawWithCoefficients:
     """The law of a configuration for the recording's axes and rate. Raises ConfigError."""
     header, faults = recording.header, []
     names = [axis.name for axis in configuration.axes]
@@ -95,7 +95,7 @@ def _law(configuration: Configuration, recording: Recording) -> Law:
     if faults:
         raise ConfigError(configuration.source, faults)
     plan = prepare(changed(configuration, schedule=())).plan
-    return Law(plan.laws, plan.coefficients.view(np.recarray))
+    return LawWithCoefficients(plan.laws, plan.coefficients.view(np.recarray))
 
 
 def _rig(configuration: Configuration, recording: Recording) -> Driver:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtloop.design.identification.identified import write_new
+from rtloop.design.identification.identified import write_new_file
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.identification.plot_response import plot_response
 from rtloop.design.identification.recorded_response import recorded_measurement
@@ -38,7 +38,7 @@ def _show(content: dict[str, Any], resonance_only: bool, out: Path | None, plot:
     if resonance_only and content["resonance"] is None:
         raise UnsuitableData("no light mode stands out in the band; --near-hz says where one is expected")
     if out is not None:
-        write_new(out, json.dumps(content) + "\n")
+        write_new_file(out, json.dumps(content) + "\n")
     if plot is not None:
         plot_response(content, plot)
     if as_json:

@@ -14,7 +14,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.errors import LoopFault, RtloopError
 from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.hil.trusted import open_own
-from rtloop.recording.file.recover import leftovers, recover
+from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.recording.views.summary import Summary, summarise
 from rtloop.supervision.interruption import Interruption
 from rtloop.supervision.naming import recording_path
@@ -22,7 +22,7 @@ from rtloop.supervision.supervisor import Processes, RunResult, Supervisor
 from rtloop.terminal.machine import echo_json
 from rtloop.terminal.progress import Counter
 from rtloop.terminal.run import RunView, print_run
-from rtloop.values import counted
+from rtloop.values import count_text
 
 
 def run_configuration(
@@ -87,7 +87,7 @@ def _for_json(
 
 def recover_leftovers(folder: Path) -> None:
     """Complete what killed runs left in `folder`, and say so; what cannot be is said too and stays."""
-    for part in leftovers(folder):
+    for part in find_leftovers(folder):
         try:
             with Counter("ticks recovered", sys.stderr) as counter:
                 report = recover(part, progress=counter.show, opener=open_own)
@@ -95,7 +95,7 @@ def recover_leftovers(folder: Path) -> None:
             click.echo(f"warning: {error}", err=True)
             continue
         click.echo(
-            f"{report['output']}: {counted(report['ticks'], 'tick')} recovered from {part.name}, which is kept",
+            f"{report['output']}: {count_text(report['ticks'], 'tick')} recovered from {part.name}, which is kept",
             err=True,
         )
         for problem in report["problems"]:

@@ -22,7 +22,7 @@ from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOption
 from rtloop.configuration.file import Configuration, ModeName, load
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.doctor.loopback import Pair, measure
-from rtloop.drivers.base import Channel, index_of
+from rtloop.drivers.base import Channel, channel_index
 from rtloop.errors import LoopFault
 from rtloop.recording.load import Recording
 from rtloop.recording.load import load as load_recording
@@ -81,7 +81,7 @@ def _staircase(
     configuration: Configuration, axis: AxisOptions, outputs: tuple[Channel, ...], amplitude_v: float
 ) -> AxisOptions:
     """The axis without its controller, asking for steps about the safe value, and no further."""
-    output = outputs[index_of(outputs, configuration.channels[axis.name].output)]
+    output = outputs[channel_index(outputs, configuration.channels[axis.name].output)]
     lowest = max(output.safe_v - amplitude_v, output.minimum_v, axis.limits.lowest_v)
     highest = min(output.safe_v + amplitude_v, output.maximum_v, axis.limits.drive_v)
     slew = min(axis.limits.slew_v_per_s or math.inf, axis.limits.trip_slew_v_per_s)

@@ -19,7 +19,7 @@ def main() -> int:
 
     rehearse()
     _rehearse_others()
-    for path in stored.set_aside_files(CACHE_FOLDER):
+    for path in stored.quarantined_files(CACHE_FOLDER):
         path.unlink(missing_ok=True)
     if CACHE_IS_PERSISTENT:
         caches = sorted(CACHE_FOLDER.parent.iterdir(), key=lambda folder: folder.stat().st_mtime, reverse=True)

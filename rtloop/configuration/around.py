@@ -6,17 +6,17 @@ from collections.abc import Sequence
 
 from rtloop.configuration.file import AroundOptions
 from rtloop.engine.memory import RING_SECONDS, Sizes, ring_ticks
-from rtloop.recording.capture.conditions import unknown_signal
-from rtloop.recording.file.around import Around
+from rtloop.recording.capture.conditions import signal_problem
+from rtloop.recording.file.around import EventWindow
 from rtloop.recording.file.topics.overview import MAX_COLUMNS
 
 MOST_BYTES = 1 << 30
 """Of the loop's ring, which is locked in memory, and of the recorder's copy of it."""
 
 
-def around_of(options: AroundOptions) -> Around:
+def around_of(options: AroundOptions) -> EventWindow:
     """As the recorder is told."""
-    return Around(options.before_s, options.after_s, options.on, options.every_s)
+    return EventWindow(options.before_s, options.after_s, options.on, options.every_s)
 
 
 def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
@@ -30,12 +30,12 @@ def around_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz
     """What is wrong with [recording] around, where records have these columns."""
     if options is None:
         return []
-    faults = [f"recording.around.on: {fault}" for text in options.on if (fault := unknown_signal(text, columns))]
+    faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]
     if len(columns) > MAX_COLUMNS:
         faults.append(f"recording.around: {len(columns)} signals; of at most {MAX_COLUMNS} an overview is kept")
     around = around_of(options)
     needed = 8 * len(columns) * (
-        ring_ticks(rate_hz * around.ring_factor(RING_SECONDS)) + round(around.behind_s * rate_hz)
+        ring_ticks(rate_hz * around.ring_factor(RING_SECONDS)) + round(around.max_delay_s * rate_hz)
     )  # fmt: skip
     if needed > MOST_BYTES:
         faults.append(

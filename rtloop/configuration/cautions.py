@@ -72,7 +72,7 @@ def tracking_problem(check: AxisCheck) -> str | None:
     """Why a stable loop does not follow its reference at rest; None where it does, or where no loop is known."""
     if check.on_model is None or not check.on_model.is_stable:
         return None
-    final, _ = check.on_model.final
+    final, _ = check.on_model.final_values
     if abs(1 - final) <= SETTLING_BAND:
         return None
     share = f"a step of 1 µm ends at {final:.3g} µm"

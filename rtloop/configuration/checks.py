@@ -10,24 +10,24 @@ from functools import cached_property
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
-from rtloop.analysis.comparison import Comparison, compare
-from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, TogetherMargins, coupling_matrix
-from rtloop.analysis.loop_analysis import LoopAnalysis, analyse
-from rtloop.analysis.margins import Margins, margins
-from rtloop.analysis.reference import AS_IT_IS, ReferencePath
+from rtloop.analysis.comparison import ControllerComparison, compare_controllers
+from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, SimultaneousMargins, coupling_matrix
+from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
+from rtloop.analysis.margins import Margins, loop_margins
+from rtloop.analysis.reference import UNFILTERED, ReferencePath
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.coefficients import controller_of
 from rtloop.configuration.extras import connect
 from rtloop.configuration.file import Configuration
 from rtloop.hil.options import RigOptions
 from rtloop.laws.contract import Controller, CoupledController
-from rtloop.laws.limited.first import must_be_limited, run_limited
+from rtloop.laws.limited.first import needs_limited_process, run_limited
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import ControllerOptions
 from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
-from rtloop.linear.together import SampledTogether
+from rtloop.linear.together import SampledCoupledSystem
 from rtloop.linear.transfer import Transfer
 
 COMPARED_PART = 0.2
@@ -57,12 +57,12 @@ class Together:
     axes: tuple[str, ...]
     place: int
     law: CoupledController
-    linear: SampledTogether | None = None
+    linear: SampledCoupledSystem | None = None
     plant: CoupledPlant | None = None
     loop: CoupledLoop | None = None
 
     @property
-    def margins(self) -> TogetherMargins | None:
+    def margins(self) -> SimultaneousMargins | None:
         """Of all its axes at once."""
         return None if self.loop is None else self.loop.margins
 
@@ -70,8 +70,8 @@ class Together:
         """The loop of this axis with other dynamics, broken alone. Raises ValueError where a part is not known."""
         if self.linear is None or self.plant is None:
             raise ValueError(f"controller: of axes {', '.join(self.axes)}: its linear part, or a model, is not known")
-        plant = self.plant.changed(self.place, dynamics, delay_ticks)
-        return CoupledLoop(self.linear, plant).alone(self.place, reference)
+        plant = self.plant.with_axis_replaced(self.place, dynamics, delay_ticks)
+        return CoupledLoop(self.linear, plant).axis_loop(self.place, reference)
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class AxisCheck:
     linear: DiscreteController | Sampled | None = None
     controller: Transfer | None = None
     discrete: DiscreteController | None = None
-    comparison: Comparison | None = None
+    comparison: ControllerComparison | None = None
     plant: Transfer | None = None
     delay_ticks: int = 0
-    reference: ReferencePath = AS_IT_IS
+    reference: ReferencePath = UNFILTERED
     on_paper: Loop | None = None
     on_model: Loop | None = None
     together: Together | None = None
@@ -99,19 +99,19 @@ class AxisCheck:
     @cached_property
     def continuous(self) -> LoopAnalysis | None:
         """All there is to know of the loop on paper."""
-        return None if self.on_paper is None else analyse(self.on_paper, margins(self.on_paper), 0)
+        return None if self.on_paper is None else analyse_loop(self.on_paper, loop_margins(self.on_paper), 0)
 
     @cached_property
     def running(self) -> LoopAnalysis | None:
         """All there is to know of the loop as it will run."""
         if self.on_model is None or self.margins is None:
             return None
-        return analyse(self.on_model, self.margins, self.delay_ticks)
+        return analyse_loop(self.on_model, self.margins, self.delay_ticks)
 
     @cached_property
     def margins(self) -> Margins | None:
         """Of the loop as it will run."""
-        return None if self.on_model is None else margins(self.on_model)
+        return None if self.on_model is None else loop_margins(self.on_model)
 
     @property
     def is_known(self) -> bool:
@@ -134,7 +134,7 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
 
     In the limited process where a law is somebody's own. Raises ConfigError for what its code does wrong there.
     """
-    if must_be_limited(configuration.laws):
+    if needs_limited_process(configuration.laws):
         checks, limited = run_limited(configuration.source, _checks_and_findings, configuration)
         findings.faults += limited.faults
         findings.warnings += limited.warnings
@@ -206,7 +206,7 @@ def _check(configuration: Configuration, axis: AxisOptions, findings: Findings) 
     if isinstance(law, TransferController):
         with findings.at(f"{where}: "):
             linear, transfer = law.discrete, law.options.transfer()
-            comparison = compare(transfer, linear, up_to_hz=COMPARED_PART / period_s)
+            comparison = compare_controllers(transfer, linear, up_to_hz=COMPARED_PART / period_s)
             findings.warnings += [f"{where}: {warning}" for warning in comparison.warnings]
             check = replace(check, controller=transfer, discrete=linear, comparison=comparison)
         if linear is None:
@@ -274,7 +274,7 @@ def _check_together(configuration: Configuration, number: int, findings: Finding
             loop = CoupledLoop(linear, plant)
     if loop is None or linear is None or plant is None:
         return checks
-    alone = [loop.alone(place, check.reference) for place, check in enumerate(checks)]
+    alone = [loop.axis_loop(place, check.reference) for place, check in enumerate(checks)]
     found = [
         replace(
             check,

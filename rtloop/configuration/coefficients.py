@@ -13,12 +13,12 @@ from rtloop.drivers.base import Channel
 from rtloop.engine.ramp import require_short_ramp
 from rtloop.hil.modal import Real
 from rtloop.law.layout import TAP_LANES, Records
-from rtloop.law.memory import records
-from rtloop.laws.contract import Controller, Law, record_of
+from rtloop.law.memory import new_records
+from rtloop.laws.contract import Controller, Law, build_record
 from rtloop.laws.linearise import linear_part
 from rtloop.laws.options import LawOptions
-from rtloop.laws.registry import LawReference, law_class, layout_of
-from rtloop.linear.together import SampledTogether
+from rtloop.laws.registry import LawReference, law_class, law_layout
+from rtloop.linear.together import SampledCoupledSystem
 
 
 def controller_of(axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()) -> Controller | None:
@@ -50,7 +50,7 @@ def axis_coefficients(
     Of several axes that share a `controller` it is number `place`, and the first one has its records.
     Raises ValueError for what does not fit: limits beyond the channel, a controller of too high an order.
     """
-    coefficients = records(layout_of(laws).coefficients, 1)
+    coefficients = new_records(law_layout(laws).coefficients, 1)
     feedforward = _law_of(axis.feedforward, DEFAULT_LAWS[0])(axis.feedforward, period_s, axis.model)
     fields: dict[str, object] = {"um_per_v": um_per_v, "offset_v": offset_v}
     fields |= _law("feedforward", feedforward, laws.index(axis.feedforward.law or DEFAULT_LAWS[0]))
@@ -79,7 +79,7 @@ def _resting_errors(controller: Controller) -> Real:
     except ValueError:
         return nothing
     largest = np.abs(linear.system.response(np.exp(2j * np.pi * np.geomspace(1e-3, 0.5, 200)))).max(initial=0.0)
-    if not isinstance(linear, SampledTogether):
+    if not isinstance(linear, SampledCoupledSystem):
         return nothing + 1 / linear.dc_gain if abs(linear.dc_gain) > 1e-3 * largest else nothing
     smallest = np.linalg.svd(linear.at_rest, compute_uv=False).min()
     return nothing + np.linalg.inv(linear.at_rest) if smallest > 1e-3 * largest else nothing
@@ -87,7 +87,7 @@ def _resting_errors(controller: Controller) -> Real:
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:
     """The law's number, and its coefficients as bytes."""
-    return {f"{slot}_law": number, slot: record_of(law).view(np.uint8)}
+    return {f"{slot}_law": number, slot: build_record(law).view(np.uint8)}
 
 
 def _assign(coefficients: Records, name: str, value: object) -> None:

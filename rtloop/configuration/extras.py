@@ -7,7 +7,7 @@ from typing import Any
 
 from rtloop import signals
 from rtloop.configuration.axis import AxisOptions
-from rtloop.drivers.base import Facts, Wiring, index_of
+from rtloop.drivers.base import Facts, Wiring, channel_index
 from rtloop.hil.options import Options
 from rtloop.law.extras import ExtraOutput, Extras
 from rtloop.law.layout import MAX_EXTRAS
@@ -65,7 +65,7 @@ def extras_of(
     """With the driver's channels. Raises ValueError for one that is not there, is taken, or cannot go so far."""
     for name, read in inputs.items():
         _at(f"inputs.{name}.channel", facts.inputs, read.channel)
-    columns = signals.columns(axes, facts.observed)
+    columns = signals.column_names(axes, facts.observed)
     for name in (*inputs, *outputs):
         if f"{name}_v" in columns:
             section = "inputs" if name in inputs else "outputs"
@@ -91,7 +91,7 @@ def extras_of(
 
 def _at(where: str, channels: Any, name: str) -> int:
     try:
-        return index_of(channels, name)
+        return channel_index(channels, name)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

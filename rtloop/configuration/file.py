@@ -27,9 +27,9 @@ from rtloop.errors import ConfigError
 from rtloop.hil.options import LARGEST_INTEGER, Options
 from rtloop.law.layout import MAX_LAWS
 from rtloop.laws.contract import ANY_NUMBER
-from rtloop.laws.limited.first import must_be_limited, try_first
+from rtloop.laws.limited.first import needs_limited_process, try_limited
 from rtloop.laws.registry import LawReference, law_class
-from rtloop.recording.capture.conditions import comparison_of
+from rtloop.recording.capture.conditions import parse_comparison
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]
 HIGHEST_RATE_HZ = 1e6
@@ -106,7 +106,7 @@ class AroundOptions(Options):
     def _check(self) -> Self:
         for text in self.on:
             try:
-                comparison_of(text)
+                parse_comparison(text)
             except ValueError as error:
                 raise ValueError(f"on: {text!r}: {error}") from None
         return self
@@ -199,8 +199,8 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
         raw = parse_toml(text)
     except ValueError as error:
         raise ConfigError(source, [str(error)]) from None
-    if names_own_laws(raw) if library is None else must_be_limited(library.loaded or ()):
-        try_first(source, parse, text, name, folder, source, library)
+    if names_own_laws(raw) if library is None else needs_limited_process(library.loaded or ()):
+        try_limited(source, parse, text, name, folder, source, library)
     driver = raw.pop("driver", None)
     faults: list[str] = []
     library = library or Library(folder)

@@ -13,7 +13,7 @@ from rtloop.configuration.text_files import InputFileError, read_text
 from rtloop.law.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER, Controller, CoupledController, Feedforward, Law
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
-from rtloop.laws.registry import BUILT_IN, LawReference, from_text, kinds, law_class, reference
+from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_from_text
 
 FEEDFORWARD, CONTROLLER = "prandtl_ishlinskii", "transfer"
 """Where a table names no law."""
@@ -36,7 +36,7 @@ class Library:
                 raise ValueError(f"{key}: {value!r}; a name is needed")
         path = str(self.folder / file) if file else ""
         if self.loaded is None:
-            return from_text(_text(Path(path)), path, kind) if file else reference(kind or default)
+            return law_from_text(_text(Path(path)), path, kind) if file else find_law(kind or default)
         loaded = dict.fromkeys(replace(law, axes=0) for law in self.loaded)
         wanted = [law for law in loaded if (law.file == path if file else law.kind == (kind or default))]
         wanted = [law for law in wanted if kind is None or law.kind == kind]

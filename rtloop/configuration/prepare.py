@@ -15,7 +15,7 @@ from rtloop.configuration.coefficients import axis_coefficients
 from rtloop.configuration.extras import extras_of
 from rtloop.configuration.file import Configuration, ScheduleOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
-from rtloop.drivers.base import Channel, Driver, Facts, index_of
+from rtloop.drivers.base import Channel, Driver, Facts, channel_index
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
@@ -24,9 +24,9 @@ from rtloop.errors import ConfigError
 from rtloop.law.extras import Extras
 from rtloop.law.layout import Records
 from rtloop.law.reference import GENERATOR
-from rtloop.laws.binding import functions_of
+from rtloop.laws.binding import bind_functions
 from rtloop.laws.contract import Controller
-from rtloop.laws.limited.first import must_be_limited, run_limited
+from rtloop.laws.limited.first import needs_limited_process, run_limited
 from rtloop.signals import Mode
 
 MOST_TICKS = 2**53
@@ -49,18 +49,18 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
 
     Raises ConfigError with all faults, DriverError for a missing library.
     """
-    if must_be_limited(configuration.laws):
+    if needs_limited_process(configuration.laws):
         job = partial(prepare, duration_s=duration_s, paced=paced)
         return run_limited(configuration.source, job, configuration, compiles=True)
     findings, rate_hz = Findings(), configuration.loop.rate_hz
     facts = _facts(configuration, paced, findings)
     if configuration.loop.enable_input is not None:
         with findings.at("loop.enable_input: "):
-            index_of(facts.inputs, configuration.loop.enable_input)
+            channel_index(facts.inputs, configuration.loop.enable_input)
     for law in configuration.laws:
         if law.text:  # what is shipped compiles
             with findings.at(""):
-                functions_of([law])
+                bind_functions([law])
     checks, coefficients = check_axes(configuration, findings), []
     for number, axis in enumerate(configuration.axes):
         owner = configuration.owners[number]
@@ -151,9 +151,9 @@ def _coefficients(
     channel, where = configuration.channels[axis.name], f"driver.channels.{axis.name}."
     output: Channel | None = None
     with findings.at(where + "input: "):
-        index_of(facts.inputs, channel.input)
+        channel_index(facts.inputs, channel.input)
     with findings.at(where + "output: "):
-        output = facts.outputs[index_of(facts.outputs, channel.output)]
+        output = facts.outputs[channel_index(facts.outputs, channel.output)]
     if output is None:
         return None
     with findings.at(f"axis.{axis.name}."):

@@ -18,7 +18,7 @@ from rtloop.configuration.axis import (
     TableOptions,
 )
 from rtloop.configuration.text_files import read_below, read_regular
-from rtloop.drivers.base import Channel, index_of
+from rtloop.drivers.base import Channel, channel_index
 from rtloop.engine.messages import ALL_AXES, Kind
 from rtloop.engine.plan import Plan
 from rtloop.law.reference import Generator
@@ -79,7 +79,7 @@ def generator_values(
         sweep = (options.amplitude, options.start_hz, options.end_hz, options.duration_s, options.offset)
         return Generator.CHIRP, *sweep, float(options.logarithmic)
     if isinstance(options, InputOptions):
-        return Generator.INPUT, index_of(inputs, options.channel), options.per_v, options.offset
+        return Generator.INPUT, channel_index(inputs, options.channel), options.per_v, options.offset
     _require_below_half_rate("frequency_hz", options.frequency_hz, rate_hz)
     kind = Generator.SINE if options.kind == "sine" else Generator.TRIANGLE
     return kind, options.amplitude, options.frequency_hz, options.offset, options.phase_deg / 360

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.errors import RtloopError
-from rtloop.hil.trusted import open_named, release
+from rtloop.hil.trusted import close_descriptor, open_user_file
 
 
 class InputFileError(RtloopError):
@@ -28,7 +28,7 @@ _QUOTED = re.compile(r"\([^()]*,\)|'[^']{2,}'|\"[^\"]{2,}\"")
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
     """All of a regular file. Raises OSError for another kind of file and for one that is larger."""
-    return _contents(open_named(path), limit_bytes)
+    return _contents(open_user_file(path), limit_bytes)
 
 
 def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
@@ -49,10 +49,10 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
     try:
         for part in relative.parts[:-1]:
             above, fd = fd, os.open(part, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=fd)
-            release(above)
+            close_descriptor(above)
         return _contents(os.open(relative.name, _READ | os.O_NOFOLLOW, dir_fd=fd), limit_bytes)
     finally:
-        release(fd)
+        close_descriptor(fd)
 
 
 def _contents(fd: int, limit_bytes: int) -> bytes:

@@ -26,17 +26,17 @@ from rtloop.design.identification.identified import (
     feedforward_section,
     hysteresis_provenance,
     model_values,
-    with_gain,
+    scale_hysteresis,
 )
-from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData, noise_std
 from rtloop.design.synthesis.section import controller_section
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
-from rtloop.design.toml_text import edited
+from rtloop.design.toml_text import edit_text
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.play_model import PlayModel
 
-LARGEST_ERROR, SMALL_PART = 3.0, 3e-4
+LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """A loop is not designed on a model whose prediction errs by more than so many times the noise, or times this part of
 all that the actuator moved, which the model of the hysteresis may leave."""
 STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
@@ -50,19 +50,19 @@ SWINGS = 8
 class Stage:
     """What two recordings tell; `actuator` is the hysteresis with the static gain of the dynamics in it."""
 
-    slow: Measured
-    fast: Measured
+    slow: AxisRecording
+    fast: AxisRecording
     hysteresis: HysteresisFit
     dynamics: DynamicsFit
     actuator: PlayModel
 
-    def asked(self, design: DesignOptions) -> DesignOptions:
+    def complete_design(self, design: DesignOptions) -> DesignOptions:
         """`design` for the identified plant at the rate of its recording."""
         plant = ModelOptions.model_validate(model_values(self.dynamics))
         output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
         return design.model_copy(update={"plant": plant, "controller": output})
 
-    def described(self) -> str:
+    def describe(self) -> str:
         """h/H, modes and delay, in a line."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{self.dynamics.delay_ticks} samples of delay"
@@ -78,35 +78,35 @@ class Chain:
     synthesis: Synthesis
 
 
-def identified(hysteresis: Measured, step: Measured, order: int | None = None) -> Stage:
+def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
     """The stage of two recordings. Raises UnsuitableData where one cannot serve."""
     if not step.even:
         raise UnsuitableData(f"{step.name}: ticks are missing or late by a period; dynamics need equal intervals")
     fit = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
     dynamics = identify_dynamics(excitation, order, criterion="held-out")
-    noise_um = min(noise_of(step.position_um), noise_of(hysteresis.position_um))
-    _require_explained(step, dynamics, max(noise_um, SMALL_PART * float(np.ptp(excitation.input))))
-    return Stage(hysteresis, step, fit, dynamics, with_gain(fit.model, dynamics.static_gain))
+    noise_um = min(noise_std(step.position_um), noise_std(hysteresis.position_um))
+    _require_explained(step, dynamics, max(noise_um, HYSTERESIS_SHARE * float(np.ptp(excitation.input))))
+    return Stage(hysteresis, step, fit, dynamics, scale_hysteresis(fit.model, dynamics.static_gain))
 
 
-def designed(stage: Stage, design: DesignOptions) -> Chain:
+def design_controller(stage: Stage, design: DesignOptions) -> Chain:
     """Synthesise for `design`, whose plant is replaced by the identified one.
 
     Raises NoController and ValueError as the synthesis does.
     """
-    completed = stage.asked(design)
+    completed = stage.complete_design(design)
     return Chain(stage, completed, synthesise_design(completed))
 
 
-def _require_explained(step: Measured, dynamics: DynamicsFit, noise_um: float) -> None:
+def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: float) -> None:
     """Raise UnsuitableData for a model that misses more of its recording than noise and hysteresis leave."""
-    allowed_um = LARGEST_ERROR * noise_um
+    allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
             f"{step.name}: no model explains it: that of order {dynamics.model.order} behind {dynamics.delay_ticks} "
             f"samples errs by {dynamics.rms_error_um:.3g} µm rms, and {allowed_um:.3g} µm is allowed (about "
-            f"{LARGEST_ERROR:g} times the noise). A step up and down, a larger one, or a longer record would help"
+            f"{LARGEST_NOISE_RATIO:g} times the noise). A step up and down, a larger one, or a longer record would help"
         )
 
 
@@ -118,30 +118,34 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
     """
     controller_text = controller_section(chain.synthesis, chain.design, spec_name, spec_text)
     comments = [line.removeprefix("# ") for line in controller_text.splitlines() if line.startswith("#")]
-    return text_with(chain.stage, {"controller": _section(controller_text, "controller")}, comments, axis, spec_name)
+    return stage_configuration(
+        chain.stage, {"controller": _read_section(controller_text, "controller")}, comments, axis, spec_name
+    )
 
 
-def text_with(stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str) -> str:
+def stage_configuration(
+    stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
+) -> str:
     """The configuration of the step with stage, specification and `parts` in axis `axis` (the first), stepping."""
     configuration = tomllib.loads(stage.fast.configuration)
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
     configuration.pop("schedule", None)
     sections = {
-        "feedforward": _section(feedforward_section(stage.actuator, ()), "feedforward"),
+        "feedforward": _read_section(feedforward_section(stage.actuator, ()), "feedforward"),
         "model": model_values(stage.dynamics),
         "specification": spec_name,
         **parts,
     }
     axis_table = next(table for table in configuration["axis"] if axis in (None, table["name"]))
     sections["reference"] = _steps(LimitsOptions.model_validate(axis_table.get("limits", {})).command_um, stage)
-    sections["interlocks"] = _with_oscillation(axis_table.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
+    sections["interlocks"] = _enable_oscillation(axis_table.get("interlocks", {}), stage.dynamics, stage.fast.period_s)
     configuration["axis"] = [{**table, **sections} if table is axis_table else table for table in configuration["axis"]]
     heading = [
         *hysteresis_provenance(stage.hysteresis, [stage.slow]),
         *dynamics_provenance(stage.dynamics, stage.fast, "hysteresis"),
         *comments,
     ]
-    return edited(stage.fast.configuration, configuration, heading)
+    return edit_text(stage.fast.configuration, configuration, heading)
 
 
 def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
@@ -152,7 +156,7 @@ def _steps(command_um: float, stage: Stage) -> dict[str, Any]:
     return {"kind": "steps", "levels": [float(f"{STEP_PART * command_um:.1g}"), 0.0], "dwell_s": round(dwell_s, 9)}
 
 
-def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
+def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
     """The interlocks with that against a growing resonance on: it is off where a stage shall ring without control."""
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):
@@ -160,5 +164,5 @@ def _with_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, peri
     return {**interlocks, "oscillation_swings": SWINGS, "swing_ticks": math.ceil(0.75 / (lowest_hz * period_s))}
 
 
-def _section(content: str, name: str) -> Any:
+def _read_section(content: str, name: str) -> Any:
     return tomllib.loads(content)["axis"][name]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import Loop, realised
+from rtloop.analysis.closed_loop import Loop, realise_transfer
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.errors import MissingExtra
 from rtloop.linear.discretise import DiscreteController
@@ -32,7 +32,7 @@ def to_control(
     if isinstance(system, FrequencyResponse):
         return library.FrequencyResponseData(system.response, 2 * np.pi * system.hz)
     if isinstance(system, Transfer):
-        return _state_space(library, realised(system), 0)
+        return _state_space(library, realise_transfer(system), 0)
     if isinstance(system, DiscreteController):
         return _state_space(library, system.system, system.period_s)
     dt = system.period_s or 0

@@ -12,11 +12,11 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Array, Item, Table
 
-WIDTH = 90
+LIST_WIDTH = 90
 """Lists that are longer have a line for each entry."""
 
 
-def section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
+def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
     """`[name]` with its keys, below comment lines; tables within follow as sections, lists of tables as [[…]]."""
     document = tomlkit.document()
     for comment in comments:
@@ -24,12 +24,12 @@ def section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) 
     nested: Mapping[str, Any] = values
     for part in reversed(name.split(".") if name else []):
         nested = {part: nested}
-    for key, value in _plain_first(nested):
-        document.add(key, item(value))
+    for key, value in _plain_values_first(nested):
+        document.add(key, toml_item(value))
     return document.as_string()
 
 
-def edited(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
+def edit_text(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
     """`text` changed so that it says `values`, with its own comments kept, below `comments`.
 
     Where its form does not let it be changed in place, the values alone.
@@ -37,34 +37,34 @@ def edited(text: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -
     heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
     try:
         document = tomlkit.parse(text)
-        _update(document, values)
+        _update_table(document, values)
         edited_text = f"{heading}\n{document.as_string()}"
         if tomllib.loads(edited_text) == values:
             return edited_text
     except (TOMLKitError, tomllib.TOMLDecodeError):
         pass
-    return section("", values, comments)
+    return write_section("", values, comments)
 
 
-def _update(table: Any, values: Mapping[str, Any]) -> None:
+def _update_table(table: Any, values: Mapping[str, Any]) -> None:
     for key in [key for key in table if key not in values]:
         table.remove(key)
-    for key, value in _plain_first(values):
+    for key, value in _plain_values_first(values):
         present = table.get(key)
         if key in table and present == value:
             continue
         if isinstance(present, MutableMapping) and isinstance(value, Mapping):
-            _update(present, value)
+            _update_table(present, value)
         elif isinstance(present, AoT) and _is_tables(value) and len(present) == len(value):
             for old_table, new_values in zip(present, value, strict=True):
-                _update(old_table, new_values)
+                _update_table(old_table, new_values)
         else:
-            table[key] = added = item(value)
+            table[key] = added = toml_item(value)
             if isinstance(added, Table):
                 added.add(tomlkit.nl())
 
 
-def item(value: Any) -> Item:
+def toml_item(value: Any) -> Item:
     """A value as it stands in a file; in lists, a mapping is an inline table."""
     if isinstance(value, Mapping):
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
@@ -78,44 +78,44 @@ def item(value: Any) -> Item:
     return tomlkit.item(value.item() if isinstance(value, np.generic) else value)
 
 
-def roots(values: npt.NDArray[np.complex128]) -> list[list[float]]:
+def root_pairs(values: npt.NDArray[np.complex128]) -> list[list[float]]:
     """Complex numbers as [real, imaginary]."""
     return [[float(value.real), float(value.imag)] for value in values]
 
 
 def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
     table = tomlkit.table(is_super_table=holds_tables_alone)
-    for key, value in _plain_first(values):
-        table.add(key, item(value))
+    for key, value in _plain_values_first(values):
+        table.add(key, toml_item(value))
     return table
 
 
 def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
-    items = [_within(value) for value in values]
+    items = [_inline_item(value) for value in values]
     array = tomlkit.array()
-    if len(items) > WIDTH:  # appended one by one they take a time that grows with its square
+    if len(items) > LIST_WIDTH:  # appended one by one they take a time that grows with its square
         array.add_line(*items, indent="", newline=False)
         return array.multiline(True)
     for element in items:
         array.append(element)
-    return array.multiline(len(array.as_string()) > WIDTH)
+    return array.multiline(len(array.as_string()) > LIST_WIDTH)
 
 
 def _inline(values: Mapping[str, Any]) -> Item:
     table = tomlkit.inline_table()
     for key, value in values.items():
-        table.append(key, _within(value))
+        table.append(key, _inline_item(value))
     return table
 
 
-def _within(value: Any) -> Item:
+def _inline_item(value: Any) -> Item:
     """A value in a list or an inline table."""
     if isinstance(value, Mapping):
         return _inline(value)
-    return _array(value) if isinstance(value, list | tuple | np.ndarray) else item(value)
+    return _array(value) if isinstance(value, list | tuple | np.ndarray) else toml_item(value)
 
 
-def _plain_first(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
+def _plain_values_first(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
     """TOML has no way back from a table to its parent."""
     return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
 

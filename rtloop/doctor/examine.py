@@ -67,7 +67,7 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
     before_s = Host({}, root).stolen_s()
     ran = subprocess.run(
         [sys.executable, "-m", "rtloop.engine.latency"],
-        input=latency.order(pacing, max(1, round(seconds * pacing.rate_hz))),
+        input=latency.encode_request(pacing, max(1, round(seconds * pacing.rate_hz))),
         capture_output=True,
         timeout=START_S + 3 * seconds,
         check=False,
@@ -75,7 +75,7 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
     if ran.returncode != 0:
         last = (ran.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {ran.returncode}"])[-1]
         raise RtloopError(f"the measurement of the clock failed: {last}")
-    granted, lateness_us, missed = latency.results(ran.stdout)
+    granted, lateness_us, missed = latency.decode_results(ran.stdout)
     host = Host(granted, root)
     measured = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
     return Examination(measured, conditions(host, pacing))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rtloop.doctor.examine import Latency
-from rtloop.errors import MissingExtra, writing
+from rtloop.errors import MissingExtra, output_errors
 from rtloop.hil.trusted import overwrite_file
 
 FINEST_US = 0.01
@@ -41,5 +41,5 @@ def draw(latency: Latency, target: Path) -> None:
     panel.set_title(f"{latency.lateness_us.size:,} ticks at {pacing.rate_hz:g} Hz, spinning {pacing.spin_us:g} µs")
     panel.grid(visible=True, alpha=0.3)
     panel.legend()
-    with writing(target), os.fdopen(overwrite_file(target), "wb") as file:
+    with output_errors(target), os.fdopen(overwrite_file(target), "wb") as file:
         figure.savefig(file, format="png", dpi=110)

@@ -10,7 +10,7 @@ from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
 from rtloop.engine.plan import Pacing
 from rtloop.hil.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
-from rtloop.hil.native.stored import damaged_files, set_aside_files
+from rtloop.hil.native.stored import damaged_files, quarantined_files
 
 LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
@@ -18,7 +18,7 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
     """The cache of compiled code; without one each start compiles for half a minute, and no tick is later for it."""
     kept = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
-    if damaged := len(damaged_files(CACHE_FOLDER)) + len(set_aside_files(CACHE_FOLDER)):
+    if damaged := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
         return Finding(
             "compiled code",
             f"{kept}; {damaged} damaged files",

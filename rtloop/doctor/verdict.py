@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rtloop.analysis.margins import delay_tolerated
+from rtloop.analysis.margins import delay_margin
 from rtloop.configuration.prepare import Prepared
 from rtloop.doctor.examine import Examination, Latency
 
@@ -31,7 +31,7 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
     for check in prepared.checks:
         if check.on_model is None or not check.on_model.is_stable:
             continue
-        tolerated_s, hz = delay_tolerated(check.on_model)
+        tolerated_s, hz = delay_margin(check.on_model)
         p50_deg, p99_deg = (360 * hz * late_us / US_PER_S for late_us in (p50_us, p99_us))
         delays.append(AxisDelay(check.name, hz, US_PER_S * tolerated_s, p50_deg, p99_deg, p99_us))
     return delays

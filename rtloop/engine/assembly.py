@@ -6,21 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, index_of
+from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, channel_index
 from rtloop.engine.clock import Clock, clock_context, paced_now, unpaced_clock
 from rtloop.engine.context import LOOP
 from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
-from rtloop.hil.native.compiled import entry
+from rtloop.hil.native.compiled import python_entry
 from rtloop.hil.native.pointers import address_pointer, carray
 from rtloop.law.law import set_mode
 from rtloop.law.layout import CONDITIONS, LAW
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR
-from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import LawReference, layout_of
+from rtloop.laws.binding import bind_functions
+from rtloop.laws.registry import LawReference, law_layout
 from rtloop.signals import Mode
 
 SNAPSHOT_SECONDS = 1.0
@@ -31,13 +31,13 @@ UNLIMITED = np.iinfo(np.int64).max
 
 def law_at_rest(plan: Plan) -> LawMemory:
     """The plan's law before its first tick."""
-    memory = LawMemory.at_rest(plan.layout, functions_of(plan.laws), plan.coefficients, plan.extras)
-    _begin(memory.records.ctypes.data, int(plan.mode))
+    memory = LawMemory.create_at_rest(plan.layout, bind_functions(plan.laws), plan.coefficients, plan.extras)
+    _set_initial_mode(memory.records.ctypes.data, int(plan.mode))
     return memory
 
 
-@entry("int64(intp, int64)")
-def _begin(law_address, mode):
+@python_entry("int64(intp, int64)")
+def _set_initial_mode(law_address, mode):
     """The law at an address, at rest, in a mode."""
     set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
     return 0
@@ -53,10 +53,10 @@ class Assembly:
         self.loop = self._loops[0]
         self._arrays: dict[str, np.ndarray[Any, Any]] = {}
         self._law = law
-        self._point("law", law.records)
-        self._wire(plan, facts)
-        self._share(plan, block)
-        self._call(pointers, clock)
+        self._add_array("law", law.records)
+        self._wire_channels(plan, facts)
+        self._map_shared_block(plan, block)
+        self._set_functions(pointers, clock)
         period_s = 1.0 / plan.pacing.rate_hz
         self.loop.period_s, self.loop.period_us = period_s, period_s * 1e6
         self.loop.heartbeat_timeout_ns = plan.pacing.heartbeat_timeout_s * 1e9
@@ -79,54 +79,56 @@ class Assembly:
         """Run the compiled loop."""
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
-    def _point(self, name: str, array: np.ndarray[Any, Any]) -> None:
+    def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
         self._arrays[name] = array
         self._loops[name] = array.ctypes.data
 
-    def _wire(self, plan: Plan, facts: Facts) -> None:
+    def _wire_channels(self, plan: Plan, facts: Facts) -> None:
         """Buffers, and which channel belongs to which axis."""
         axes, loop = plan.axes, self.loop
         loop.axis_count, loop.input_count, loop.output_count = len(axes), len(facts.inputs), len(facts.outputs)
         loop.observed_count = len(facts.observed)
-        self._point("inputs", np.zeros(len(facts.inputs) + 1 + len(facts.observed)))
-        self._point("outputs", np.array([channel.safe_v for channel in facts.outputs]))
-        self._point("timing", np.zeros(4))
-        self._point("conditions", np.zeros(1, CONDITIONS))
-        loop.enable_index = -1 if plan.enable_input is None else index_of(facts.inputs, plan.enable_input)
+        self._add_array("inputs", np.zeros(len(facts.inputs) + 1 + len(facts.observed)))
+        self._add_array("outputs", np.array([channel.safe_v for channel in facts.outputs]))
+        self._add_array("timing", np.zeros(4))
+        self._add_array("conditions", np.zeros(1, CONDITIONS))
+        loop.enable_index = -1 if plan.enable_input is None else channel_index(facts.inputs, plan.enable_input)
         names = plan.extras.inputs
         loop.hold_index, loop.hold_min_v = -1 if plan.hold is None else names.index(plan.hold[0]), np.inf
         if plan.hold is not None:
             loop.hold_min_v = plan.hold[1]
-        read_indices = [index_of(facts.inputs, plan.extra_channels[name]) for name in names]
-        written_indices = [index_of(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs]
-        self._point("extra_input_index", np.array(read_indices, np.int64))
-        self._point("extra_output_index", np.array(written_indices, np.int64))
-        self._point("adc_v", np.zeros(len(axes)))
-        self._point("references", np.zeros(len(axes)))
-        self._point("feeds_um", np.zeros(len(axes)))
-        inputs = [index_of(facts.inputs, plan.wiring[axis].input) for axis in axes]
-        outputs = [index_of(facts.outputs, plan.wiring[axis].output) for axis in axes]
-        self._point("input_index", np.array(inputs, np.int64))
-        self._point("output_index", np.array(outputs, np.int64))
+        read_indices = [channel_index(facts.inputs, plan.extra_channels[name]) for name in names]
+        written_indices = [
+            channel_index(facts.outputs, plan.extra_channels[output.name]) for output in plan.extras.outputs
+        ]
+        self._add_array("extra_input_index", np.array(read_indices, np.int64))
+        self._add_array("extra_output_index", np.array(written_indices, np.int64))
+        self._add_array("adc_v", np.zeros(len(axes)))
+        self._add_array("references", np.zeros(len(axes)))
+        self._add_array("feeds_um", np.zeros(len(axes)))
+        inputs = [channel_index(facts.inputs, plan.wiring[axis].input) for axis in axes]
+        outputs = [channel_index(facts.outputs, plan.wiring[axis].output) for axis in axes]
+        self._add_array("input_index", np.array(inputs, np.int64))
+        self._add_array("output_index", np.array(outputs, np.int64))
 
-    def _share(self, plan: Plan, block: SharedBlock) -> None:
+    def _map_shared_block(self, plan: Plan, block: SharedBlock) -> None:
         """What lies in the shared block, the schedule and the generators."""
         loop = self.loop
         for name in ("words", "last_drive_v", "commands", "commands_marks", "table", "staged"):
-            self._point(name, block[name])
+            self._add_array(name, block[name])
         for name in ("ticks", "events", "snapshots"):
             for part in ("head", "marks", "slots"):
-                self._point(f"{name}_{part}", block[f"{name}_{part}"])
+                self._add_array(f"{name}_{part}", block[f"{name}_{part}"])
             self._loops[f"{name}_capacity"] = block[f"{name}_marks"].size
         block["table"][: plan.table.size] = plan.table
         block["last_drive_v"][:] = self._law.axes["drive_v"]
         loop.table_count, loop.command_count = block["table"].size, block["commands"].size
         loop.column_count, loop.snapshot_bytes = block["ticks_slots"].shape[1], block["snapshots_slots"].shape[1]
-        self._point("generators", plan.generators.copy())
-        self._point("schedule", plan.schedule)
+        self._add_array("generators", plan.generators.copy())
+        self._add_array("schedule", plan.schedule)
         loop.schedule_count = plan.schedule.size
 
-    def _call(self, pointers: Pointers, clock: Clock) -> None:
+    def _set_functions(self, pointers: Pointers, clock: Clock) -> None:
         """The C functions of driver and clock; a driver that has a clock of its own waits by it."""
         loop = self.loop
         loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
@@ -142,12 +144,13 @@ def rehearse() -> None:
     pacing = Pacing(rate_hz=1000.0, paced=False)
     wiring = {"x": Wiring("adc0", "dac0")}
     laws = tuple(map(LawReference, REHEARSED_LAWS))
-    coefficients = np.zeros(1, layout_of(laws).coefficients)
+    coefficients = np.zeros(1, law_layout(laws).coefficients)
     coefficients["controller_axes"], coefficients["controller_law"] = 1, REHEARSED_LAWS.index("transfer")
     coefficients["trip_slew_v_per_tick"] = Channel("dac0").maximum_v
     empty_schedule = np.zeros(0, MESSAGE)
     plan = Plan("rehearsal", ("x",), pacing, REHEARSED_TICKS, "sim", {}, wiring, laws, coefficients, Mode.OFF,
-                np.zeros(1, GENERATOR), np.zeros(0), empty_schedule, ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
+                np.zeros(1, GENERATOR), np.zeros(0), empty_schedule,
+                ("x_true_position_um", "x_hysteresis_um"))  # fmt: skip
     driver, block, context = plan.driver(), SharedBlock.create(plan.sizes), clock_context(pacing.rate_hz)
     ring = block.ring("ticks")
     clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size)

@@ -10,25 +10,25 @@ from __future__ import annotations
 import numpy as np
 
 from rtloop.engine.context import (
+    axis_generators,
+    control_words,
     event_ring,
-    generators_of,
-    law_of,
-    messages,
-    unsigned,
-    words_of,
+    law_record,
+    message_array,
+    word_array,
 )
 from rtloop.engine.memory import COMMAND_SLOTS, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE_VALUES, Kind
 from rtloop.engine.ring import ONE, claim, publish
-from rtloop.hil.native.atomics import exchanged, load_acquire, store_release
-from rtloop.hil.native.compiled import guarded, jit, seldom, seldom_guarded
-from rtloop.hil.native.pointers import address_pointer, carray, copy
-from rtloop.hil.native.words import exchanged as exchanged_word
+from rtloop.hil.native.atomics import compare_exchange, load_acquire, store_release
+from rtloop.hil.native.compiled import jit, jit_checked, jit_rare, jit_rare_checked
+from rtloop.hil.native.pointers import address_pointer, carray, copy_bytes
+from rtloop.hil.native.words import compare_exchange as exchanged_word
 from rtloop.hil.native.words import store_release as store_word
-from rtloop.law.access import coefficients_of, loop_of, state_of
-from rtloop.law.law import fits, reset_trip, set_controller, set_mode, set_prefilter
+from rtloop.law.access import axis_state, coefficients_record, loop_state
+from rtloop.law.law import coefficients_fit, continue_prefilter, mark_new_controller, reset_trip, set_mode
 from rtloop.law.layout import COEFFICIENTS
-from rtloop.law.prefilter import fill_prefilter_anew, filtered
+from rtloop.law.prefilter import last_outputs_um, refill_prefilter
 from rtloop.law.reference import GENERATOR_PARAMETERS, Generator
 from rtloop.signals import Mode
 
@@ -70,10 +70,10 @@ def _mark(block: SharedBlock, position: int) -> int:
     return marks.ctypes.data + position % marks.size * marks.itemsize
 
 
-@guarded
-def _exchange(marks, position):
+@jit_checked
+def _claim_command(marks, position):
     """Whether the caller is the one who takes, or withdraws, the command at `position`."""
-    return exchanged(marks, position % marks.size, np.uint64(position + 1), GONE)
+    return compare_exchange(marks, position % marks.size, np.uint64(position + 1), GONE)
 
 
 @jit
@@ -81,35 +81,35 @@ def apply_commands(loop):
     """Apply what is due at this tick: all of the schedule, and of the queue at most COMMANDS_PER_TICK."""
     if loop.scheduled < loop.schedule_count:
         _apply_schedule(loop)
-    words = words_of(loop)
+    words = control_words(loop)
     if load_acquire(words, HEAD) != words[TAIL]:
         _apply_queue(loop)
 
 
-@seldom_guarded
+@jit_rare_checked
 def _apply_schedule(loop):
-    schedule = messages(loop.schedule, loop.schedule_count)
+    schedule = message_array(loop.schedule, loop.schedule_count)
     while loop.scheduled < loop.schedule_count and schedule[loop.scheduled].tick <= loop.tick:
-        _apply(loop, schedule[loop.scheduled])
+        _apply_command(loop, schedule[loop.scheduled])
         loop.scheduled += 1
 
 
-@seldom_guarded
+@jit_rare_checked
 def _apply_queue(loop):
-    words, queue = words_of(loop), messages(loop.commands, loop.command_count)
-    marks = unsigned(loop.commands_marks, loop.command_count)
+    words, queue = control_words(loop), message_array(loop.commands, loop.command_count)
+    marks = word_array(loop.commands_marks, loop.command_count)
     tail = words[TAIL]
     waiting = np.int64(load_acquire(words, HEAD) - tail)
     for _ in range(min(waiting, COMMANDS_PER_TICK)):
-        if _exchange(marks, np.int64(tail)):
-            _apply(loop, queue[np.int64(tail % np.uint64(loop.command_count))])
+        if _claim_command(marks, np.int64(tail)):
+            _apply_command(loop, queue[np.int64(tail % np.uint64(loop.command_count))])
         tail += ONE
         store_release(words, TAIL, tail)
 
 
-@seldom
-def _apply(loop, command):
-    law, state = law_of(loop), loop_of(law_of(loop))
+@jit_rare
+def _apply_command(loop, command):
+    law, state = law_record(loop), loop_state(law_record(loop))
     if command.kind == SET_MODE:
         if state.trip != 0 or loop.stopping != 0:
             values = (float(command.kind), command.values[0])
@@ -128,7 +128,7 @@ def _apply(loop, command):
             publish_event(loop, REFUSED, command.axis, command.origin, command.identity, (float(command.kind), 0.0))
             return
     elif command.kind == STOP:
-        store_release(words_of(loop), STOP_WORD, ONE)  # the loop reports it when it stops
+        store_release(control_words(loop), STOP_WORD, ONE)  # the loop reports it when it stops
         return
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
@@ -143,25 +143,25 @@ def _apply(loop, command):
     loop.events += 1
 
 
-@guarded
-def _change_units(loop, mode, held):
+@jit_checked
+def _change_units(loop, mode, holds_output):
     """References are volts, or micrometres, from here on; if `held`, one of the other unit gives way to what is."""
-    generators, law, volts = generators_of(loop), law_of(loop), 1 if mode == RAW else 0
+    generators, law, volts = axis_generators(loop), law_record(loop), 1 if mode == RAW else 0
     for a in range(loop.axis_count):
-        if held and generators[a].volts != volts:
-            in_force = state_of(law, a).drive_v
+        if holds_output and generators[a].volts != volts:
+            in_force = axis_state(law, a).drive_v
             if mode == FEEDFORWARD:
-                in_force = state_of(law, a).applied_command_um
+                in_force = axis_state(law, a).applied_command_um
             elif mode == CLOSED_LOOP:
-                in_force = state_of(law, a).position_um
+                in_force = axis_state(law, a).position_um
             generators[a].kind, generators[a].parameters[0], generators[a].feed_um = HOLD, in_force, 0.0
             generators[a].start_tick = generators[a].held_until = loop.tick
         generators[a].volts = volts
 
 
-@guarded
+@jit_checked
 def _set_reference(loop, command):
-    generators, volts = generators_of(loop), 1 if loop_of(law_of(loop)).mode == RAW else 0
+    generators, volts = axis_generators(loop), 1 if loop_state(law_record(loop)).mode == RAW else 0
     for a in range(loop.axis_count):
         if command.axis < 0 or command.axis == a:
             generators[a].kind = np.int64(command.values[0])
@@ -173,14 +173,14 @@ def _set_reference(loop, command):
                 generators[a].parameters[i] = command.values[1 + i]
 
 
-@guarded
-def _load_law(loop, first, another):
+@jit_checked
+def _load_law(loop, first, is_new_controller):
     """Take the staged coefficients of an axis, and of those that share its controller, and make their state fit.
 
     False, and nothing taken, where their counts do not fit a record. Another controller continues from the command in
     force. Another pre-filter begins with the reference in force.
     """
-    law = law_of(loop)
+    law = law_record(loop)
     size = law.coefficients_bytes
     if first < 0 or first >= law.axis_count:
         return False
@@ -188,37 +188,37 @@ def _load_law(loop, first, another):
     count = max(np.int64(carray(address_pointer(staged), 1, COEFFICIENTS)[0].controller_axes), 1)
     for i in range(count):
         staged_coefficients = carray(address_pointer(staged + i * size), 1, COEFFICIENTS)[0]
-        if not fits(law, first + i, staged + i * size):
+        if not coefficients_fit(law, first + i, staged + i * size):
             return False
-        if staged_coefficients.controller_axes != coefficients_of(law, first + i).controller_axes:
+        if staged_coefficients.controller_axes != coefficients_record(law, first + i).controller_axes:
             return False
     for i in range(count):
-        _take_axis(law, first + i, staged + i * size)
-    if another:
-        set_controller(law, first)
+        _load_axis(law, first + i, staged + i * size)
+    if is_new_controller:
+        mark_new_controller(law, first)
     loop.next_snapshot = loop.tick
     return True
 
 
-@guarded
-def _take_axis(law, a, staged):
+@jit_checked
+def _load_axis(law, a, staged):
     """Coefficients of one axis, from an address."""
-    before, after = coefficients_of(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
+    before, after = coefficients_record(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
     needs_refill = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count
     if not needs_refill:
         for i in range(after.section_count):
             for j in range(after.sections.shape[1]):
                 needs_refill = needs_refill or before.sections[i, j] != after.sections[i, j]
-    size, state = law.coefficients_bytes, state_of(law, a)
-    last_um = filtered(before, state)
-    copy(law.coefficients + a * size, staged, size)
+    size, state = law.coefficients_bytes, axis_state(law, a)
+    last_um = last_outputs_um(before, state)
+    copy_bytes(law.coefficients + a * size, staged, size)
     if needs_refill:
-        fill_prefilter_anew(state)
+        refill_prefilter(state)
     elif state.tap_index >= 0:
-        set_prefilter(law, a, last_um)
+        continue_prefilter(law, a, last_um)
 
 
-@seldom
+@jit_rare
 def publish_event(loop, kind, axis, origin, identity, values):
     """An event of this tick with its first values."""
     ring, position = event_ring(loop), np.uint64(loop.events)

@@ -72,61 +72,61 @@ LOOP = np.dtype(
 
 
 @jit
-def law_of(loop):
+def law_record(loop):
     """Where the law's records are."""
     return carray(address_pointer(loop.law), 1, LAW)[0]
 
 
 @jit
-def conditions_of(loop):
+def tick_conditions(loop):
     """What the tick is judged by beside its inputs."""
     return carray(address_pointer(loop.conditions), 1, CONDITIONS)[0]
 
 
 @jit
-def loop_at(address):
+def loop_record(address):
     """A loop's record at an address."""
     return carray(address_pointer(address), 1, LOOP)[0]
 
 
 @jit
-def generators_of(loop):
+def axis_generators(loop):
     """Reference generators of all axes."""
     return carray(address_pointer(loop.generators), loop.axis_count, GENERATOR)
 
 
 @jit
-def words_of(loop):
+def control_words(loop):
     """Control words of the shared block."""
     return carray(address_pointer(loop.words), WORDS, np.uint64)
 
 
 @jit
-def floats(address, count):
+def float_array(address, count):
     """float64 values at an address."""
     return carray(address_pointer(address), count, np.float64)
 
 
 @jit
-def integers(address, count):
+def int_array(address, count):
     """int64 values at an address."""
     return carray(address_pointer(address), count, np.int64)
 
 
 @jit
-def unsigned(address, count):
+def word_array(address, count):
     """uint64 values at an address."""
     return carray(address_pointer(address), count, np.uint64)
 
 
 @jit
-def octets(address, count):
+def byte_array(address, count):
     """Bytes at an address."""
     return carray(address_pointer(address), count, np.uint8)
 
 
 @jit
-def messages(address, count):
+def message_array(address, count):
     """Commands or events at an address."""
     return carray(address_pointer(address), count, MESSAGE)
 

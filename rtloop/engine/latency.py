@@ -26,7 +26,7 @@ START_DELAY_NS = 20_000_000
 
 
 @jit
-def wait_and_note(wait, context, timing, address, lateness_us, missed):
+def measure_waits(wait, context, timing, address, lateness_us, missed):
     """Wait for so many ticks; `timing` (4,) lies at `address`. Lateness and missed periods of each tick."""
     for k in range(lateness_us.size):
         if call(wait, context, address) != 0:
@@ -41,18 +41,18 @@ def measure(pacing: Pacing, ticks: int) -> tuple[npt.NDArray[np.float64], npt.ND
     clock = paced_clock(context, pacing.spin_us)
     lateness_us, missed = np.zeros(ticks), np.zeros(ticks)
     arguments = clock.wait, clock.context, timing, timing.ctypes.data
-    wait_and_note(*arguments, lateness_us[:0], missed[:0])  # compiled, before time counts
+    measure_waits(*arguments, lateness_us[:0], missed[:0])  # compiled, before time counts
     context.start_ns = time.monotonic_ns() + START_DELAY_NS
-    wait_and_note(*arguments, lateness_us, missed)
+    measure_waits(*arguments, lateness_us, missed)
     return lateness_us, missed
 
 
-def order(pacing: Pacing, ticks: int) -> bytes:
+def encode_request(pacing: Pacing, ticks: int) -> bytes:
     """What the process reads."""
     return json.dumps({"pacing": asdict(pacing), "ticks": ticks}).encode()
 
 
-def results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def decode_results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """What the process wrote: what was granted, lateness in µs, missed periods."""
     line, _, data = output.partition(b"\n")
     lateness_us, missed = np.frombuffer(data).reshape(2, -1)

@@ -14,26 +14,26 @@ import numpy as np
 
 from rtloop.engine.commands import apply_commands, publish_event
 from rtloop.engine.context import (
-    conditions_of,
-    floats,
-    generators_of,
-    integers,
-    law_of,
-    loop_at,
+    axis_generators,
+    control_words,
+    float_array,
+    int_array,
+    law_record,
+    loop_record,
     snapshot_ring,
+    tick_conditions,
     tick_ring,
-    words_of,
 )
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
 from rtloop.engine.trips import publish_trip
 from rtloop.hil.native.atomics import load_acquire
-from rtloop.hil.native.compiled import entry, jit, seldom
-from rtloop.hil.native.pointers import call, copy
-from rtloop.law.access import loop_of, state_of
-from rtloop.law.extras import inputs_of, outputs_of
-from rtloop.law.law import all_fit, evaluate, set_mode, update
+from rtloop.hil.native.compiled import jit, jit_rare, python_entry
+from rtloop.hil.native.pointers import call, copy_bytes
+from rtloop.law.access import axis_state, loop_state
+from rtloop.law.extras import extra_inputs, extra_outputs
+from rtloop.law.law import all_coefficients_fit, evaluate, set_mode, update
 from rtloop.law.layout import LOOP_STATE
 from rtloop.law.reference import FOR_EVER, reference_sample
 from rtloop.signals import (
@@ -93,20 +93,20 @@ GIVE_UP_S = 1.0
 """A card that refuses every write for so long is left to whoever parks it."""
 
 
-@entry("int64(intp, int64)")
+@python_entry("int64(intp, int64)")
 def run_ticks(loop_address, until_tick):
     """Run until `until_tick` ticks were executed, a stop or a failed driver was ramped down; returns an Outcome.
 
     `loop_address` is that of a LOOP record. A count beyond its record, or an index beyond its array, ends the run at
     once: whoever called brings the outputs down, for the law's memory is not to be believed any more.
     """
-    loop, outcome = loop_at(loop_address), BROKEN
+    loop, outcome = loop_record(loop_address), BROKEN
     try:
-        if not all_fit(law_of(loop)):
+        if not all_coefficients_fit(law_record(loop)):
             raise IndexError("a count of the law is beyond its record")
         outcome = _run_ticks(loop, until_tick)
         if outcome != DONE:
-            _end_lateness(loop)
+            _end_late_episode(loop)
     except Exception:
         publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, (TRIP_LAW, 0.0))
     return outcome
@@ -115,12 +115,12 @@ def run_ticks(loop_address, until_tick):
 @jit
 def _run_ticks(loop, until_tick):
     while loop.tick < until_tick:
-        _prepare(loop)
+        _prepare_tick(loop)
         if call(loop.wait, loop.wait_context, loop.timing) != 0:
             return FAILURE
-        _tick(loop)
+        _execute_tick(loop)
         loop.tick += 1
-        state = loop_of(law_of(loop))
+        state = loop_state(law_record(loop))
         if state.settled != 0:
             if loop.failed != 0:
                 return FAILURE
@@ -132,40 +132,40 @@ def _run_ticks(loop, until_tick):
 
 
 @jit
-def _prepare(loop):
+def _prepare_tick(loop):
     """What a tick does before its deadline: schedule and commands, stop request, and what is done once a second."""
     apply_commands(loop)
     failing = loop.failed == WRITE_FAILED  # one write may fail and the next succeed: the ramp is tried
-    if loop.stopping == 0 and (failing or load_acquire(words_of(loop), STOP_WORD) != 0):
+    if loop.stopping == 0 and (failing or load_acquire(control_words(loop), STOP_WORD) != 0):
         loop.stopping = 1
         publish_event(loop, STOP_KIND, ALL_AXES, LOOP_ORIGIN if failing else SUPERVISOR, 0, (0.0, 0.0))
-        set_mode(law_of(loop), OFF, False)
+        set_mode(law_record(loop), OFF, False)
     if loop.tick >= loop.next_snapshot:
         _publish_snapshot(loop)
         loop.next_snapshot = loop.tick + loop.snapshot_ticks
         if loop.tick >= loop.late_until:
-            _end_lateness(loop)
+            _end_late_episode(loop)
 
 
 @jit
-def _tick(loop):
-    timing = floats(loop.timing, 4)
+def _execute_tick(loop):
+    timing = float_array(loop.timing, 4)
     deadline_ns, wake_ns, missed, now_ns = timing[0], timing[1], timing[2], timing[3]
 
     status = call(loop.read, loop.driver_context, loop.inputs)
-    read_ns = _now(loop)
+    read_ns = _elapsed_ns(loop)
 
     lateness_us = (wake_ns - deadline_ns) * US_PER_NS
-    _evaluate(loop, status, now_ns, lateness_us)
-    law_ns = _now(loop)
+    _evaluate_law(loop, status, now_ns, lateness_us)
+    law_ns = _elapsed_ns(loop)
 
     write_status = call(loop.write, loop.driver_context, loop.outputs)
-    write_ns = _now(loop)
+    write_ns = _elapsed_ns(loop)
 
-    _note(loop, write_status)
-    state = loop_of(law_of(loop))
-    update(law_of(loop))
-    _report(loop, status, write_status, missed)
+    _record_outputs(loop, write_status)
+    state = loop_state(law_record(loop))
+    update(law_record(loop))
+    _publish_events(loop, status, write_status, missed)
     if loop.tick >= loop.record_limit:
         return
     ring, position = tick_ring(loop), np.uint64(loop.tick)
@@ -180,64 +180,64 @@ def _tick(loop):
     row[PERIODS_MISSED] = missed
     row[MODE] = float(state.mode)
     row[DRIVER_STATUS] = float(status)
-    row[EXEC] = (_now(loop) - wake_ns) * US_PER_NS
+    row[EXEC] = (_elapsed_ns(loop) - wake_ns) * US_PER_NS
     overrun = lateness_us + row[EXEC] > loop.period_us
     row[FLAGS] = float(state.tick_flags | (OVERRUN if overrun else 0) | (WRITE_FAILED_FLAG if write_status < 0 else 0))
     publish(ring, position)
 
 
 @jit
-def _now(loop):
+def _elapsed_ns(loop):
     """ns since the start; NaN in virtual time, whose clock has no `now`."""
     if loop.now == 0:
         return np.nan
     call(loop.now, loop.clock_context, loop.timing)
-    return floats(loop.timing, 1)[0]
+    return float_array(loop.timing, 1)[0]
 
 
 @jit
-def _note(loop, written):
+def _record_outputs(loop, write_status):
     """Where the outputs are now, for whoever parks them."""
-    if written < 0:
-        _hold(loop)
+    if write_status < 0:
+        _hold_outputs(loop)
         return
-    law, last_drive_v = law_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    law, last_drive_v = law_record(loop), float_array(loop.last_drive_v, loop.axis_count)
     loop.refused = 0
     for a in range(loop.axis_count):
-        last_drive_v[a] = state_of(law, a).drive_v
+        last_drive_v[a] = axis_state(law, a).drive_v
 
 
-@seldom
-def _hold(loop):
+@jit_rare
+def _hold_outputs(loop):
     """A write failed: the outputs are where they were, and the law goes on from there. After GIVE_UP_S no further."""
-    law, last_drive_v = law_of(loop), floats(loop.last_drive_v, loop.axis_count)
+    law, last_drive_v = law_record(loop), float_array(loop.last_drive_v, loop.axis_count)
     loop.refused += 1
-    loop_of(law).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
+    loop_state(law).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
     for a in range(loop.axis_count):
-        state_of(law, a).drive_v = last_drive_v[a]
+        axis_state(law, a).drive_v = last_drive_v[a]
 
 
 @jit
-def _evaluate(loop, status, now_ns, lateness_us):
+def _evaluate_law(loop, status, now_ns, lateness_us):
     """References, interlocks and law; the drives go to the driver's outputs."""
-    inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
-    outputs = floats(loop.outputs, loop.output_count)
-    adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
-    feeds_um = floats(loop.feeds_um, loop.axis_count)
+    inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
+    outputs = float_array(loop.outputs, loop.output_count)
+    adc_v, references = float_array(loop.adc_v, loop.axis_count), float_array(loop.references, loop.axis_count)
+    feeds_um = float_array(loop.feeds_um, loop.axis_count)
     input_index, output_index = (
-        integers(loop.input_index, loop.axis_count),
-        integers(loop.output_index, loop.axis_count),
+        int_array(loop.input_index, loop.axis_count),
+        int_array(loop.output_index, loop.axis_count),
     )
-    generators, table = generators_of(loop), floats(loop.table, loop.table_count)
-    law = law_of(loop)
+    generators, table = axis_generators(loop), float_array(loop.table, loop.table_count)
+    law = law_record(loop)
     if law.extra_count != 0:
         _read_extras(loop, inputs)
     for a in range(loop.axis_count):
         adc_v[a] = inputs[input_index[a]]
         references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
         feeds_um[a] = generators[a].feed_um
-    heartbeat_ns = float(load_acquire(words_of(loop), HEARTBEAT_WORD))
-    conditions = conditions_of(loop)
+    heartbeat_ns = float(load_acquire(control_words(loop), HEARTBEAT_WORD))
+    conditions = tick_conditions(loop)
     conditions.driver_status = status
     conditions.heartbeat_lost = 1 if now_ns - heartbeat_ns > loop.heartbeat_timeout_ns else 0
     conditions.sample_age_us = inputs[loop.input_count]
@@ -245,40 +245,40 @@ def _evaluate(loop, status, now_ns, lateness_us):
     conditions.enable_v = inputs[loop.enable_index] if loop.enable_index >= 0 else 0.0
     evaluate(law, adc_v, references, feeds_um, conditions)
     for a in range(loop.axis_count):
-        outputs[output_index[a]] = state_of(law, a).drive_v
+        outputs[output_index[a]] = axis_state(law, a).drive_v
     if law.extra_count != 0:
         _set_extras(loop, outputs)
 
 
-@seldom
+@jit_rare
 def _read_extras(loop, inputs):
     """Inputs beside the sensors, for the law; references stand still while the input that holds them is high."""
-    law, read = law_of(loop), inputs_of(law_of(loop))
-    index = integers(loop.extra_input_index, law.extra_input_count)
+    law, read = law_record(loop), extra_inputs(law_record(loop))
+    index = int_array(loop.extra_input_index, law.extra_input_count)
     for k in range(law.extra_input_count):
         read[k] = inputs[index[k]]
     if loop.hold_index >= 0 and read[loop.hold_index] >= loop.hold_min_v:
-        generators = generators_of(loop)
+        generators = axis_generators(loop)
         for a in range(loop.axis_count):
             generators[a].start_tick += 1
             if generators[a].held_until < FOR_EVER:
                 generators[a].held_until += 1
 
 
-@seldom
+@jit_rare
 def _set_extras(loop, outputs):
     """Outputs beside the drives."""
-    law, extras = law_of(loop), outputs_of(law_of(loop))
-    index = integers(loop.extra_output_index, law.extra_output_count)
+    law, extras = law_record(loop), extra_outputs(law_record(loop))
+    index = int_array(loop.extra_output_index, law.extra_output_count)
     for k in range(law.extra_output_count):
         outputs[index[k]] = extras[k].value_v
 
 
-@seldom
+@jit_rare
 def _fill_extras(loop, row, column):
     """Inputs and outputs beside sensors and drives."""
-    law = law_of(loop)
-    read, extras = inputs_of(law), outputs_of(law)
+    law = law_record(loop)
+    read, extras = extra_inputs(law), extra_outputs(law)
     for k in range(law.extra_input_count):
         row[column + k] = read[k]
     for k in range(law.extra_output_count):
@@ -288,14 +288,14 @@ def _fill_extras(loop, row, column):
 @jit
 def _fill_signals(loop, row):
     """Sample age, the signals of each axis, extra inputs and outputs, the observed signals."""
-    inputs = floats(loop.inputs, loop.input_count + 1 + loop.observed_count)
-    adc_v, references = floats(loop.adc_v, loop.axis_count), floats(loop.references, loop.axis_count)
-    feeds_um = floats(loop.feeds_um, loop.axis_count)
-    law = law_of(loop)
+    inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
+    adc_v, references = float_array(loop.adc_v, loop.axis_count), float_array(loop.references, loop.axis_count)
+    feeds_um = float_array(loop.feeds_um, loop.axis_count)
+    law = law_record(loop)
     row[SAMPLE_AGE] = inputs[loop.input_count]
-    row[ENABLE] = conditions_of(loop).enable_v
+    row[ENABLE] = tick_conditions(loop).enable_v
     for a in range(loop.axis_count):
-        column, state = COMMON_COUNT + a * PER_AXIS_COUNT, state_of(law, a)
+        column, state = COMMON_COUNT + a * PER_AXIS_COUNT, axis_state(law, a)
         row[column + ADC] = adc_v[a]
         row[column + POSITION] = state.position_um
         row[column + REFERENCE] = references[a]
@@ -313,25 +313,25 @@ def _fill_signals(loop, row):
 
 
 @jit
-def _report(loop, status, written, missed):
+def _publish_events(loop, status, write_status, missed):
     """Events of this tick: trips, a failing driver, the beginning of an episode of late ticks."""
-    new_trip = loop_of(law_of(loop)).new_trip
+    new_trip = loop_state(law_record(loop)).new_trip
     if new_trip != 0:
         publish_trip(loop, new_trip)
-    if loop.failed == 0 and (status < 0 or written < 0):
-        loop.failed = WRITE_FAILED if written < 0 else READ_FAILED
-        failing, operation = (written, 1.0) if written < 0 else (status, 0.0)
+    if loop.failed == 0 and (status < 0 or write_status < 0):
+        loop.failed = WRITE_FAILED if write_status < 0 else READ_FAILED
+        failing, operation = (write_status, 1.0) if write_status < 0 else (status, 0.0)
         loop.failed_tick, loop.failed_status = loop.tick, failing
         publish_event(loop, DRIVER_FAILED, ALL_AXES, LOOP_ORIGIN, 0, (float(failing), operation))
     if missed > 0.0:
-        _note_lateness(loop, missed)
+        _record_lateness(loop, missed)
 
 
-@seldom
-def _note_lateness(loop, missed):
+@jit_rare
+def _record_lateness(loop, missed):
     """Begin an episode, or go on with it; it is over when a second has passed without a missed period."""
     if loop.tick >= loop.late_until:
-        _end_lateness(loop)
+        _end_late_episode(loop)
     if loop.late_ticks == 0:
         publish_event(loop, LATENESS_BEGINS, ALL_AXES, LOOP_ORIGIN, 0, (missed, 0.0))
     periods = np.int64(missed)
@@ -341,8 +341,8 @@ def _note_lateness(loop, missed):
     loop.late_until = loop.tick + np.int64(1.0 / loop.period_s)
 
 
-@seldom
-def _end_lateness(loop):
+@jit_rare
+def _end_late_episode(loop):
     """What the whole episode missed, where that is more than its first event has said."""
     if loop.late_ticks > 1:
         values = (float(loop.late_periods), float(loop.late_ticks), float(loop.late_largest))
@@ -350,11 +350,11 @@ def _end_lateness(loop):
     loop.late_ticks = loop.late_periods = loop.late_largest = 0
 
 
-@seldom
+@jit_rare
 def _publish_snapshot(loop):
     """Tick, coefficients and state as bytes, as they are after the commands of this tick."""
     ring, position = snapshot_ring(loop), np.uint64(loop.snapshots)
-    slot, law, offset = claim(ring, position), law_of(loop), TICK_BYTES
+    slot, law, offset = claim(ring, position), law_record(loop), TICK_BYTES
     for i in range(TICK_BYTES):
         ring.slots[slot, i] = (loop.tick >> (8 * i)) & 0xFF
     for address, count in (
@@ -364,7 +364,7 @@ def _publish_snapshot(loop):
     ):
         if offset + count > loop.snapshot_bytes:
             raise IndexError("the law is larger than a snapshot")
-        copy(loop.snapshots_slots + slot * loop.snapshot_bytes + offset, address, count)
+        copy_bytes(loop.snapshots_slots + slot * loop.snapshot_bytes + offset, address, count)
         offset += count
     publish(ring, position)
     loop.snapshots += 1

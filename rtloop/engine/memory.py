@@ -23,7 +23,7 @@ import numpy as np
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 from rtloop.hil.native.words import load_acquire, store_release
-from rtloop.hil.trusted import release
+from rtloop.hil.trusted import close_descriptor
 
 DIRECTORY_BYTES = 8192
 _LOCK = "hhqqi4x"
@@ -86,7 +86,7 @@ class ProcessState(IntEnum):
     FAILED = 4
 
     @classmethod
-    def ended(cls, state: int) -> bool:
+    def has_ended(cls, state: int) -> bool:
         """Whether a process in this state has ended by itself."""
         return state in (cls.FINISHED, cls.FAILED)
 
@@ -111,14 +111,14 @@ class SharedBlock:
         self._arrays: dict[str, np.ndarray[Any, Any]] = {
             name: np.frombuffer(
                 self._map,
-                dtype=np.lib.format.descr_to_dtype(_tuples(descr)),
+                dtype=np.lib.format.descr_to_dtype(_restore_tuples(descr)),
                 count=int(np.prod(shape)),
                 offset=offset,
             ).reshape(shape)
             for name, (offset, descr, shape) in directory.items()
         }
         words = self._arrays["words"]
-        self._words = range(words.ctypes.data, words.ctypes.data + words.nbytes, words.itemsize)
+        self._word_addresses = range(words.ctypes.data, words.ctypes.data + words.nbytes, words.itemsize)
         """Their addresses."""
 
     @staticmethod
@@ -127,10 +127,10 @@ class SharedBlock:
         return os.memfd_create("rtloop")
 
     @classmethod
-    def attach(cls, fd: int, given_up: Callable[[], bool]) -> SharedBlock:
+    def attach(cls, fd: int, is_given_up: Callable[[], bool]) -> SharedBlock:
         """The block in `fd`, once it was created. Raises EOFError when `given_up` says that it never will be."""
         while os.pread(fd, 1, 0) != b"{":
-            if given_up():
+            if is_given_up():
                 raise EOFError("no shared block was created")
             time.sleep(ATTACH_POLL_S)
         return cls(fd)
@@ -138,7 +138,7 @@ class SharedBlock:
     @classmethod
     def create(cls, sizes: Sizes, fd: int | None = None) -> SharedBlock:
         """A new zeroed block in `fd`, which must be empty, or in an anonymous file."""
-        specification = _specification(sizes)
+        specification = _array_specification(sizes)
         offset, directory = DIRECTORY_BYTES, {}
         for name, (dtype, shape) in specification.items():
             directory[name] = (offset, np.lib.format.dtype_to_descr(dtype), shape)
@@ -156,11 +156,11 @@ class SharedBlock:
 
     def load(self, word: Word) -> int:
         """A control word; what its writer wrote before it is seen after it, on any processor."""
-        return load_acquire(self._words[word])
+        return load_acquire(self._word_addresses[word])
 
     def store(self, word: Word, value: int) -> None:
         """Set a control word; who loads it sees what was written before it, on any processor."""
-        store_release(self._words[word], int(value))
+        store_release(self._word_addresses[word], int(value))
 
     @property
     def fault(self) -> str | None:
@@ -181,13 +181,13 @@ class SharedBlock:
         self.store(Word.LOOP_PID, os.getpid())
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)
 
-    def driven_by(self) -> int | None:
+    def driver_pid(self) -> int | None:
         """The process that claimed the block and still lives, as the kernel knows it; not for that process itself."""
-        return claimant(self.fd)
+        return claimant_pid(self.fd)
 
     def kill_driver(self) -> None:
         """End the process that claimed the block: that one, and none that has got its number meanwhile."""
-        pid = self.driven_by()
+        pid = self.driver_pid()
         if pid is None:
             return
         try:
@@ -195,19 +195,19 @@ class SharedBlock:
         except ProcessLookupError:
             return
         try:
-            if self.driven_by() == pid:
+            if self.driver_pid() == pid:
                 signal.pidfd_send_signal(process, signal.SIGKILL)
         except ProcessLookupError:
             pass
         finally:
-            release(process)
+            close_descriptor(process)
 
     def ring(self, name: str) -> Ring:
         """The ring `ticks`, `events` or `snapshots`."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
 
 
-def claimant(fd: int) -> int | None:
+def claimant_pid(fd: int) -> int | None:
     """The process that claimed the block in a file and still lives; None for the calling process."""
     request = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0)
     kind, *_, pid = struct.unpack(_LOCK, fcntl.fcntl(fd, fcntl.F_GETLK, request))
@@ -219,7 +219,7 @@ def ring_ticks(rate_hz: float) -> int:
     return 1 << int(np.ceil(np.log2(max(MIN_RING_TICKS, RING_SECONDS * rate_hz))))
 
 
-def _specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
+def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
     word, real = np.dtype(np.uint64), np.dtype(np.float64)
     ticks = ring_ticks(sizes.rate_hz)
     arrays: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
@@ -243,7 +243,7 @@ def _specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ..
     return arrays
 
 
-def _tuples(descr: Any) -> Any:
+def _restore_tuples(descr: Any) -> Any:
     """numpy's dtype description as it was before JSON turned its tuples into lists."""
     if isinstance(descr, str):
         return descr

@@ -14,8 +14,8 @@ from rtloop.drivers.registry import driver_class
 from rtloop.engine.memory import Sizes
 from rtloop.law.extras import Extras
 from rtloop.law.memory import NO_EXTRAS, Layout
-from rtloop.laws.registry import LawReference, layout_of
-from rtloop.signals import Mode, columns
+from rtloop.laws.registry import LawReference, law_layout
+from rtloop.signals import Mode, column_names
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ class Plan:
     @property
     def layout(self) -> Layout:
         """The records of these laws."""
-        return layout_of(self.laws)
+        return law_layout(self.laws)
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a record."""
-        return columns(self.axes, self.observed, self.extras.columns)
+        return column_names(self.axes, self.observed, self.extras.columns)
 
     @property
     def sizes(self) -> Sizes:

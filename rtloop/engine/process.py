@@ -24,9 +24,9 @@ from rtloop.engine.clock import clock_context, paced_clock, unpaced_clock
 from rtloop.engine.loop import WRITE_FAILED, Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.plan import Plan, require_facts
-from rtloop.engine.ramp import found_v, ramp_to_safe
+from rtloop.engine.ramp import ramp_to_safe, starting_outputs_v
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
-from rtloop.errors import ConfigError, HostRefused, LoopFault, RtloopError, UnavailableError, one_line
+from rtloop.errors import ConfigError, HostRefusal, LoopFault, RtloopError, UnavailableError, one_line_error
 
 EXIT_CODES = {
     Outcome.DONE: 0,
@@ -63,31 +63,31 @@ def main() -> int:
     driver: Driver | None = None
     state = ProcessState.FAILED
     try:
-        driver, facts = _driver(plan)
-        outcome = _run(plan, block, driver, facts)
+        driver, facts = _make_driver(plan)
+        outcome = _run_plan(plan, block, driver, facts)
         report("finished", outcome=outcome.name.lower(), driver_error=block.fault)
         state = ProcessState.FINISHED
         code = EXIT_CODES[outcome]
     except (DriverError, RtloopError) as error:
-        code = _failed(error)
+        code = _report_failure(error)
     finally:
         try:
             if driver is not None:
                 driver.close()
         except DriverError as error:
-            code, state = _failed(error), ProcessState.FAILED
+            code, state = _report_failure(error), ProcessState.FAILED
         block.store(Word.LOOP_STATE, state)
     return code
 
 
-def _failed(error: DriverError | RtloopError) -> int:
+def _report_failure(error: DriverError | RtloopError) -> int:
     """Say why there is no run; the exit code."""
     code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
     report("failed", message=str(error), exit_code=code)
     return code
 
 
-def _driver(plan: Plan) -> tuple[Driver, Facts]:
+def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
     """The plan's driver, not yet opened. Raises ConfigError for what it cannot be."""
     try:
         driver = plan.driver()
@@ -96,17 +96,17 @@ def _driver(plan: Plan) -> tuple[Driver, Facts]:
         raise ConfigError(plan.name, [f"driver.{error}"]) from error
 
 
-def _opened(driver: Driver) -> Pointers:
+def _open_driver(driver: Driver) -> Pointers:
     """Whatever a third party's driver raises as it opens, said with its name. Raises DriverError."""
     try:
         return driver.open()
     except DriverError:
         raise
     except Exception as error:
-        raise DriverError(f"driver {driver.kind!r}: it could not be opened: {one_line(error)}") from error
+        raise DriverError(f"driver {driver.kind!r}: it could not be opened: {one_line_error(error)}") from error
 
 
-def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
+def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
     context = clock_context(plan.pacing.rate_hz)
     if plan.pacing.paced:
         clock = paced_clock(context, plan.pacing.spin_us)
@@ -114,15 +114,17 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcom
         die_with_parent()
         ring = block.ring("ticks")
         clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, ring.marks.size // 2)
-    pointers = _opened(driver)
-    ramp_to_safe(driver, pointers, found_v(driver, None), plan.trip_slew_v_per_s)  # as somebody who died left them
+    pointers = _open_driver(driver)
+    ramp_to_safe(
+        driver, pointers, starting_outputs_v(driver, None), plan.trip_slew_v_per_s
+    )  # as somebody who died left them
     assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
     freeze_garbage_collection()
     realtime = prepare_realtime(plan.pacing)
     granted = realtime["scheduler"] == "SCHED_FIFO" and realtime["mlock"]
     if plan.pacing.require_realtime and plan.pacing.paced and not granted:
-        raise HostRefused(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
+        raise HostRefusal(f"loop.require_realtime: true, but the host refused {'; '.join(realtime['refused'])}")
     block.store(Word.LOOP_STATE, ProcessState.READY)
     report("ready", realtime=realtime)
     while not block.load(Word.GO):
@@ -144,15 +146,15 @@ def _run(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcom
         return outcome
     finally:
         if assembly.loop.failed:
-            block.fault = _fault(driver, assembly.loop)
+            block.fault = _fault_text(driver, assembly.loop)
         ramp_to_safe(driver, pointers, assembly.outputs_v, plan.trip_slew_v_per_s)  # where the loop did not
 
 
-def _fault(driver: Driver, loop: Any) -> str:
+def _fault_text(driver: Driver, loop: Any) -> str:
     """Which driver failed at what, when, and why as far as it says so."""
     operation = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
-    reason = f"its status was {loop.failed_status}" if error is None else one_line(error)
+    reason = f"its status was {loop.failed_status}" if error is None else one_line_error(error)
     return f"driver {driver.kind!r}: {operation} failed at tick {loop.failed_tick}: {reason}"
 
 

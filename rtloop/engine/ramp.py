@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.drivers.base import Channel, Driver, Pointers, index_of
+from rtloop.drivers.base import Channel, Driver, Pointers, channel_index
 from rtloop.drivers.errors import DriverError
 
 Volts = npt.NDArray[np.float64]
@@ -36,10 +36,10 @@ def safe_outputs_v(driver: Driver) -> Volts:
 
 def output_indices(driver: Driver) -> list[int]:
     """Output of each axis, in the order of the axes."""
-    return [index_of(driver.facts.outputs, wiring.output) for wiring in driver.wiring.values()]
+    return [channel_index(driver.facts.outputs, wiring.output) for wiring in driver.wiring.values()]
 
 
-def require_short_ramp(where: str, slew_v_per_s: float, output: Channel) -> None:
+def require_short_ramp(key: str, slew_v_per_s: float, output: Channel) -> None:
     """Raise ValueError, which begins with `where`, for a slew that takes longer than LONGEST_RAMP_S to safe.
 
     The ramp counts from the end of the channel's range that is farthest from safe.
@@ -48,15 +48,15 @@ def require_short_ramp(where: str, slew_v_per_s: float, output: Channel) -> None
     if slew_v_per_s * LONGEST_RAMP_S < farthest_v:
         ramp_s, minimum_v_per_s = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
         raise ValueError(
-            f"{where}: {slew_v_per_s:g} takes {ramp_s:.3g} s from {farthest_v:g} V to "
+            f"{key}: {slew_v_per_s:g} takes {ramp_s:.3g} s from {farthest_v:g} V to "
             f"safe; {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s, are allowed"
         )
 
 
-def unusable_drives(driver: Driver, noted_v: Sequence[float] | Volts) -> list[str]:
+def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Volts) -> list[str]:
     """A sentence for each axis whose noted drive is no number, or beyond the range of its channel."""
     sentences = []
-    for axis, index, volts in zip(driver.wiring, output_indices(driver), noted_v, strict=True):
+    for axis, index, volts in zip(driver.wiring, output_indices(driver), recorded_v, strict=True):
         channel = driver.facts.outputs[index]
         if not channel.minimum_v <= volts <= channel.maximum_v:
             allowed = f"{channel.minimum_v:g} … {channel.maximum_v:g} V"
@@ -66,7 +66,7 @@ def unusable_drives(driver: Driver, noted_v: Sequence[float] | Volts) -> list[st
     return sentences
 
 
-def found_v(driver: Driver, noted_v: Sequence[float] | Volts | None) -> Volts:
+def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Volts | None) -> Volts:
     """Where the outputs of a driver are that was just opened: as it says, else as noted, axis by axis; else safe.
 
     A card that says a value beyond a channel's range is at the end of that range. A noted value beyond it, or one that
@@ -79,8 +79,8 @@ def found_v(driver: Driver, noted_v: Sequence[float] | Volts | None) -> Volts:
         outputs_v = np.clip(np.array(reported_v, float), lowest_v, highest_v)
         return np.where(np.isnan(outputs_v), safe_v, outputs_v)
     outputs_v = safe_v.copy()
-    if noted_v is not None:
-        outputs_v[output_indices(driver)] = noted_v
+    if recorded_v is not None:
+        outputs_v[output_indices(driver)] = recorded_v
     return np.where((outputs_v >= lowest_v) & (outputs_v <= highest_v), outputs_v, safe_v)
 
 
@@ -113,14 +113,14 @@ def ramp_to_safe(
         values = np.ascontiguousarray(row)
         deadline_s = time.monotonic() + GIVE_UP_S
         while (status := write(pointers.context, values.ctypes.data)) < 0 and time.monotonic() < deadline_s:
-            _wait(time.monotonic() + period_s)
+            _wait_until(time.monotonic() + period_s)
         if status < 0:
             raise DriverError(f"{driver.kind}: write failed while parking at {row.tolist()} V")
         on_step(row)
-        _wait(time.monotonic() + period_s)
+        _wait_until(time.monotonic() + period_s)
 
 
-def _wait(until_s: float) -> None:
+def _wait_until(until_s: float) -> None:
     while (remaining_s := until_s - time.monotonic()) > 0:
         if remaining_s > SPIN_S:
             time.sleep(remaining_s - SPIN_S)

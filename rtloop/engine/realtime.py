@@ -30,11 +30,11 @@ def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
     }
     if not pacing.paced:
         return report
-    _try(report, "affinity", lambda: _affinity(pacing.cpu))
-    _try(report, "mlock", lambda: _checked(_libc.mlockall(MCL_CURRENT | MCL_FUTURE)) or True)
-    _try(report, "timer_slack_ns", lambda: _checked(_libc.prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)) or 1)
-    _try(report, "pm_qos", _hold_pm_qos)
-    _try(report, "priority", lambda: _fifo(pacing.priority))
+    _request(report, "affinity", lambda: _set_affinity(pacing.cpu))
+    _request(report, "mlock", lambda: _require_success(_libc.mlockall(MCL_CURRENT | MCL_FUTURE)) or True)
+    _request(report, "timer_slack_ns", lambda: _require_success(_libc.prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)) or 1)
+    _request(report, "pm_qos", _request_pm_qos)
+    _request(report, "priority", lambda: _enter_fifo(pacing.priority))
     if report["priority"]:
         report["scheduler"] = "SCHED_FIFO"
     return report
@@ -52,31 +52,31 @@ def die_with_parent() -> None:
     _libc.prctl(PR_SET_PDEATHSIG, 9, 0, 0, 0)
 
 
-def _try(report: dict[str, Any], name: str, request: Any) -> None:
+def _request(report: dict[str, Any], name: str, request: Any) -> None:
     try:
         report[name] = request()
     except OSError as error:
         report["refused"].append(f"{name}: {os.strerror(error.errno or 0)}")
 
 
-def _checked(result: int) -> int:
+def _require_success(result: int) -> int:
     if result != 0:
         raise OSError(ctypes.get_errno(), "refused")
     return result
 
 
-def _affinity(cpu: int | None) -> list[int]:
+def _set_affinity(cpu: int | None) -> list[int]:
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
     return sorted(os.sched_getaffinity(0))
 
 
-def _fifo(priority: int) -> int:
+def _enter_fifo(priority: int) -> int:
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     return priority
 
 
-def _hold_pm_qos() -> bool:
+def _request_pm_qos() -> bool:
     """Keep the processors out of deep idle states while this process lives: the open file is the request."""
     fd = os.open(PM_QOS_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     os.write(fd, (0).to_bytes(4, "little"))

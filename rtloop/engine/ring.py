@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.native.atomics import fence_acquire, fence_release, load_acquire, store_release
-from rtloop.hil.native.compiled import entry, jit
-from rtloop.hil.native.pointers import address_pointer, carray, copy
+from rtloop.hil.native.compiled import jit, python_entry
+from rtloop.hil.native.pointers import address_pointer, carray, copy_bytes
 
 BUSY = np.uint64(0xFFFFFFFFFFFFFFFF)
 ONE = np.uint64(1)
@@ -29,13 +29,13 @@ class Ring(NamedTuple):
 
 
 @jit
-def slot_of(ring, position):
+def slot_index(ring, position):
     """Slot of a position."""
-    return _slot(ring.marks.shape[0], position)
+    return _wrapped_position(ring.marks.shape[0], position)
 
 
 @jit
-def _slot(count, position):
+def _wrapped_position(count, position):
     """The number of slots is a power of two."""
     return np.int64(position & np.uint64(count - 1))
 
@@ -43,7 +43,7 @@ def _slot(count, position):
 @jit
 def claim(ring, position):
     """Slot to fill for `position` (uint64): its old content is invalid from here on. Writer only."""
-    slot = slot_of(ring, position)
+    slot = slot_index(ring, position)
     store_release(ring.marks, slot, BUSY)
     fence_release()
     return slot
@@ -52,7 +52,7 @@ def claim(ring, position):
 @jit
 def publish(ring, position):
     """Make the filled slot of `position` visible to all readers. Writer only."""
-    store_release(ring.marks, slot_of(ring, position), position + ONE)
+    store_release(ring.marks, slot_index(ring, position), position + ONE)
     store_release(ring.head, 0, position + ONE)
 
 
@@ -73,7 +73,7 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
     return copied, int(first[0]), int(first[0]) - int(cursor)
 
 
-@entry("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
+@python_entry("int64(intp, intp, intp, int64, int64, intp, int64, intp)")
 def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, first_address):
     """Slots copied; `first`, the position to begin with, becomes that of the first of them."""
     head_word = carray(address_pointer(head_address), 1, np.uint64)
@@ -86,10 +86,10 @@ def _drain(head_address, marks_address, slots, count, slot_bytes, out, room, fir
     copied = 0
     while copied < room and first + np.uint64(copied) < head:
         position = first + np.uint64(copied)
-        slot = _slot(count, position)
+        slot = _wrapped_position(count, position)
         intact = load_acquire(marks, slot) == position + ONE
         if intact:
-            copy(out + copied * slot_bytes, slots + slot * slot_bytes, slot_bytes)
+            copy_bytes(out + copied * slot_bytes, slots + slot * slot_bytes, slot_bytes)
             fence_acquire()
             intact = load_acquire(marks, slot) == position + ONE
         if intact:

@@ -1,15 +1,15 @@
 """The event of a trip: which axis, by which value beyond which limit. Not judged here: the law has, a tick is told of.
 
-The conditions are those of `rtloop.law.safety` and `rtloop.law.watch`, on the same inputs and the same state.
+The conditions are those of `rtloop.law.safety` and `rtloop.law.lasting_causes`, on the same inputs and the same state.
 """
 
 from __future__ import annotations
 
 from rtloop.engine.commands import publish_event
-from rtloop.engine.context import conditions_of, floats, law_of
+from rtloop.engine.context import float_array, law_record, tick_conditions
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
-from rtloop.hil.native.compiled import seldom
-from rtloop.law.access import coefficients_of, state_of
+from rtloop.hil.native.compiled import jit_rare
+from rtloop.law.access import axis_state, coefficients_record
 from rtloop.signals import Failure, Flag
 
 TRIPPED, LOOP = int(Kind.TRIPPED), int(Origin.LOOP)
@@ -23,14 +23,14 @@ NON_FINITE, SENSOR_RANGE, POSITION, STALE, ENABLE, FROZEN, LATE, TRACKING, OSCIL
 )
 
 
-@seldom
+@jit_rare
 def publish_trip(loop, causes):
     """One event of all new `causes`, with the first axis and cause that explains it, the value and its limit."""
-    law = law_of(loop)
-    adc_v = floats(loop.adc_v, loop.axis_count)
+    law = law_record(loop)
+    adc_v = float_array(loop.adc_v, loop.axis_count)
     for a in range(loop.axis_count):
-        coefficients, state = coefficients_of(law, a), state_of(law, a)
-        cause, value, limit = _first_cause(coefficients, state, adc_v[a], conditions_of(loop), causes)
+        coefficients, state = coefficients_record(law, a), axis_state(law, a)
+        cause, value, limit = _first_cause(coefficients, state, adc_v[a], tick_conditions(loop), causes)
         if cause != 0:
             number = coefficients.feedforward_law if limit >= FEEDFORWARD_FAILURES else coefficients.controller_law
             publish_event(loop, TRIPPED, a, LOOP, 0, (float(causes), value, limit, float(cause), float(number)))
@@ -38,7 +38,7 @@ def publish_trip(loop, causes):
     publish_event(loop, TRIPPED, ALL_AXES, LOOP, 0, (float(causes), 0.0, 0.0, 0.0))
 
 
-@seldom
+@jit_rare
 def _first_cause(coefficients, state, adc_v, conditions, causes):
     """Flag bit, value and limit of what is wrong on one axis; 0 where nothing among `causes` is."""
     if causes & LAW != 0 and state.failed != 0:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.configuration.file import Configuration, parse
-from rtloop.design.toml_text import section
-from rtloop.errors import writing
+from rtloop.design.toml_text import write_section
+from rtloop.errors import output_errors
 from rtloop.experiments.procedure import Run, hold
 from rtloop.hil.trusted import overwrite_file
 
@@ -54,14 +54,14 @@ def derived(
         "segments": timeline.segments,
     }
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))
-    text = section("", raw, [MARK + json.dumps(about, allow_nan=False), f"derived from {base.name}"])
+    text = write_section("", raw, [MARK + json.dumps(about, allow_nan=False), f"derived from {base.name}"])
     return parse(text, name, base.folder, f"{base.name}, experiment {experiment}")
 
 
 def keep_tables(run: Run, folder: Path) -> None:
     """Write the tables of a run to a folder, and have its references read them there. Raises OutputError."""
     for name, samples in run.tables.items():
-        with writing(folder / name):
+        with output_errors(folder / name):
             folder.mkdir(parents=True, exist_ok=True)
             with os.fdopen(overwrite_file(folder / name), "wb") as file:
                 np.save(file, samples)

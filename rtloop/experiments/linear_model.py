@@ -15,7 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop, sampled_plant
-from rtloop.analysis.perturbation import Range, changes, lightest_pair, maker, until_unstable, with_resonance_shifted
+from rtloop.analysis.perturbation import (
+    PercentRange,
+    least_damped_pole,
+    loop_builder,
+    plant_changes,
+    shift_resonance,
+    stability_range,
+)
 from rtloop.analysis.step_response import step_metrics
 from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.coefficients import controller_of
@@ -53,12 +60,12 @@ class LinearModel:
     @cached_property
     def resonance_hz(self) -> float | None:
         """Of the most lightly damped pair of poles; None where there is no pair."""
-        return abs(lightest_pair(self.dynamics)) / (2 * np.pi) if np.any(self.dynamics.poles.imag > 0) else None
+        return abs(least_damped_pole(self.dynamics)) / (2 * np.pi) if np.any(self.dynamics.poles.imag > 0) else None
 
     @cached_property
     def decay_per_s(self) -> float:
         """How fast the resonance dies away; 0 where there is none."""
-        return -lightest_pair(self.dynamics).real if self.resonance_hz else 0.0
+        return -least_damped_pole(self.dynamics).real if self.resonance_hz else 0.0
 
     def plant(self, hz: npt.ArrayLike) -> Complex:
         """P, from a command without hysteresis to the position, at frequencies (k,) in Hz."""
@@ -66,7 +73,7 @@ class LinearModel:
 
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
         """From the reference to the position, at frequencies (k,) in Hz."""
-        return None if self.loop is None else self.loop.from_reference(hz)[0]
+        return None if self.loop is None else self.loop.response_from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
         """S·P, from a disturbance before the dynamics to the position, at frequencies (k,) in Hz."""
@@ -82,9 +89,9 @@ class LinearModel:
             return None
         a, b, c, d = self.loop.matrices
         path = self.loop.reference
-        answer = simulated(a, b, c, d, path.toward_error(reference))
-        if path.commands:
-            answer += simulated(a, self.loop.injection.b, c, np.array([0.0, 1.0]), path.toward_command(reference))
+        answer = simulated(a, b, c, d, path.error_input(reference))
+        if path.has_command_path:
+            answer += simulated(a, self.loop.injection.b, c, np.array([0.0, 1.0]), path.command_input(reference))
         return answer[0], answer[1]
 
     def left_of(self, disturbance: Real) -> Real | None:
@@ -100,7 +107,11 @@ class LinearModel:
     @cached_property
     def sine_peak(self) -> float | None:
         """Largest command per amplitude of a sine of the reference, at any frequency."""
-        return None if self.loop is None else float(np.abs(self.loop.from_reference(self.loop.frequencies)[1]).max())
+        return (
+            None
+            if self.loop is None
+            else float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
+        )
 
     @cached_property
     def tracking_peak(self) -> float | None:
@@ -123,7 +134,7 @@ class LinearModel:
 
     def stable_at(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted."""
-        shifted = self.loop_with(with_resonance_shifted(self.dynamics, shift_percent))
+        shifted = self.loop_with(shift_resonance(self.dynamics, shift_percent))
         return shifted is not None and shifted.is_stable
 
     def loop_with(self, plant: Transfer) -> Loop | None:
@@ -133,12 +144,12 @@ class LinearModel:
         return discrete_loop(self._controller, plant, self._delay_ticks, self._path)
 
     @cached_property
-    def tolerated(self) -> Range | None:
+    def tolerated(self) -> PercentRange | None:
         """Shifts of the resonance within which the loop is stable."""
         if self._controller is None or not self.resonance_hz:
             return None
-        resonance = changes(self.dynamics)["resonance"]
-        return until_unstable(maker(self._controller, self._delay_ticks), self.dynamics, resonance)
+        resonance = plant_changes(self.dynamics)["resonance"]
+        return stability_range(loop_builder(self._controller, self._delay_ticks), self.dynamics, resonance)
 
 
 def linear_model(axis: AxisOptions, rate_hz: float) -> LinearModel | None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rtloop.values import rendered
+from rtloop.values import render_page
 
 HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
 
@@ -17,7 +17,7 @@ def page(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]]
 
     Pictures are dark on dark screens; paper is always light.
     """
-    return rendered(
+    return render_page(
         __package__,
         title=f"{content['name']}: experiments",
         when=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(content["created_unix_ns"] / 1e9)),

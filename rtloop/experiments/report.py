@@ -17,7 +17,7 @@ from rtloop.experiments.theme import pictures
 from rtloop.experiments.verdict import Analysis, Table
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
-from rtloop.values import plain
+from rtloop.values import to_jsonable
 
 Say = Callable[[str], None]
 
@@ -70,7 +70,7 @@ def report(takings: Sequence[Taken], say: Say = lambda _: None) -> Report:
         "versions": first["versions"],
         "experiments": sections,
     }
-    return Report(plain(content), drawn)
+    return Report(to_jsonable(content), drawn)
 
 
 def _section(

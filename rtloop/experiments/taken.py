@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.configuration.axis import AxisOptions
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.synthesis.specification import SpecificationOptions
-from rtloop.design.verification.judgement import limits
+from rtloop.design.verification.judgement import required_limits
 from rtloop.experiments.derive import about
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.procedure import Segment
@@ -82,7 +82,9 @@ class Taken:
         self, name: str, quantity: str, unit: str, run: float, model: float | None = None, tolerance: float = 0.0
     ) -> Row:
         """A quantity with what the axis's specification asks and claims of it, by its `name` there."""
-        return Row(quantity, unit, run, model, tolerance, limits(self.asked).get(name), self.asked.claims.get(name))
+        return Row(
+            quantity, unit, run, model, tolerance, required_limits(self.asked).get(name), self.asked.claims.get(name)
+        )
 
     @property
     def trip(self) -> dict[str, Any] | None:

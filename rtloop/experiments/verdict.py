@@ -30,14 +30,14 @@ class Row:
     @property
     def met(self) -> bool | None:
         """Whether what is asked is met; None where nothing is asked, or the run did not show the quantity (NaN)."""
-        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.met(self.run))
+        return None if self.limit is None or math.isnan(self.run) else bool(self.limit.is_met_by(self.run))
 
     @property
     def as_claimed(self) -> bool | None:
         """Whether the claim is borne out; None where there is none, or none with a number."""
         if self.claim is None or not self.claim.is_number or not math.isfinite(self.run):
             return None
-        return bool(self.claim.borne_out(self.run))
+        return bool(self.claim.is_borne_out(self.run))
 
     @property
     def as_the_model(self) -> bool | None:

@@ -26,7 +26,7 @@ from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import loading_curve, loading_slopes, model_output
 from rtloop.laws.shipped.play_model import PlayModel
 
-SAME = 1e-9
+SAME_BEND = 1e-9
 """Bends closer than this part of the largest are one."""
 
 
@@ -89,37 +89,37 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
         )
     if not (np.isfinite(command_um) and command_um > 0):
         raise ValueError(f"command_um: {command_um}; a finite number above 0 is needed")
-    bends = np.concatenate([inverse.thresholds, _commands_for(inverse, actuator.thresholds)])
-    thresholds = _distinct(bends[bends < command_um], command_um)
+    bends = np.concatenate([inverse.thresholds, _inverse_loading_curve(inverse, actuator.thresholds)])
+    thresholds = _distinct_values(bends[bends < command_um], command_um)
     middles = 0.5 * (thresholds + np.append(thresholds[1:], command_um))
     drives = loading_curve(inverse, middles)
-    steepness = _slope_at(actuator, drives) * _slope_at(inverse, middles)
+    steepness = _loading_slope(actuator, drives) * _loading_slope(inverse, middles)
     operator = PlayModel(thresholds, np.diff(steepness, prepend=0.0))
     lengths = np.diff(thresholds, append=command_um)
     return Residual(operator, command_um, float(steepness[-1]), _weighted_median(steepness, lengths))
 
 
-def compensated(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
+def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
     """y (samples,) for a sequence of commands v (samples,), by simulation of both models from rest."""
     return model_output(actuator, model_output(inverse, commands_um))
 
 
-def _commands_for(inverse: PlayModel, drives: Real) -> Real:
+def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
     """The v ≥ 0 at which the increasing curve of `inverse` reaches each of `drives`."""
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
     return inverse.thresholds[part] + (drives - levels[part]) / loading_slopes(inverse)[part]
 
 
-def _slope_at(model: PlayModel, points: Real) -> Real:
+def _loading_slope(model: PlayModel, points: Real) -> Real:
     """dφ at `points`; 0 in the dead band before the first threshold."""
     slopes = np.concatenate([[0.0], loading_slopes(model)])
     return slopes[np.searchsorted(model.thresholds, points, side="right")]
 
 
-def _distinct(values: Real, largest: float) -> Real:
+def _distinct_values(values: Real, largest: float) -> Real:
     ordered = np.sort(values)
-    return ordered[np.concatenate([[True], np.diff(ordered) > SAME * largest])]
+    return ordered[np.concatenate([[True], np.diff(ordered) > SAME_BEND * largest])]
 
 
 def _weighted_median(values: Real, weights: Real) -> float:

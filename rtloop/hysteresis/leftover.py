@@ -17,7 +17,7 @@ LARGEST_SHARE = 0.5
 """δ as a part of the model's mean slope: beyond it the actuator is not that of the model any more."""
 
 
-def with_hysteresis_left(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
+def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
     """The model changed so that its inverse leaves a loop of h/H = `percent` over ±`drive_v`; itself for 0.
 
     Raises ValueError where that is less than its own dead band leaves, or more than can be put in.
@@ -28,21 +28,22 @@ def with_hysteresis_left(model: PlayModel, percent: float, drive_v: float) -> Pl
 
     reach_um = float(loading_curve(model, drive_v))
     command_um = reach_um * np.sin(np.linspace(0, 2 * np.pi * CYCLES, round(SAMPLES * CYCLES)))
-    drives_v = np.clip(model_output(model.without_dead_band().inverse(), command_um), -drive_v, drive_v)
+    drives_v = np.clip(model_output(model.remove_dead_band().inverse(), command_um), -drive_v, drive_v)
 
-    def left(share: float) -> float:
-        return loop_shape(command_um, model_output(_changed(model, share, drive_v), drives_v)).percent
+    def residual_percent(share: float) -> float:
+        return loop_shape(command_um, model_output(_add_play(model, share, drive_v), drives_v)).percent
 
-    lowest_percent, highest_percent = left(0.0), left(LARGEST_SHARE)
+    lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)
     if not lowest_percent < percent < highest_percent:
         raise ValueError(
-            f"residual_percent: {percent:g}; above {lowest_percent:.3g} and below {highest_percent:.3g} are allowed here"
+            f"residual_percent: {percent:g}; above {lowest_percent:.3g} and below {highest_percent:.3g} are allowed "
+            "here"
         )
-    share = root_scalar(lambda share: left(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
-    return _changed(model, share, drive_v)
+    share = root_scalar(lambda share: residual_percent(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
+    return _add_play(model, share, drive_v)
 
 
-def _changed(model: PlayModel, share: float, drive_v: float) -> PlayModel:
+def _add_play(model: PlayModel, share: float, drive_v: float) -> PlayModel:
     added = share * float(loading_curve(model, drive_v)) / drive_v
     thresholds, place = np.unique(np.append(model.thresholds, 0.5 * drive_v), return_inverse=True)
     weights = np.zeros(thresholds.size)

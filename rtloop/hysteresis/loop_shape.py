@@ -39,12 +39,12 @@ def loop_shape(drive: Real, output: Real) -> LoopShape:
     whole_branches = [part for part in branches if np.ptp(drive[part]) > 0.98 * span]
     last = whole_branches[-2:] if len(whole_branches) >= 2 else branches[-2:]
     edges = np.linspace(drive.min(), drive.max(), BINS + 1)
-    first, second = (_branch(drive[part], output[part], edges) for part in last)
+    first, second = (_branch_output(drive[part], output[part], edges) for part in last)
     whole_loop = output[last[0].start : last[-1].stop]
     return LoopShape(float(np.abs(first - second)[1:-1].max()), float(np.ptp(whole_loop)))
 
 
-def _branch(drive: Real, output: Real, edges: Real) -> Real:
+def _branch_output(drive: Real, output: Real, edges: Real) -> Real:
     """Output at the bins' edges, straight between the means of the bins: on a straight piece these lie on it."""
     bins = np.clip(np.digitize(drive, edges) - 1, 0, BINS - 1)
     counts = np.bincount(bins, minlength=BINS)

@@ -17,16 +17,16 @@ from rtloop.hil.modal import Real
 from rtloop.laws.shipped.play_model import PlayModel
 
 
-def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, before: Real | None = None) -> Real:
+def play_outputs(drive: npt.ArrayLike, thresholds: npt.ArrayLike, initial_outputs: Real | None = None) -> Real:
     """F_r[u], (samples, plays), of virgin plays, or of plays that stood at `before` (plays,) when the drive was first
     seen.
 
     While the drive does not turn back, the formula holds for all samples at once with the state before the first.
     """
     u, r = np.asarray(drive, dtype=float), np.asarray(thresholds, dtype=float)
-    u = np.concatenate([[0.0] if before is None else u[:1], u])
+    u = np.concatenate([[0.0] if initial_outputs is None else u[:1], u])
     outputs = np.empty((u.size, r.size))
-    last = np.zeros(r.size) if before is None else before
+    last = np.zeros(r.size) if initial_outputs is None else initial_outputs
     bounds = [0, *(_reversals(u) + 1).tolist(), u.size]
     for start, end in pairwise(bounds):
         part = u[start:end, None]
@@ -40,7 +40,7 @@ def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
     return play_outputs(drive, model.thresholds) @ model.weights
 
 
-def turning_points(drive: Real, least: float) -> npt.NDArray[np.intp]:
+def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
     """Where the drive turned back by at least `least`: its alternating highest and lowest samples, not the first."""
     turns: list[int] = []
     candidates = [0, *_reversals(drive).tolist(), drive.size - 1]
@@ -48,10 +48,10 @@ def turning_points(drive: Real, least: float) -> npt.NDArray[np.intp]:
     for k in candidates:
         low = k if drive[k] <= drive[low] else low
         high = k if drive[k] >= drive[high] else high
-        if drive[k] <= drive[high] - least:
+        if drive[k] <= drive[high] - min_reversal:
             turns += [high] if not turns or drive[turns[-1]] < drive[high] else []
             low = high = k
-        elif drive[k] >= drive[low] + least:
+        elif drive[k] >= drive[low] + min_reversal:
             turns += [low] if not turns or drive[turns[-1]] > drive[low] else []
             low = high = k
     return np.array([k for k in turns if k], dtype=np.intp)

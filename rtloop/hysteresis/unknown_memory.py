@@ -21,11 +21,11 @@ import numpy.typing as npt
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
 
-LEAST_WITHIN = 0.03
+MIN_INTERVAL_SHARE = 0.03
 """Part of the drive's range that a stretch within what was covered has at least: noise makes small ones."""
 
 
-class Missing(NamedTuple):
+class MissingStroke(NamedTuple):
     """What a drive left out, in V: from `turn_v`, the later of its two extremes, it came back to `reached_v` at the
     farthest and not to `goal_v`, the other extreme."""
 
@@ -34,14 +34,14 @@ class Missing(NamedTuple):
     goal_v: float
 
 
-def known_stretches(drive: Real) -> npt.NDArray[np.intp]:
+def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
     """Number of the stretch within what was covered before that each sample (samples,) is in; −1 where in none.
 
     A stretch begins at an end of what was covered, and shows plays of up to half of its own range, no larger ones.
     """
     is_extended = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
     beyond = np.concatenate([[True], is_extended, [True]])
-    numbers, number, minimum_v = np.full(drive.size, -1), 0, LEAST_WITHIN * float(np.ptp(drive))
+    numbers, number, minimum_v = np.full(drive.size, -1), 0, MIN_INTERVAL_SHARE * float(np.ptp(drive))
     for start, end in np.flatnonzero(np.diff(beyond)).reshape(-1, 2):
         if np.ptp(drive[start : end + 1]) >= minimum_v:
             numbers[start + 1 : end + 1] = number
@@ -49,21 +49,21 @@ def known_stretches(drive: Real) -> npt.NDArray[np.intp]:
     return numbers
 
 
-def missing_stroke(drive: Real) -> Missing:
+def missing_stroke(drive: Real) -> MissingStroke:
     """What would have let a stretch within what was covered have the drive's whole range."""
     low, high = int(np.argmin(drive)), int(np.argmax(drive))
     if low > high:
-        return Missing(float(drive[low]), float(drive[low:].max()), float(drive[high]))
-    return Missing(float(drive[high]), float(drive[high:].min()), float(drive[low]))
+        return MissingStroke(float(drive[low]), float(drive[low:].max()), float(drive[high]))
+    return MissingStroke(float(drive[high]), float(drive[high:].min()), float(drive[low]))
 
 
-def known_from(drive: Real, threshold_v: float) -> int | None:
+def first_determined_sample(drive: Real, threshold_v: float) -> int | None:
     """The first sample at which plays up to this threshold are known; None where that is never."""
     covered = np.maximum.accumulate(drive) - np.minimum.accumulate(drive)
     return int(np.argmax(covered >= 2 * threshold_v)) if covered[-1] >= 2 * threshold_v else None
 
 
-def settled_memory(drive: Real, thresholds: Real) -> Real:
+def periodic_memory(drive: Real, thresholds: Real) -> Real:
     """What the plays (plays,) remember at the first sample if the same drive has gone before, again and again."""
     memory = np.full(thresholds.size, 0.5 * float(drive.max() + drive.min()))
     cycle = np.append(drive, drive[0])

@@ -20,11 +20,11 @@ from typing import IO, Any
 import numpy as np
 
 from rtloop.errors import MissingExtra, RtloopError
-from rtloop.interchange.formats.groups import BYTES_AT_MOST, rows_of
+from rtloop.interchange.formats.groups import MAX_BYTES, row_count
 from rtloop.interchange.formats.table import Table, UnopenedData, UnreadableData
-from rtloop.interchange.reading import read_here
+from rtloop.interchange.reading import read_in_process
 
-MEMORY_BYTES = 6 * BYTES_AT_MOST
+MEMORY_BYTES = 6 * MAX_BYTES
 """Of address space: libraries, what is read, and the copies that are made on the way."""
 
 
@@ -38,7 +38,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
     devnull = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=devnull, stdout=subprocess.PIPE, stderr=devnull, env=environment) as process:
         assert process.stdout
-        table = _received(path, process.stdout)
+        table = _receive_table(path, process.stdout)
     if table is None:
         number = -process.returncode
         cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
@@ -46,7 +46,7 @@ def read_table(path: Path, group: str | None = None) -> Table:
     return table
 
 
-def _received(path: Path, stream: IO[bytes]) -> Table | None:
+def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
     """The table; None where the process ended before it was whole. Raises what it says was wrong."""
     line = stream.readline()
     if not line.endswith(b"\n"):
@@ -65,32 +65,32 @@ def _received(path: Path, stream: IO[bytes]) -> Table | None:
     return Table(columns, message["units"], message["time"], message["about"], tuple(message["in_other_files"]))
 
 
-def _main(path: Path, group: str | None) -> None:
+def _serve_table(path: Path, group: str | None) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = sys.stdout.buffer
     try:
-        table = read_here(path, group)
+        table = read_in_process(path, group)
     except RtloopError as fault:
-        _say(out, {"error": str(fault), "kind": type(fault).__name__})
+        _send_line(out, {"error": str(fault), "kind": type(fault).__name__})
         return
     except MemoryError:
-        _say(out, {"error": f"{path}: needs more than {MEMORY_BYTES >> 30} GiB of memory; cut it", "kind": ""})
+        _send_line(out, {"error": f"{path}: needs more than {MEMORY_BYTES >> 30} GiB of memory; cut it", "kind": ""})
         return
     except Exception as fault:  # whatever a library lets through of a damaged file
-        _say(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})
+        _send_line(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})
         return
-    header = {"rows": rows_of(table), "columns": [*table.columns], "units": dict(table.units)}
+    header = {"rows": row_count(table), "columns": [*table.columns], "units": dict(table.units)}
     header |= {"time": table.time, "about": dict(table.about), "in_other_files": [*table.in_other_files]}
-    _say(out, header)
+    _send_line(out, header)
     for values in table.columns.values():
         out.write(values.data.cast("B"))
     out.flush()
 
 
-def _say(out: IO[bytes], what: dict[str, Any]) -> None:
-    out.write(json.dumps(what).encode() + b"\n")
+def _send_line(out: IO[bytes], message: dict[str, Any]) -> None:
+    out.write(json.dumps(message).encode() + b"\n")
     out.flush()
 
 
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)
+    _serve_table(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)

@@ -13,40 +13,40 @@ from typing import IO, Any
 
 import numpy as np
 
-from rtloop.errors import MissingExtra, OutputError, writing
-from rtloop.hil.trusted import remake_file
-from rtloop.interchange.hdf5_signals import append, begin, path_of
+from rtloop.errors import MissingExtra, OutputError, output_errors
+from rtloop.hil.trusted import replace_file
+from rtloop.interchange.hdf5_signals import append_rows, create_dataset, descriptor_path
 from rtloop.interchange.to_mat import write_mat
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.parts import Files, find_files
-from rtloop.recording.load import Recording, described, load
-from rtloop.recording.views.selection import ALL, Selection
+from rtloop.recording.file.parts import RecordingPaths, find_files
+from rtloop.recording.load import Recording, describe_signal, load
+from rtloop.recording.views.selection import ALL_SIGNALS, Selection
 
-FORMATS = {"csv": ".csv", "parquet": ".parquet", "npz": ".npz", "mat": ".mat", "hdf5": ".h5"}
+EXPORT_SUFFIXES = {"csv": ".csv", "parquet": ".parquet", "npz": ".npz", "mat": ".mat", "hdf5": ".h5"}
 """And how their files end."""
 PASS_BYTES = 512 << 20
 """Memory for the columns of one pass of the npz export."""
 ROW_GROUP = 1 << 18
 
-Progress = Callable[[int], None]
+ReportTicks = Callable[[int], None]
 
 
 def export(
-    files: Files,
+    files: RecordingPaths,
     to: str,
     output: Path | str | None = None,
-    progress: Progress | None = None,
-    selection: Selection = ALL,
+    progress: ReportTicks | None = None,
+    selection: Selection = ALL_SIGNALS,
 ) -> dict[str, Any]:
     """Write what is selected of a recording as `to`, one of FORMATS; `progress` is told the ticks so far.
 
     Returns {recording, output, ticks, bytes, problems}. Raises RecordingError, OutputError, MissingExtra.
     """
-    if to not in FORMATS:
-        raise RecordingError(f"export to {to!r}: possible are {', '.join(FORMATS)}")
+    if to not in EXPORT_SUFFIXES:
+        raise RecordingError(f"export to {to!r}: possible are {', '.join(EXPORT_SUFFIXES)}")
     recording, report_ticks = load(files), progress or (lambda _: None)
     path = find_files(files)[0]
-    target = path.with_suffix(FORMATS[to]) if output is None else Path(output)
+    target = path.with_suffix(EXPORT_SUFFIXES[to]) if output is None else Path(output)
     writers = {"csv": _write_csv, "parquet": _write_parquet, "npz": _write_npz, "hdf5": _write_hdf5}
     with _new_file(target) as part:
         if to == "mat":
@@ -70,10 +70,10 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
     part = target.with_name(target.name + ".part")
     if os.path.lexists(target):
         raise OutputError(f"{target} exists already; it is not overwritten")
-    with writing(part):
-        fd = remake_file(part)
+    with output_errors(part):
+        fd = replace_file(part)
     try:
-        with writing(target):
+        with output_errors(target):
             with os.fdopen(fd, "w+b") as file:
                 yield file
             os.replace(part, target)
@@ -81,32 +81,32 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
         part.unlink(missing_ok=True)
 
 
-def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
+def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """One line of names, then one line a tick; `float()` of each field gives the recorded number."""
-    ticks, names = 0, selection.names(recording)
+    ticks, names = 0, selection.selected_names(recording)
     file.write((",".join(names) + "\n").encode("ascii"))
-    for rows in selection.blocks(recording, names):
+    for rows in selection.read_blocks(recording, names):
         file.write("".join(",".join(map(repr, row)) + "\n" for row in rows.tolist()).encode("ascii"))
         ticks += len(rows)
         progress(ticks)
     return ticks
 
 
-def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
+def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """A column of doubles a signal, its unit in the field's metadata, header and events in the file's."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise MissingExtra("export to Parquet needs pyarrow: pip install 'rtloop[parquet]'") from None
-    names, units = selection.names(recording), recording.units
+    names, units = selection.selected_names(recording), recording.units
     fields = [pyarrow.field(name, pyarrow.float64(), nullable=False, metadata={"unit": units[name]}) for name in names]
     about = {"rtloop.header": json.dumps(recording.header), "rtloop.events": json.dumps(recording.events)}
     schema = pyarrow.schema(fields, metadata=about)
     ticks = 0
     try:
         with pyarrow.parquet.ParquetWriter(file, schema, compression="zstd") as writer:
-            for rows in _grouped(selection.blocks(recording, names)):
+            for rows in _join_blocks(selection.read_blocks(recording, names)):
                 columns = [np.ascontiguousarray(rows[:, index]) for index in range(rows.shape[1])]
                 writer.write_table(pyarrow.Table.from_arrays([pyarrow.array(c) for c in columns], schema=schema))
                 ticks += len(rows)
@@ -116,39 +116,39 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
     return ticks
 
 
-def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
+def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """An array a signal, and `header_json` and `events_json`; several passes where memory asks for it."""
-    all_names = selection.names(recording)
-    ticks = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
+    all_names = selection.selected_names(recording)
+    ticks = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))
     columns_per_pass = max(PASS_BYTES // (8 * max(ticks, 1)), 1)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for name, value in (("header_json", recording.header), ("events_json", recording.events)):
             _add_array(archive, name, np.array(json.dumps(value)))
         for start in range(0, len(all_names), columns_per_pass):
             names = all_names[start : start + columns_per_pass]
-            blocks = list(selection.blocks(recording, names)) or [np.empty((0, len(names)))]
+            blocks = list(selection.read_blocks(recording, names)) or [np.empty((0, len(names)))]
             for index, name in enumerate(names):
                 _add_array(archive, name, np.concatenate([rows[:, index] for rows in blocks]))
             progress(ticks * (start + len(names)) // len(all_names))
     return ticks
 
 
-def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, progress: Progress) -> int:
+def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """A dataset a signal, its `unit` and `meaning` as attributes; header and events as JSON in two more."""
     try:
         import h5py
     except ImportError:
         raise MissingExtra("export to HDF5 needs h5py: pip install 'rtloop[data]'") from None
-    names, ticks = selection.names(recording), 0
-    with h5py.File(path_of(file), "w", track_order=True) as root:
+    names, ticks = selection.selected_names(recording), 0
+    with h5py.File(descriptor_path(file), "w", track_order=True) as root:
         root.attrs["rate_hz"] = recording.header["rate_hz"]
         for name, value in (("header_json", recording.header), ("events_json", recording.events)):
             root[name] = json.dumps(value)
-        datasets = [begin(root, name) for name in names]
+        datasets = [create_dataset(root, name) for name in names]
         for name, dataset in zip(names, datasets, strict=True):
-            dataset.attrs.update({"unit": recording.units[name], "meaning": described(name).meaning})
-        for rows in selection.blocks(recording, names):
-            append(datasets, rows)
+            dataset.attrs.update({"unit": recording.units[name], "meaning": describe_signal(name).meaning})
+        for rows in selection.read_blocks(recording, names):
+            append_rows(datasets, rows)
             ticks += len(rows)
             progress(ticks)
     return ticks
@@ -159,7 +159,7 @@ def _add_array(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any])
         np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _grouped(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
+def _join_blocks(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
     """The blocks, joined to about ROW_GROUP rows."""
     pending: list[np.ndarray[Any, Any]] = []
     for rows in blocks:

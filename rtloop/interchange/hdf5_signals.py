@@ -11,17 +11,17 @@ CHUNK_TICKS = 1 << 16
 COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
-def path_of(file: IO[bytes]) -> str:
+def descriptor_path(file: IO[bytes]) -> str:
     """A path by which the HDF5 library opens an open file itself, whatever its name leads to by now."""
     return f"/proc/self/fd/{file.fileno()}"
 
 
-def begin(place: Any, name: str) -> Any:
+def create_dataset(parent: Any, name: str) -> Any:
     """An empty dataset of doubles in a group or file."""
-    return place.create_dataset(name, (0,), "<f8", maxshape=(None,), chunks=(CHUNK_TICKS,), **COMPRESSION)
+    return parent.create_dataset(name, (0,), "<f8", maxshape=(None,), chunks=(CHUNK_TICKS,), **COMPRESSION)
 
 
-def append(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
+def append_rows(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
     """Rows (n, datasets) behind what is there."""
     for dataset, values in zip(datasets, rows.T, strict=True):
         length = dataset.shape[0]

@@ -18,14 +18,14 @@ from unicodedata import normalize
 
 from rtloop.hil.modal import Real
 from rtloop.interchange.formats.table import Table, UnreadableData
-from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scaled
-from rtloop.recording.load import unit_of
-from rtloop.signals import COMMON, DRIVE, PER_AXIS
+from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scale_values
+from rtloop.recording.load import signal_unit
+from rtloop.signals import AXIS_SIGNALS, COMMON_SIGNALS, DRIVE
 
 FIRST_AXIS = "x"
-ALIKE = 3
+MAX_SUGGESTIONS = 3
 """Columns that are named where one is not found."""
-LONGEST_NAME = 90
+MAX_NAME_CHARACTERS = 90
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _SOURCE = re.compile(
     r"(?P<column>.+?)(?:\s*\[(?P<unit>[^\[\]]*)\])?"
@@ -34,32 +34,32 @@ _SOURCE = re.compile(
 )
 _BRACKETED = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\)|\s(?:/|in)\s+(\S+))")
 _SUFFIX = re.compile(r".*[^_]_([A-Za-zµ]+)")
-_PREFIX_OF_TAKEN = "file_"
+_RESERVED_NAME_PREFIX = "file_"
 
 
-class Column(NamedTuple):
+class MappedColumn(NamedTuple):
     """A column of a file as a signal: times `factor`, plus `offset`, is in `unit`; `said` is the mapping in words."""
 
     name: str
     factor: Fraction
     offset: float
     unit: str
-    said: str
-    assumed: str | None
+    description: str
+    assumption: str | None
     """What had to be assumed of its unit."""
 
     def values(self, table: Table) -> Real:
         """The signal, (rows,)."""
-        values = scaled(table.columns[self.name], self.factor)
+        values = scale_values(table.columns[self.name], self.factor)
         return values + self.offset if self.offset else values
 
 
-def column_of(table: Table, path: Path, signal: str, source: str) -> Column:
+def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
     """What `signal` is made of, by the words of a mapping. Raises UnreadableData."""
-    parts = {} if source in table.columns else _parts(source)
+    parts = {} if source in table.columns else _parse_source(source)
     name = find_column(table, path, parts.get("column") or source)
-    sensitivity_unit, target = parts.get("by") or "", unit_of(signal)
-    in_file = unit_in(table, name)
+    sensitivity_unit, target = parts.get("by") or "", signal_unit(signal)
+    in_file = column_unit(table, name)
     source_unit = parts.get("unit") or in_file
     unit = source_unit or (sensitivity_unit.partition("/")[2] if sensitivity_unit else target)
     try:
@@ -70,23 +70,25 @@ def column_of(table: Table, path: Path, signal: str, source: str) -> Column:
     except UnknownUnit as fault:
         raise UnreadableData(
             f"{path}: {signal}: column {name!r}: {fault}; its unit stands in brackets, a factor behind a star: "
-            f'"{bare(name)} [V] * 2.5 µm/V"'
+            f'"{name_without_unit(name)} [V] * 2.5 µm/V"'
         ) from None
     assumption = None
     if target and not source_unit:
         assumption = f"{signal}: no unit is known of {name!r}; it is taken for {unit}"
     elif in_file and in_file != source_unit:
         assumption = f"{signal}: the file says that {name!r} is in {in_file}; it is taken for {unit}"
-    return Column(name, factor, offset, target or source_unit or "", _said(name, unit, parts), assumption)
+    return MappedColumn(
+        name, factor, offset, target or source_unit or "", _describe_mapping(name, unit, parts), assumption
+    )
 
 
-def _parts(source: str) -> dict[str, str | None]:
+def _parse_source(source: str) -> dict[str, str | None]:
     match = _SOURCE.fullmatch(source)
     return match.groupdict() if match else {}
 
 
-def _said(name: str, unit: str, parts: dict[str, str | None]) -> str:
-    text = f"{bare(name)} [{unit}]" if unit else name
+def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str:
+    text = f"{name_without_unit(name)} [{unit}]" if unit else name
     if parts.get("factor"):
         text += f" * {parts['factor']} {parts.get('by') or ''}".rstrip()
     if parts.get("offset"):
@@ -94,60 +96,70 @@ def _said(name: str, unit: str, parts: dict[str, str | None]) -> str:
     return text
 
 
-def find_column(table: Table, path: Path, asked: str) -> str:
+def find_column(table: Table, path: Path, name_or_path: str) -> str:
     """The column of the file that is meant. Raises UnreadableData where none is, or several."""
-    if asked in table.columns:
-        return asked
-    rules = (lambda name: _plain(name) == _plain(asked), lambda name: _slashed(name).endswith("/" + _slashed(asked)))
+    if name_or_path in table.columns:
+        return name_or_path
+    rules = (
+        lambda name: _normalised_name(name) == _normalised_name(name_or_path),
+        lambda name: _normalised_path(name).endswith("/" + _normalised_path(name_or_path)),
+    )
     for rule in rules:
         matches = [name for name in table.columns if rule(name)]
         if len(matches) == 1:
             return matches[0]
         if matches:
-            raise UnreadableData(f"{path}: column {asked!r}: several are called so: {_listed(matches)}")
-    similar = difflib.get_close_matches(asked, list(table.columns), ALIKE, 0.4) or list(table.columns)[: 4 * ALIKE]
+            raise UnreadableData(f"{path}: column {name_or_path!r}: several are called so: {_quoted_list(matches)}")
+    similar = (
+        difflib.get_close_matches(name_or_path, list(table.columns), MAX_SUGGESTIONS, 0.4)
+        or list(table.columns)[: 4 * MAX_SUGGESTIONS]
+    )
     left_out = f" (left out: {table.about['left out']})" if "left out" in table.about else ""
-    raise UnreadableData(f"{path}: no column {asked!r}; there are {_listed(similar)}{left_out}")
+    raise UnreadableData(f"{path}: no column {name_or_path!r}; there are {_quoted_list(similar)}{left_out}")
 
 
-def unit_in(table: Table, name: str) -> str | None:
+def column_unit(table: Table, name: str) -> str | None:
     """The unit of a column as the file says it: beside its name, within it, or as the end of it."""
     if table.units.get(name):
         return table.units[name]
-    if unit := _split(name)[1]:
+    if unit := _split_unit(name)[1]:
         return unit
     suffix = _SUFFIX.fullmatch(name)
     return suffix[1] if suffix and is_unit(suffix[1]) else None
 
 
-def bare(name: str) -> str:
+def name_without_unit(name: str) -> str:
     """A column's name without the unit in it."""
-    return _split(name)[0]
+    return _split_unit(name)[0]
 
 
 def signal_name(text: str) -> str:
     """A signal's whole name: that of the first axis, where an axis is not named."""
-    return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in PER_AXIS} else text
+    return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in AXIS_SIGNALS} else text
 
 
-def own_name(column: str) -> str:
+def default_signal_name(column: str) -> str:
     """What a column is called in a recording where nobody says it otherwise."""
-    plain = normalize("NFKD", bare(column).replace("µ", "u").replace("ß", "ss")).encode("ascii", "ignore").decode()
-    words = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[-LONGEST_NAME:].strip("_")
+    plain = (
+        normalize("NFKD", name_without_unit(column).replace("µ", "u").replace("ß", "ss"))
+        .encode("ascii", "ignore")
+        .decode()
+    )
+    words = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[-MAX_NAME_CHARACTERS:].strip("_")
     name = words if words[:1].isalpha() else f"column_{words}"
-    return _PREFIX_OF_TAKEN + name if name in {signal.name for signal in COMMON} else name
+    return _RESERVED_NAME_PREFIX + name if name in {signal.name for signal in COMMON_SIGNALS} else name
 
 
-def axes_of(signals: list[str]) -> list[str]:
+def axis_names(signals: list[str]) -> list[str]:
     """The axes that the names of signals speak of, in their order; `x_true_position_um` is of x where there is an x."""
     candidates = [
         name.removesuffix(f"_{signal.name}")
         for name in signals
-        for signal in PER_AXIS
+        for signal in AXIS_SIGNALS
         if name.endswith(f"_{signal.name}")
     ]
     axes = list(dict.fromkeys(candidates))
-    axes_with_drive = {axis for axis in axes if f"{axis}_{PER_AXIS[DRIVE].name}" in signals}
+    axes_with_drive = {axis for axis in axes if f"{axis}_{AXIS_SIGNALS[DRIVE].name}" in signals}
     return [
         axis
         for axis in axes
@@ -155,19 +167,19 @@ def axes_of(signals: list[str]) -> list[str]:
     ]
 
 
-def _split(name: str) -> tuple[str, str | None]:
+def _split_unit(name: str) -> tuple[str, str | None]:
     match = _BRACKETED.fullmatch(name.strip())
     unit = next(filter(None, match.groups()[1:]), "") if match else ""
     return (match[1], unit) if match and is_unit(unit) else (name, None)
 
 
-def _plain(name: str) -> str:
-    return bare(name).strip(" \"'").casefold()
+def _normalised_name(name: str) -> str:
+    return name_without_unit(name).strip(" \"'").casefold()
 
 
-def _slashed(name: str) -> str:
-    return re.sub(r"[\\./]+", "/", _plain(name).replace('"', "").strip("/"))
+def _normalised_path(name: str) -> str:
+    return re.sub(r"[\\./]+", "/", _normalised_name(name).replace('"', "").strip("/"))
 
 
-def _listed(names: list[str]) -> str:
+def _quoted_list(names: list[str]) -> str:
     return ", ".join(map(repr, names))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_user_file
 from rtloop.interchange.formats.from_csv import read_csv
 from rtloop.interchange.formats.from_hdf5 import read_hdf5
-from rtloop.interchange.formats.from_mat import HDF5_AT, HDF5_MAGIC, read_mat
+from rtloop.interchange.formats.from_mat import HDF5_MAGIC, HDF5_OFFSET, read_mat
 from rtloop.interchange.formats.from_npz import read_npz
 from rtloop.interchange.formats.from_parquet import read_parquet
 from rtloop.interchange.formats.table import Table, UnopenedData
@@ -16,7 +16,7 @@ from rtloop.interchange.formats.table import Table, UnopenedData
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
-def read_here(path: Path, group: str | None = None) -> Table:
+def read_in_process(path: Path, group: str | None = None) -> Table:
     """The columns of a file; `group` says which ones, where it has several rasters, groups or topics.
 
     A library may let anything through of a damaged file, or crash: `aside.read_table` does not.
@@ -24,8 +24,8 @@ def read_here(path: Path, group: str | None = None) -> Table:
     Raises UnopenedData, UnreadableData, MissingExtra.
     """
     try:
-        with os.fdopen(open_named(path), "rb") as file:
-            head = file.read(HDF5_AT + len(HDF5_MAGIC))
+        with os.fdopen(open_user_file(path), "rb") as file:
+            head = file.read(HDF5_OFFSET + len(HDF5_MAGIC))
     except OSError as error:
         raise UnopenedData(f"{path}: {error.strerror}") from None
     if head.startswith(MCAP_MAGIC):

@@ -8,81 +8,89 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.interchange.formats.groups import TIMES, rows_of
+from rtloop.interchange.formats.groups import TIME_NAMES, row_count
 from rtloop.interchange.formats.table import Table, UnreadableData
-from rtloop.interchange.mapping import bare, column_of, unit_in
-from rtloop.interchange.units import UnknownUnit, factor_between, scaled
+from rtloop.interchange.mapping import column_unit, map_column, name_without_unit
+from rtloop.interchange.units import UnknownUnit, factor_between, scale_values
 from rtloop.recording.file.topics.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 from rtloop.recording.file.topics.ticks import LARGEST
-from rtloop.signals import COMMON, DEADLINE, TICK
-from rtloop.values import counted
+from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
+from rtloop.values import count_text
 
-JITTER = 1e-3
+JITTER_TOLERANCE = 1e-3
 """Part of a period by which samples may be early or late before it is told."""
 ROUNDED_NS = 1.5
 """What rounding to whole ns makes of an even time."""
-MISSING = 1.5
+GAP_PERIODS = 1.5
 """Periods between two samples from which on some are missing between them."""
 
 
-OWN = (COMMON[TICK].name, COMMON[DEADLINE].name)
+RECORDING_TIME_COLUMNS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
 """A file with both came from a recording, and its columns are taken as they are."""
 
 
-class Sampling(NamedTuple):
+class TimeBase(NamedTuple):
     """Deadlines (rows,) in whole ns that grow, the rate, where they are from, and what is to be told of them."""
 
     deadline_ns: Real
     rate_hz: float
-    said: str
+    description: str
     notes: list[str]
 
 
-def sampling(table: Table, path: Path, time: str | None, rate_hz: float | None) -> Sampling:
+def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | None) -> TimeBase:
     """The times by `rate_hz`, or else by the column `time` (words of a mapping), or the one that is called so.
 
     Raises UnreadableData where there is no time, or one that does not grow.
     """
     if rate_hz is not None:
-        deadlines = np.rint(np.arange(rows_of(table)) * (1e9 / rate_hz))
-        return Sampling(deadlines, rate_hz, f"by the rate of {rate_hz:g} Hz that was given", [])
+        deadlines = np.rint(np.arange(row_count(table)) * (1e9 / rate_hz))
+        return TimeBase(deadlines, rate_hz, f"by the rate of {rate_hz:g} Hz that was given", [])
     if time is None and (time := time_column(table)) is None:
         raise UnreadableData(
             f"{path}: no column is known to be its time; --time COLUMN says which one is, or --rate HZ what to count by"
         )
-    column = column_of(table, path, "", time)
+    column = map_column(table, path, "", time)
     if table.columns[column.name].size < 2:
         raise UnreadableData(f"{path}: fewer than two samples; --rate HZ says their rate")
-    unit, notes = unit_of_time(table, column.name, time, column.said), []
+    unit, notes = time_unit(table, column.name, time, column.description), []
     if unit is None:
         unit, notes = "s", [f"no unit is known of the time {column.name!r}; it is taken for s"]
-    deadlines, conversion_notes = _in_ns(path, column.name, table.columns[column.name], unit)
+    deadlines, conversion_notes = _deadlines_ns(path, column.name, table.columns[column.name], unit)
     period_ns, irregularity_notes = _regularity(deadlines)
     measured_rate_hz = _rate_hz(deadlines, period_ns)
     if not LOWEST_RATE_HZ <= measured_rate_hz <= HIGHEST_RATE_HZ:
         raise UnreadableData(
-            f"{path}: {measured_rate_hz:g} Hz by the time {column.name!r} in {unit}; {LOWEST_RATE_HZ:g} to {HIGHEST_RATE_HZ:g} "
-            f"Hz are possible: --time '{bare(column.name)} [ms]' says another unit, --rate HZ the rate"
+            f"{path}: {measured_rate_hz:g} Hz by the time {column.name!r} in {unit}; {LOWEST_RATE_HZ:g} to "
+            f"{HIGHEST_RATE_HZ:g} "
+            f"Hz are possible: --time '{name_without_unit(column.name)} [ms]' says another unit, --rate HZ the rate"
         )
-    return Sampling(
-        deadlines, measured_rate_hz, f"{bare(column.name)} [{unit}]", [*notes, *conversion_notes, *irregularity_notes]
+    return TimeBase(
+        deadlines,
+        measured_rate_hz,
+        f"{name_without_unit(column.name)} [{unit}]",
+        [*notes, *conversion_notes, *irregularity_notes],
     )
 
 
-def came_from_a_recording(table: Table) -> bool:
+def is_from_recording(table: Table) -> bool:
     """Whether a table has the ticks and deadlines of one: then no mapping is needed."""
-    return set(OWN) <= table.columns.keys()
+    return set(RECORDING_TIME_COLUMNS) <= table.columns.keys()
 
 
 def time_column(table: Table) -> str | None:
     """The deadlines of a recording; the column that the file calls its time, or that is called so in any file."""
-    if came_from_a_recording(table):
-        return OWN[1]
-    named_columns = [name for name in table.columns if bare(name).rpartition("/")[2].strip(" \"'").casefold() in TIMES]
-    return table.time or next(iter(named_columns), None) or _unnamed_time(table)
+    if is_from_recording(table):
+        return RECORDING_TIME_COLUMNS[1]
+    named_columns = [
+        name
+        for name in table.columns
+        if name_without_unit(name).rpartition("/")[2].strip(" \"'").casefold() in TIME_NAMES
+    ]
+    return table.time or next(iter(named_columns), None) or _first_column_as_time(table)
 
 
-def _unnamed_time(table: Table) -> str | None:
+def _first_column_as_time(table: Table) -> str | None:
     """The first of columns without names, or row of Simulink's To File, where it grows evenly."""
     name, times = next(iter(table.columns.items()))
     return name if name.endswith("_1") and len(table.columns) > 1 and grows_evenly(times) else None
@@ -92,16 +100,16 @@ def grows_evenly(values: Real) -> bool:
     """Whether each value is larger than the one before, by about the same step: as a clock or a counter does."""
     with np.errstate(invalid="ignore"):  # inf − inf, which does not grow
         steps = np.diff(values)
-    return steps.size > 1 and bool(steps.min() > 0 and steps.max() < MISSING * steps.min())
+    return steps.size > 1 and bool(steps.min() > 0 and steps.max() < GAP_PERIODS * steps.min())
 
 
-def unit_of_time(table: Table, name: str, asked: str, said: str) -> str | None:
+def time_unit(table: Table, name: str, mapping: str, description: str) -> str | None:
     """What times are counted in, by the mapping, else by the file."""
-    mapping_unit = said.rpartition("[")[2].rstrip("]") if asked != name and said.endswith("]") else None
-    return mapping_unit or unit_in(table, name)
+    mapping_unit = description.rpartition("[")[2].rstrip("]") if mapping != name and description.endswith("]") else None
+    return mapping_unit or column_unit(table, name)
 
 
-def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
+def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[str]]:
     """Whole ns since the start that the file counts from, or since the first sample where that is long ago."""
     if not np.all(np.isfinite(times)):
         raise UnreadableData(f"{path}: time {name!r}: row {int(np.argmin(np.isfinite(times))) + 1} holds no number")
@@ -113,7 +121,7 @@ def _in_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, list[st
     if times.min() < 0 or times.max() * float(factor) > LARGEST:
         notes = [f"the time begins at {times[0]:g} {unit} in the file; it is counted from there"]
         times = times - times[0]
-    deadlines = np.rint(scaled(times, factor))
+    deadlines = np.rint(scale_values(times, factor))
     is_growing = np.diff(deadlines) > 0
     if not is_growing.all():
         row = int(np.argmin(is_growing))
@@ -139,19 +147,21 @@ def _regularity(deadlines: Real) -> tuple[float, list[str]]:
     """The usual period in ns, and in words what jitters and what is missing."""
     intervals = np.diff(deadlines)
     period, notes = float(np.median(intervals)), []
-    regular_intervals = intervals[intervals < MISSING * period]
+    regular_intervals = intervals[intervals < GAP_PERIODS * period]
     deviation = np.abs(regular_intervals - period)
-    if deviation.size and deviation.max() > max(JITTER * period, ROUNDED_NS):
+    if deviation.size and deviation.max() > max(JITTER_TOLERANCE * period, ROUNDED_NS):
         rms = float(np.sqrt(np.mean(deviation**2)))
         notes.append(
-            f"sample times jitter: by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a period of "
+            f"sample times jitter: by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a "
+            "period of "
             f"{period / 1e3:.6g} µs; they are kept as they are"
         )
-    gap_indices = np.flatnonzero(intervals >= MISSING * period)
+    gap_indices = np.flatnonzero(intervals >= GAP_PERIODS * period)
     if gap_indices.size:
         samples = int(np.sum(np.rint(intervals[gap_indices] / period) - 1))
         first_gap_text = f"first behind {deadlines[gap_indices[0]] * 1e-9:.6g} s"
         notes.append(
-            f"about {counted(samples, 'sample')} missing, in {counted(gap_indices.size, 'place')}, {first_gap_text}"
+            f"about {count_text(samples, 'sample')} missing, in {count_text(gap_indices.size, 'place')}, "
+            f"{first_gap_text}"
         )
     return period, notes

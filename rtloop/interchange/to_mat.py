@@ -19,7 +19,7 @@ import numpy as np
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.recording.views.selection import Selection
-from rtloop.signals import PER_AXIS
+from rtloop.signals import AXIS_SIGNALS
 
 LARGEST_BYTES = (1 << 31) - (1 << 20)
 """Numbers and texts: a variable of version 5 takes less than 2 GiB, names and headers of the signals included."""
@@ -36,8 +36,8 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
     """
     from scipy.io import savemat
 
-    names, about = selection.names(recording), _about(recording)
-    count = sum(len(rows) for rows in selection.blocks(recording, ["tick"]))
+    names, about = selection.selected_names(recording), _about(recording)
+    count = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))
     size = 8 * count * (len(names) + 1) + sum(len(str(text)) for text in about["Info"].values())
     if size > LARGEST_BYTES:
         raise RecordingError(
@@ -45,7 +45,7 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
             "export less with --signals, --every, --from and --until"
         )
     data, done = np.empty((len(names), 1, count)), 0
-    for rows in selection.blocks(recording, names):
+    for rows in selection.read_blocks(recording, names):
         data[:, 0, done : done + len(rows)] = rows.T
         done += len(rows)
     signals = np.zeros((1, len(names)), [("Data", "O"), *((field, "O") for field in _signal(recording, names[0]))])
@@ -64,7 +64,7 @@ def variable_of(path: Path) -> str:
 
 def _signal(recording: Recording, name: str) -> dict[str, str | float]:
     """What stands beside a signal's data."""
-    axis = next((name.removesuffix(f"_{one.name}") for one in PER_AXIS if name.endswith(f"_{one.name}")), "")
+    axis = next((name.removesuffix(f"_{one.name}") for one in AXIS_SIGNALS if name.endswith(f"_{one.name}")), "")
     path = f"rtloop/{axis}/{name}" if axis else f"rtloop/{name}"
     return {"Name": name, "Unit": recording.units[name], "XIndex": 1.0, "Path": path, "Raster": RASTER}
 

@@ -18,14 +18,14 @@ PREFIXES = {
 """Powers of ten."""
 BASES = {"m": "m", "V": "V", "s": "s", "A": "A", "N": "N", "g": "g", "K": "K", "Pa": "Pa", "Ohm": "Ohm", "Hz": "1/s"}
 """Symbols that take a prefix."""
-NAMED = {
+UNIT_NAMES = {
     "volt": "V", "volts": "V", "millivolt": "mV", "millivolts": "mV", "meter": "m", "meters": "m", "metre": "m",
     "metres": "m", "micrometer": "µm", "micrometers": "µm", "micrometre": "µm", "micron": "µm", "microns": "µm",
     "nanometer": "nm", "nanometers": "nm", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s",
     "sekunden": "s", "msec": "ms", "usec": "µs", "millisecond": "ms", "milliseconds": "ms", "microseconds": "µs",
     "hertz": "Hz", "hr": "h", "ampere": "A", "newton": "N", "angstrom": "Å", "count": "counts",
 }  # fmt: skip
-OTHERS = {
+UNPREFIXED_UNITS = {
     "Å": (Fraction(1, 10**10), "m"), "min": (Fraction(60), "s"), "h": (Fraction(3600), "s"),
     "%": (Fraction(1, 100), ""),
     "1": (Fraction(1), ""), "-": (Fraction(1), ""), "": (Fraction(1), ""), "°C": (Fraction(1), "degC"),
@@ -34,7 +34,7 @@ OTHERS = {
 }  # fmt: skip
 _POWER = re.compile(r"(.*?[^\d^])\^?([-+]?\d)?$")
 _SUPERSCRIPT = str.maketrans("⁻⁰¹²³⁴", "-01234")
-_SAME = str.maketrans({"μ": "µ", "Ω": "Ohm", "⋅": "·", "*": "·"})
+_SYMBOL_VARIANTS = str.maketrans({"μ": "µ", "Ω": "Ohm", "⋅": "·", "*": "·"})
 
 
 class UnknownUnit(ValueError):
@@ -52,22 +52,22 @@ class Unit(NamedTuple):
     powers: Powers
 
 
-def parsed(text: str) -> Unit:
+def parse_unit(text: str) -> Unit:
     """What a unit means. Raises UnknownUnit."""
     scale, powers = Fraction(1), Powers()
-    for place, part in enumerate(text.strip().translate(_SAME).split("/")):
+    for place, part in enumerate(text.strip().translate(_SYMBOL_VARIANTS).split("/")):
         sign = 1 if place == 0 else -1
         for factor in part.strip().split("·"):
-            base_scale, base_powers = _factor(factor.strip(), text)
+            base_scale, base_powers = _parse_factor(factor.strip(), text)
             scale *= base_scale**sign
-            powers = _product(powers, tuple((symbol, sign * exponent) for symbol, exponent in base_powers))
+            powers = _multiply_powers(powers, tuple((symbol, sign * exponent) for symbol, exponent in base_powers))
     return Unit(scale, powers)
 
 
 def factor_between(source: str, target: str, by: str = "") -> Fraction:
     """What values in `source`, times one `by`, are to be multiplied by to be in `target`. Raises UnknownUnit."""
-    source_unit, by_unit, target_unit = parsed(source), parsed(by), parsed(target)
-    if _product(source_unit.powers, by_unit.powers) != target_unit.powers:
+    source_unit, by_unit, target_unit = parse_unit(source), parse_unit(by), parse_unit(target)
+    if _multiply_powers(source_unit.powers, by_unit.powers) != target_unit.powers:
         raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} is no {target or '1'}")
     return source_unit.scale * by_unit.scale / target_unit.scale
 
@@ -75,13 +75,13 @@ def factor_between(source: str, target: str, by: str = "") -> Fraction:
 def is_unit(text: str) -> bool:
     """Whether this is a unit that is understood; a number alone is taken for none."""
     try:
-        parsed(text)
+        parse_unit(text)
     except UnknownUnit:
         return False
     return bool(re.search(r"[^\W\d_]|[%°]", text))
 
 
-def scaled(values: Real, factor: Fraction) -> Real:
+def scale_values(values: Real, factor: Fraction) -> Real:
     """The values times the factor, rounded once where it is a whole number or one over one."""
     if factor == 1:
         return values
@@ -90,27 +90,27 @@ def scaled(values: Real, factor: Fraction) -> Real:
     return values * float(factor)
 
 
-def _product(one: Powers, other: Powers) -> Powers:
-    exponents = dict(one)
-    for symbol, exponent in other:
+def _multiply_powers(first_powers: Powers, second_powers: Powers) -> Powers:
+    exponents = dict(first_powers)
+    for symbol, exponent in second_powers:
         exponents[symbol] = exponents.get(symbol, 0) + exponent
     return tuple(sorted((symbol, exponent) for symbol, exponent in exponents.items() if exponent))
 
 
-def _factor(text: str, whole: str) -> Unit:
+def _parse_factor(text: str, unit_text: str) -> Unit:
     """One of the factors of a unit, with its exponent."""
-    if text in OTHERS:
-        scale, symbol = OTHERS[text]
+    if text in UNPREFIXED_UNITS:
+        scale, symbol = UNPREFIXED_UNITS[text]
         return Unit(scale, ((symbol, 1),) if symbol else ())
     match = _POWER.fullmatch(text.translate(_SUPERSCRIPT))
     name, exponent = (match[1], int(match[2] or 1)) if match else (text, 1)
-    name = NAMED.get(name, NAMED.get(name.lower(), name))
-    if name in OTHERS and name:
-        scale, symbol = OTHERS[name]
+    name = UNIT_NAMES.get(name, UNIT_NAMES.get(name.lower(), name))
+    if name in UNPREFIXED_UNITS and name:
+        scale, symbol = UNPREFIXED_UNITS[name]
         return Unit(scale**exponent, ((symbol, exponent),))
     for base, meaning in BASES.items():
         prefix = name.removesuffix(base)
         if name.endswith(base) and prefix in PREFIXES:
             symbol, sign = ("s", -1) if meaning == "1/s" else (meaning, 1)
             return Unit((Fraction(10) ** PREFIXES[prefix]) ** exponent, ((symbol, sign * exponent),))
-    raise UnknownUnit(f"unit {whole!r} is not known; such as V, mV, µm, nm, m, s, ms, Hz, µm/V are")
+    raise UnknownUnit(f"unit {unit_text!r} is not known; such as V, mV, µm, nm, m, s, ms, Hz, µm/V are")

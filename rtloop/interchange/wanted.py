@@ -14,11 +14,11 @@ from rtloop.errors import ConfigError
 from rtloop.recording.file.topics.checked import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
-BESIDE = "map.toml"
+MAPPING_FILE_NAME = "map.toml"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ColumnSelection:
     """Signals by name, each with the words of its mapping; columns that keep their names; what stands for the time."""
 
     signals: dict[str, str] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class Wanted:
         return bool(self.signals or self.keep or self.everything)
 
 
-class _File(BaseModel):
+class _MappingFile(BaseModel):
     """A mapping's file; `all` is `everything`."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -46,27 +46,31 @@ class _File(BaseModel):
     group: str | None = None
 
 
-def wanted_by(maps: Sequence[str], other: Wanted) -> Wanted:
+def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnSelection:
     """`other`, and what `NAME=COLUMN` and `COLUMN` ask for besides."""
-    signals, keep = dict(other.signals), [*other.keep]
+    signals, keep = dict(selection.signals), [*selection.keep]
     for text in maps:
         name, equals, source = text.partition("=")
         if equals and NAME.fullmatch(name.strip()):
             signals[name.strip()] = source.strip()
         else:
             keep.append(text)
-    return Wanted(signals, tuple(keep), other.everything, other.time, other.rate_hz, other.group)
+    return ColumnSelection(
+        signals, tuple(keep), selection.everything, selection.time, selection.rate_hz, selection.group
+    )
 
 
-def mapping_beside(data: Path) -> Path | None:
+def find_mapping(data: Path) -> Path | None:
     """The mapping that is kept beside a file: NAME.map.toml for NAME.mat, or map.toml for all in the folder."""
-    return next(filter(Path.is_file, (data.with_suffix(f".{BESIDE}"), data.with_name(BESIDE))), None)
+    return next(
+        filter(Path.is_file, (data.with_suffix(f".{MAPPING_FILE_NAME}"), data.with_name(MAPPING_FILE_NAME))), None
+    )
 
 
-def read_mapping(path: Path) -> Wanted:
+def read_mapping(path: Path) -> ColumnSelection:
     """What a mapping's file asks for. Raises InputFileError, ConfigError."""
     try:
-        mapping = _File.model_validate(parse_toml(read_text(path)))
+        mapping = _MappingFile.model_validate(parse_toml(read_text(path)))
     except ValidationError as error:
         faults = [
             f"{'.'.join(map(str, error_detail['loc']))}: {error_detail['msg'].lower()}"
@@ -80,4 +84,6 @@ def read_mapping(path: Path) -> Wanted:
         raise ConfigError(
             str(path), [f"signals: {name!r}; letters, digits and _ make a name" for name in invalid_names]
         )
-    return Wanted(mapping.signals, tuple(mapping.keep), mapping.all, mapping.time, mapping.rate_hz, mapping.group)
+    return ColumnSelection(
+        mapping.signals, tuple(mapping.keep), mapping.all, mapping.time, mapping.rate_hz, mapping.group
+    )

@@ -8,11 +8,11 @@ import numpy as np
 
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LOOP_STATE, STATE, TOLD
+from rtloop.law.layout import COEFFICIENTS, CONTROL, CONTROL_SIGNALS, FUNCTIONS, LOOP_STATE, STATE
 
 FEEDFORWARD_COEFFICIENTS, FEEDFORWARD_STATE = COEFFICIENTS.itemsize, STATE.itemsize
 CONTROL_BYTES, FUNCTIONS_BYTES = CONTROL.itemsize, FUNCTIONS.itemsize
-CONTROL_FIELDS = len(TOLD)
+CONTROL_FIELDS = len(CONTROL_SIGNALS)
 
 
 class Law(NamedTuple):
@@ -34,7 +34,7 @@ class Law(NamedTuple):
 
 
 @jit
-def opened(law):
+def unpack_law(law):
     """A LAW record, read once."""
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
@@ -43,36 +43,36 @@ def opened(law):
 
 
 @jit
-def coefficients_of(law, a):
+def coefficients_record(law, a):
     """Coefficients of axis number `a`."""
     return carray(address_pointer(law.coefficients + a * law.coefficients_bytes), 1, COEFFICIENTS)[0]
 
 
 @jit
-def state_of(law, a):
+def axis_state(law, a):
     """State of axis number `a`."""
     return carray(address_pointer(law.axes + a * law.axes_bytes), 1, STATE)[0]
 
 
 @jit
-def loop_of(law):
+def loop_state(law):
     """State common to all axes."""
     return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
 
 
 @jit
-def control_of(law, a):
+def axis_control(law, a):
     """What the controller of axis number `a` is told."""
     return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
 
 
 @jit
-def together_of(law, first, count):
+def joint_control(law, first, count):
     """What the controller of `count` axes from `first` on is told, (fields of CONTROL, count)."""
     return carray(address_pointer(law.together + first * CONTROL_BYTES), (CONTROL_FIELDS, count), np.float64)
 
 
 @jit
-def functions_of(law, number):
+def law_functions(law, number):
     """The law of this number."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]

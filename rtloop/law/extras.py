@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit, seldom
+from rtloop.hil.native.compiled import jit, jit_rare
 from rtloop.hil.native.pointers import address_pointer, carray
-from rtloop.law.access import CONTROL_BYTES, coefficients_of, loop_of, opened, state_of
-from rtloop.law.layout import EXTRA_OUTPUT, MAX_EXTRAS, TOLD
-from rtloop.law.safety import clip, usable
-from rtloop.law.slots import CONTROLLER_OUTPUT, note_failure
+from rtloop.law.access import CONTROL_BYTES, axis_state, coefficients_record, loop_state, unpack_law
+from rtloop.law.layout import CONTROL_SIGNALS, EXTRA_OUTPUT, MAX_EXTRAS
+from rtloop.law.safety import clip, is_usable
+from rtloop.law.slots import CONTROLLER_OUTPUT, record_failure
 from rtloop.signals import Flag, Mode
 
 CLOSED_LOOP, TRIP_LAW = int(Mode.CLOSED_LOOP), int(Flag.TRIP_LAW)
-TOLD_BYTES = len(TOLD) * 8
+SIGNALS_BYTES = len(CONTROL_SIGNALS) * 8
 """What a controller is told of one axis; of several, inputs and outputs stand behind that of all."""
 
 
@@ -46,56 +46,56 @@ class Extras(NamedTuple):
 
 
 @jit
-def inputs_of(record):
+def extra_inputs(record):
     """What the inputs read in this tick, (MAX_EXTRAS,)."""
     return carray(address_pointer(record.extra_inputs), MAX_EXTRAS, np.float64)
 
 
 @jit
-def outputs_of(record):
+def extra_outputs(record):
     """The outputs, EXTRA_OUTPUT records (MAX_EXTRAS,)."""
     return carray(address_pointer(record.extra_outputs), MAX_EXTRAS, EXTRA_OUTPUT)
 
 
 @jit
-def _told(law, a, count):
+def _controller_extras(law, a, count):
     """Inputs and outputs that the controller of `count` axes from `a` on is told, (2 * MAX_EXTRAS,)."""
     place = law.controls if count == 1 else law.together
-    return carray(address_pointer(place + a * CONTROL_BYTES + count * TOLD_BYTES), 2 * MAX_EXTRAS, np.float64)
+    return carray(address_pointer(place + a * CONTROL_BYTES + count * SIGNALS_BYTES), 2 * MAX_EXTRAS, np.float64)
 
 
-@seldom
-def hand_in(record):
+@jit_rare
+def pass_extra_inputs(record):
     """Tell every controller the inputs, and the outputs at their safe values."""
-    law, inputs, outputs = opened(record), inputs_of(record), outputs_of(record)
+    law, inputs, outputs = unpack_law(record), extra_inputs(record), extra_outputs(record)
     for a in range(law.axis_count):
-        count = np.int64(coefficients_of(law, a).controller_axes)
+        count = np.int64(coefficients_record(law, a).controller_axes)
         if count != 0:
-            volts = _told(law, a, count)
+            volts = _controller_extras(law, a, count)
             for k in range(record.extra_input_count):
                 volts[k] = inputs[k]
             for k in range(record.extra_output_count):
                 volts[MAX_EXTRAS + k] = outputs[k].safe_v
 
 
-@seldom
-def hand_out(record):
+@jit_rare
+def collect_extra_outputs(record):
     """Take over the outputs that the controllers have set; all are safe where the loop is not closed.
 
     One that is no number is safe, and trips the next tick, as what goes wrong behind the drives does.
     """
-    law, outputs = opened(record), outputs_of(record)
-    loop = loop_of(law)
+    law, outputs = unpack_law(record), extra_outputs(record)
+    loop = loop_state(law)
     for k in range(record.extra_output_count):
         outputs[k].value_v = outputs[k].safe_v
     for a in range(law.axis_count):
-        count = np.int64(coefficients_of(law, a).controller_axes)
-        volts = _told(law, a, max(count, 1))
+        count = np.int64(coefficients_record(law, a).controller_axes)
+        volts = _controller_extras(law, a, max(count, 1))
         for k in range(record.extra_output_count):
             if loop.mode == CLOSED_LOOP and a <= outputs[k].axis < a + count:
                 value_v = volts[MAX_EXTRAS + k]
-                if usable(value_v):
+                if is_usable(value_v):
                     outputs[k].value_v = clip(value_v, outputs[k].lowest_v, outputs[k].highest_v)
                 else:
-                    note_failure(state_of(law, a), CONTROLLER_OUTPUT, value_v)
+                    record_failure(axis_state(law, a), CONTROLLER_OUTPUT, value_v)
                     loop.pending |= TRIP_LAW

@@ -26,7 +26,7 @@ MAX_EXTRAS = 8
 """Inputs, and outputs, beside the sensors and the drives."""
 MAX_LAWS = 32
 """Kinds of laws that one loop may know."""
-ANEW = -1
+REFILL = -1
 """A tap index that says: fill the pre-filter's memory with the next reference."""
 
 Records = np.recarray[Any, Any]
@@ -35,13 +35,13 @@ LINE_BYTES = 64
 """Records begin at a cache line and arrays come first in them: no load of four numbers straddles two lines."""
 
 
-def whole_lines(fields: list[Any]) -> np.dtype[Any]:
+def cache_line_record(fields: list[Any]) -> np.dtype[Any]:
     """A record of `fields` and what fills up its last cache line."""
     size = np.dtype(fields, align=True).itemsize
     return np.dtype([*fields, ("reserved", np.float64, (-size % LINE_BYTES // 8,))], align=True)
 
 
-COEFFICIENTS = whole_lines(
+COEFFICIENTS = cache_line_record(
     [
         # reference pre-filter: FIR taps to the error and to the command; then second-order sections b0 b1 b2 a1 a2
         ("taps", np.float64, (MAX_TAPS,)),
@@ -83,7 +83,7 @@ COEFFICIENTS = whole_lines(
         ("late_ticks", np.int64),
     ]
 )
-STATE = whole_lines(
+STATE = cache_line_record(
     [
         ("tap_history", np.float64, (2 * MAX_TAPS,)),  # newest first from `tap_index` on, and all of it twice
         ("tap_sums", np.float64, (2 * TAP_LANES,)),
@@ -135,7 +135,7 @@ ALLOWED_COEFFICIENTS = {
 }
 """What whole numbers may be; the numbers of laws depend on how many there are."""
 ALLOWED_STATE = {
-    "tap_index": Allowed(ANEW, MAX_TAPS - 1),
+    "tap_index": Allowed(REFILL, MAX_TAPS - 1),
     "entering": Allowed(0, 2),
     "usable": SWITCH,
     "swing_direction": Allowed(-1, 1),
@@ -161,17 +161,17 @@ CONDITIONS = np.dtype(
     align=True,
 )
 """What a tick is judged by beside its inputs; all of it is recorded."""
-TOLD = ("reference_um", "position_um", "error_um", "command_um", "applied_um")
+CONTROL_SIGNALS = ("reference_um", "position_um", "error_um", "command_um", "applied_um")
 _EXTRAS = [("inputs", np.float64, (MAX_EXTRAS,)), ("outputs", np.float64, (MAX_EXTRAS,))]
-CONTROL = np.dtype([*((name, np.float64) for name in TOLD), *_EXTRAS], align=True)
+CONTROL = np.dtype([*((name, np.float64) for name in CONTROL_SIGNALS), *_EXTRAS], align=True)
 """What a controller is told of an axis, see `rtloop.laws.contract`; written anew each tick, no part of the state."""
 
 
-def told_by(axes: int) -> np.dtype[Any]:
+def control_dtype(axes: int) -> np.dtype[Any]:
     """What a controller of so many axes is told: of several, the same, each number an array with an entry an axis."""
     if axes == 1:
         return CONTROL
-    return np.dtype([*((name, np.float64, (axes,)) for name in TOLD), *_EXTRAS], align=True)
+    return np.dtype([*((name, np.float64, (axes,)) for name in CONTROL_SIGNALS), *_EXTRAS], align=True)
 
 
 EXTRA_OUTPUT = np.dtype(

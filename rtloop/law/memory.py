@@ -36,7 +36,7 @@ from rtloop.law.validity import Allowed, Bits, require_allowed
 
 NO_EXTRAS = Extras()
 Slot = Literal["feedforward", "controller"]
-Which = Literal["coefficients", "state"]
+RecordKind = Literal["coefficients", "state"]
 Rules = Mapping[str, Allowed | Bits]
 
 
@@ -63,7 +63,7 @@ class Layout:
 
     laws: tuple[LawRecords, ...]
 
-    def room(self, slot: Slot) -> tuple[int, int]:
+    def slot_bytes(self, slot: Slot) -> tuple[int, int]:
         """Bytes of coefficients and of state that a slot has."""
         slot_laws = [law for law in self.laws if law.slot == slot]
         return (
@@ -74,28 +74,30 @@ class Layout:
     @property
     def coefficients(self) -> np.dtype[Any]:
         """Of an axis: its own fields, then `feedforward` and `controller` as bytes."""
-        return self._behind(COEFFICIENTS, 0)
+        return self._with_slots(COEFFICIENTS, 0)
 
     @property
     def state(self) -> np.dtype[Any]:
         """Of an axis, likewise."""
-        return self._behind(STATE, 1)
+        return self._with_slots(STATE, 1)
 
-    def _behind(self, own: np.dtype[Any], which: int) -> np.dtype[Any]:
+    def _with_slots(self, axis_record: np.dtype[Any], part: int) -> np.dtype[Any]:
         slots: tuple[Slot, ...] = ("feedforward", "controller")
-        return np.dtype([*own.descr, *((slot, np.uint8, (self.room(slot)[which],)) for slot in slots)])
+        return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
 
     def snapshot_bytes(self, axes: int) -> int:
         """Length of a snapshot: tick, coefficients and state."""
         return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
 
-    def law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
+    def slot_law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
         """Of one axis's coefficients, the law in a slot; None for a controller that another axis owns."""
         if slot == "controller" and not coefficients["controller_axes"]:
             return None
         return self.laws[int(coefficients[f"{slot}_law"])]
 
-    def split(self, snapshot: bytes | npt.NDArray[np.uint8], axes: int) -> tuple[int, Records, Records, Records]:
+    def split_snapshot(
+        self, snapshot: bytes | npt.NDArray[np.uint8], axes: int
+    ) -> tuple[int, Records, Records, Records]:
         """Tick, coefficients, axes' state and loop state of a snapshot, as copies that the kernels can work on.
 
         Raises ValueError where the length does not fit `axes`, or a count, an index or a switch is not allowed.
@@ -105,31 +107,31 @@ class Layout:
             raise ValueError(f"law snapshot: {len(data)} bytes, but {axes} axes take {self.snapshot_bytes(axes)}")
         offset, parts = 8, []
         for dtype, count in ((self.coefficients, axes), (self.state, axes), (LOOP_STATE, 1)):
-            parts.append(copied(np.frombuffer(data, dtype, count, offset)))
+            parts.append(copy_records(np.frombuffer(data, dtype, count, offset)))
             offset += count * dtype.itemsize
         coefficients, states, loop = parts
         for number in range(axes):
-            self.require(number, coefficients, states)
+            self.require_allowed_axis(number, coefficients, states)
         require_owners(coefficients["controller_axes"].tolist())
         require_allowed("the loop", loop[0], ALLOWED_LOOP_STATE)
         return int.from_bytes(data[:8], "little"), coefficients, states, loop
 
-    def require(self, number: int, coefficients: Records, states: Records) -> None:
+    def require_allowed_axis(self, number: int, coefficients: Records, states: Records) -> None:
         """Raise ValueError for the first whole number of axis `number` that is not allowed."""
         axis, state, owner = coefficients[number], states[number], f"axis {number}"
-        require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_numbers(number, len(coefficients))})
+        require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_number_rules(number, len(coefficients))})
         require_allowed(owner, state, ALLOWED_STATE)
         for slot in ("feedforward", "controller"):
-            law = self.law(axis, slot)
+            law = self.slot_law(axis, slot)
             if law is None:
                 continue
             expected = int(axis["controller_axes"]) if slot == "controller" else 0
             if law.axes != expected:
                 raise ValueError(f"{slot}_law of {owner}: {law.name}, which is for {law.axes} axes and not {expected}")
-            require_allowed(owner, view(axis, slot, law.coefficients), law.allowed_coefficients)
-            require_allowed(owner, view(state, slot, law.state), law.allowed_state)
+            require_allowed(owner, slot_view(axis, slot, law.coefficients), law.allowed_coefficients)
+            require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
 
-    def _law_numbers(self, number: int, axes: int) -> Rules:
+    def _law_number_rules(self, number: int, axes: int) -> Rules:
         laws = Allowed(0, len(self.laws) - 1)
         return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
 
@@ -173,21 +175,21 @@ def require_owners(controller_axes: Sequence[int]) -> None:
         owned_axes = max(owned_axes, number + count)
 
 
-def view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
+def slot_view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
     """A plug-in's record within that of an axis, which it shares its memory with."""
     return axis[slot][: dtype.itemsize].view(dtype).view(np.recarray)[0]
 
 
-def records(dtype: np.dtype[Any], count: int) -> Records:
+def new_records(dtype: np.dtype[Any], count: int) -> Records:
     """Zeroed records at a cache line, with attribute access also where the kernels run uncompiled."""
     buffer = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
     begin = -buffer.ctypes.data % LINE_BYTES
     return buffer[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
 
 
-def copied(source: npt.NDArray[Any]) -> Records:
+def copy_records(source: npt.NDArray[Any]) -> Records:
     """A copy of records, at a cache line."""
-    copy = records(source.dtype, source.size)
+    copy = new_records(source.dtype, source.size)
     copy[:] = source
     return copy
 
@@ -214,36 +216,36 @@ class LawMemory:
             record["axes"], record["coefficients_bytes"] = law.axes, law.coefficients.itemsize
             record["state_bytes"], record["first_rule"], record["rule_count"] = law.state.itemsize, count, len(own)
             count += len(own)
-        self._kept = {
+        self._arrays = {
             "coefficients": coefficients,
             "axes": axes,
             "loop": state,
-            "controls": records(CONTROL, axes.size),
-            "together": records(CONTROL, axes.size),
+            "controls": new_records(CONTROL, axes.size),
+            "together": new_records(CONTROL, axes.size),
             "functions": self._functions,
             "rules": np.concatenate([np.zeros(0, RULE), *rules]),
             "result": np.zeros(1),
             "raised": np.zeros(1, np.int64),
             "extra_inputs": np.zeros(MAX_EXTRAS),
-            "extra_outputs": records(EXTRA_OUTPUT, MAX_EXTRAS),
+            "extra_outputs": new_records(EXTRA_OUTPUT, MAX_EXTRAS),
         }
-        for record, output in zip(self._kept["extra_outputs"], extras.outputs, strict=False):
+        for record, output in zip(self._arrays["extra_outputs"], extras.outputs, strict=False):
             record["value_v"] = record["safe_v"] = output.safe_v
             record["lowest_v"], record["highest_v"], record["axis"] = output.lowest_v, output.highest_v, output.axis
-        self.records: Any = records(LAW, 1)
-        for name, array in self._kept.items():
+        self.records: Any = new_records(LAW, 1)
+        for name, array in self._arrays.items():
             self.records[name] = array.ctypes.data
         self.law = self.records[0]
         self.law.coefficients_bytes, self.law.axes_bytes = coefficients.itemsize, axes.itemsize
         self.law.axis_count, self.law.law_count = axes.size, len(layout.laws)
         self.law.extra_input_count, self.law.extra_output_count = len(extras.inputs), len(extras.outputs)
         self.law.extra_count = len(extras.inputs) + len(extras.outputs)
-        own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.room("feedforward")
+        own, feedforward = (COEFFICIENTS.itemsize, STATE.itemsize), layout.slot_bytes("feedforward")
         self.law.controller_coefficients = own[0] + feedforward[0]
         self.law.controller_state = own[1] + feedforward[1]
 
     @classmethod
-    def at_rest(
+    def create_at_rest(
         cls,
         layout: Layout,
         functions: npt.NDArray[Any],
@@ -251,31 +253,31 @@ class LawMemory:
         extras: Extras = NO_EXTRAS,
     ) -> LawMemory:
         """Outputs at their safe values, an unloaded actuator that never moved."""
-        owned_coefficients = copied(coefficients)
-        axes = records(layout.state, owned_coefficients.size)
+        owned_coefficients = copy_records(coefficients)
+        axes = new_records(layout.state, owned_coefficients.size)
         axes["drive_v"] = owned_coefficients["safe_v"]
-        return cls(layout, functions, owned_coefficients, axes, records(LOOP_STATE, 1), extras)
+        return cls(layout, functions, owned_coefficients, axes, new_records(LOOP_STATE, 1), extras)
 
-    def of_law(self, axis: int, slot: Slot, what: Which) -> Any:
+    def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
         """A plug-in's record of axis number `axis`, by attributes; None for a controller that another axis owns."""
-        law = self.layout.law(self.coefficients[axis], slot)
+        law = self.layout.slot_law(self.coefficients[axis], slot)
         if law is None:
             return None
-        if what == "coefficients":
-            return view(self.coefficients[axis], slot, law.coefficients)
-        return view(self.axes[axis], slot, law.state)
+        if kind == "coefficients":
+            return slot_view(self.coefficients[axis], slot, law.coefficients)
+        return slot_view(self.axes[axis], slot, law.state)
 
 
-def fields(layout: Layout, coefficients: Records, which: Which) -> list[list[Any]]:
+def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:
     """Of each axis: (name, type, offset) of every field of its coefficients or state, its plug-ins' included."""
     tables: list[list[Any]] = []
     for axis in coefficients:
-        table = getattr(layout, which)
+        table = getattr(layout, record_kind)
         rows: list[Any] = []
         for name, (dtype, start, *_) in table.fields.items():
-            law = layout.law(axis, name) if name in ("feedforward", "controller") else None
+            law = layout.slot_law(axis, name) if name in ("feedforward", "controller") else None
             if law is not None:
-                inner = getattr(law, which)
+                inner = getattr(law, record_kind)
                 rows += [(field, kind, start + place) for field, (kind, place, *_) in inner.fields.items()]
                 start, dtype = start + inner.itemsize, np.dtype((np.uint8, (dtype.itemsize - inner.itemsize,)))
             rows.append((name, dtype, start))

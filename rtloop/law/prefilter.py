@@ -10,26 +10,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit, seldom
-from rtloop.law.layout import ANEW, MAX_TAPS, TAP_LANES
+from rtloop.hil.native.compiled import jit, jit_rare
+from rtloop.law.layout import MAX_TAPS, REFILL, TAP_LANES
 
 
 @jit
-def fill_prefilter_anew(state):
+def refill_prefilter(state):
     """Have the pre-filter begin with the next reference, as if that had stood for ever."""
-    state.tap_index = ANEW
+    state.tap_index = REFILL
 
 
-@seldom
-def filtered(coefficients, state):
+@jit_rare
+def last_outputs_um(coefficients, state):
     """What both rows of taps made of the last reference, in µm, or would have made."""
     if coefficients.tap_count == 0 or state.tap_index < 0:
         return state.tap_history[max(state.tap_index, 0)], 0.0
-    return _rows(coefficients, state)
+    return _tap_outputs_um(coefficients, state)
 
 
 @jit
-def _rows(coefficients, state):
+def _tap_outputs_um(coefficients, state):
     """Both rows of taps on the history, in µm; in four lanes each, an order that does not depend on the processor."""
     begin, history = np.uint8(state.tap_index), state.tap_history
     taps, command_taps = coefficients.taps, coefficients.command_taps
@@ -52,14 +52,14 @@ def _rows(coefficients, state):
     return (x0 + x1) + (x2 + x3), (v0 + v1) + (v2 + v3)
 
 
-@seldom
-def _filled(coefficients, state, value):
+@jit_rare
+def _fill_memory(coefficients, state, value):
     """The pre-filter's memory at rest for a constant reference."""
     state.tap_index = 0
     for i in range(2 * MAX_TAPS):
         state.tap_history[i] = value
     if coefficients.tap_count > 0:
-        value = filtered(coefficients, state)[0]
+        value = last_outputs_um(coefficients, state)[0]
     for i in range(coefficients.section_count):
         b0, b1, b2, a1, a2 = coefficients.sections[i]
         output = value * (b0 + b1 + b2) / (1.0 + a1 + a2)
@@ -69,19 +69,19 @@ def _filled(coefficients, state, value):
 
 
 @jit
-def prefilter(coefficients, state, value):
+def filter_reference(coefficients, state, value):
     """What is wanted of the position, and what is added to the command, for a reference; all in µm.
 
     The sections are second-order, in transposed direct form II.
     """
     if state.tap_index < 0:
-        _filled(coefficients, state, value)
+        _fill_memory(coefficients, state, value)
     added_um = 0.0
     if coefficients.tap_count > 0:
         index = (state.tap_index if state.tap_index > 0 else MAX_TAPS) - 1
         state.tap_index = index
         state.tap_history[index] = state.tap_history[index + MAX_TAPS] = value
-        value, added_um = _rows(coefficients, state)
+        value, added_um = _tap_outputs_um(coefficients, state)
     for i in range(coefficients.section_count):
         output = coefficients.sections[i, 0] * value + state.section_history[i, 0]
         state.section_history[i, 0] = (

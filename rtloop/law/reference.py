@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from rtloop.hil.native.compiled import guarded
+from rtloop.hil.native.compiled import jit_checked
 
 GENERATOR_PARAMETERS = 8
 
@@ -55,7 +55,7 @@ HOLD, TABLE, SINE, TRIANGLE, CHIRP = (int(kind) for kind in Generator if kind is
 TURN = 2.0 * math.pi
 
 
-@guarded
+@jit_checked
 def reference_sample(generator, tick, period_s, table, inputs):
     """Reference of one axis at `tick`; `table` (n,) holds the samples of all tables, `inputs` the driver's volts.
 
@@ -85,7 +85,7 @@ def reference_sample(generator, tick, period_s, table, inputs):
     return inputs[np.int64(p[0])] * p[1] + p[2]
 
 
-@guarded
+@jit_checked
 def _table_index(index, count, repeat):
     """Index within a table of `count` samples: from the start again, or held at the end."""
     if repeat:
@@ -93,13 +93,13 @@ def _table_index(index, count, repeat):
     return index if index < count else count - 1
 
 
-@guarded
+@jit_checked
 def _phase(turns):
     """Fraction of a turn, in 0 ≤ phase < 1."""
     return turns - math.floor(turns)
 
 
-@guarded
+@jit_checked
 def _chirp_turns(p, time_s):
     """Turns of a sweep that holds its last frequency once it has ended."""
     start_hz, end_hz, duration_s = p[1], p[2], p[3]

@@ -21,7 +21,7 @@ ENABLE = int(Flag.TRIP_ENABLE)
 
 
 @jit
-def usable(value):
+def is_usable(value):
     """True for a finite number of sane magnitude."""
     return -USABLE_MAGNITUDE < value < USABLE_MAGNITUDE
 
@@ -33,7 +33,7 @@ def clip(value, low, high):
 
 
 @jit
-def toward(value, target, step):
+def step_toward(value, target, step):
     """`value` moved toward `target` by at most `step`."""
     return clip(target, value - step, value + step)
 

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.native.compiled import jit, seldom
+from rtloop.hil.native.compiled import jit, jit_rare
 from rtloop.hil.native.pointers import address_pointer, call_law, carray
 from rtloop.law.access import (
     CONTROL_BYTES,
     FEEDFORWARD_COEFFICIENTS,
     FEEDFORWARD_STATE,
-    coefficients_of,
-    functions_of,
-    state_of,
+    axis_state,
+    coefficients_record,
+    law_functions,
 )
 from rtloop.law.layout import CONTROL, RULE
-from rtloop.law.safety import usable
+from rtloop.law.safety import is_usable
 from rtloop.signals import RAISED, Failure
 
 OK, NONE = 0, -2
@@ -35,88 +35,88 @@ FEEDFORWARD_OUTPUT, FEEDFORWARD_UPDATE, FEEDFORWARD_ENTER = (
 
 
 @jit
-def _result(law):
+def _last_result(law):
     """What the last call returned."""
     return carray(address_pointer(law.result), 1, np.float64)[0]
 
 
-@seldom
-def note_failure(state, failure, value):
+@jit_rare
+def record_failure(state, failure, value):
     """The first failure of an axis since it was entered is the one that is told."""
     if state.failed == 0:
         state.failed, state.failed_value = failure, value
 
 
 @jit
-def _controller_call(law, a, function, told):
+def _call_controller(law, a, function, control_address):
     coefficients = law.coefficients + a * law.coefficients_bytes + law.controller_coefficients
     state = law.axes + a * law.axes_bytes + law.controller_state
-    return call_law(function, law.result, law.raised, coefficients, state, told + a * CONTROL_BYTES)
+    return call_law(function, law.result, law.raised, coefficients, state, control_address + a * CONTROL_BYTES)
 
 
 @jit
-def _feedforward_call(law, a, function, result, value):
+def _call_feedforward(law, a, function, result, value):
     coefficients = law.coefficients + a * law.coefficients_bytes + FEEDFORWARD_COEFFICIENTS
     state = law.axes + a * law.axes_bytes + FEEDFORWARD_STATE
     return call_law(function, result, law.raised, coefficients, state, value)
 
 
 @jit
-def controller_output(law, a, coefficients, told):
+def controller_output(law, a, coefficients, control_address):
     """Whether the controller whose first axis is `a` came to its end, and what it returned.
 
     `told` is where what it is told begins, for all axes: `law.controls` or `law.together`.
     """
-    status = _controller_call(law, a, functions_of(law, coefficients.controller_law).output, told)
+    status = _call_controller(law, a, law_functions(law, coefficients.controller_law).output, control_address)
     if status in (OK, NONE):
-        return True, _result(law)
-    note_failure(state_of(law, a), CONTROLLER_OUTPUT + RAISED, np.nan)
+        return True, _last_result(law)
+    record_failure(axis_state(law, a), CONTROLLER_OUTPUT + RAISED, np.nan)
     return False, np.nan
 
 
-@seldom
-def controller_enter(law, a, told):
+@jit_rare
+def controller_enter(law, a, control_address):
     """Have the controller whose first axis is `a`, its state at zero, go on from a command; False where it failed."""
-    functions = functions_of(law, coefficients_of(law, a).controller_law)
+    functions = law_functions(law, coefficients_record(law, a).controller_law)
     state = carray(
         address_pointer(law.axes + a * law.axes_bytes + law.controller_state), functions.state_bytes, np.uint8
     )
     for i in range(functions.state_bytes):
         state[i] = 0
-    if functions.enter == 0 or _controller_call(law, a, functions.enter, told) in (OK, NONE):
+    if functions.enter == 0 or _call_controller(law, a, functions.enter, control_address) in (OK, NONE):
         return True
-    note_failure(state_of(law, a), CONTROLLER_ENTER + RAISED, np.nan)
+    record_failure(axis_state(law, a), CONTROLLER_ENTER + RAISED, np.nan)
     return False
 
 
 @jit
-def controller_update(law, a, coefficients, told):
+def controller_update(law, a, coefficients, control_address):
     """Advance the controller whose first axis is `a`; False where it failed."""
-    if _controller_call(law, a, functions_of(law, coefficients.controller_law).update, told) in (OK, NONE):
+    if _call_controller(law, a, law_functions(law, coefficients.controller_law).update, control_address) in (OK, NONE):
         return True
-    note_failure(state_of(law, a), CONTROLLER_UPDATE + RAISED, np.nan)
+    record_failure(axis_state(law, a), CONTROLLER_UPDATE + RAISED, np.nan)
     return False
 
 
 @jit
 def feedforward_output(law, a, coefficients, state, command_um):
     """Drive in V for a command in µm; a failure is noted."""
-    function = functions_of(law, coefficients.feedforward_law).output
-    if _feedforward_call(law, a, function, law.result, command_um) not in (OK, NONE):
-        note_failure(state, FEEDFORWARD_OUTPUT + RAISED, np.nan)
+    function = law_functions(law, coefficients.feedforward_law).output
+    if _call_feedforward(law, a, function, law.result, command_um) not in (OK, NONE):
+        record_failure(state, FEEDFORWARD_OUTPUT + RAISED, np.nan)
         return np.nan
-    drive_v = _result(law)
-    if not usable(drive_v):
-        note_failure(state, FEEDFORWARD_OUTPUT, drive_v)
+    drive_v = _last_result(law)
+    if not is_usable(drive_v):
+        record_failure(state, FEEDFORWARD_OUTPUT, drive_v)
     return drive_v
 
 
-@seldom
+@jit_rare
 def feedforward_enter(law, a, drive_v):
     """The feedforward takes over at `drive_v`."""
-    functions = functions_of(law, coefficients_of(law, a).feedforward_law)
-    if functions.enter != 0 and _feedforward_call(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):
-        note_failure(state_of(law, a), FEEDFORWARD_ENTER + RAISED, np.nan)
+    functions = law_functions(law, coefficients_record(law, a).feedforward_law)
+    if functions.enter != 0 and _call_feedforward(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):
+        record_failure(axis_state(law, a), FEEDFORWARD_ENTER + RAISED, np.nan)
 
 
 @jit
@@ -125,21 +125,21 @@ def feedforward_update(law, a, coefficients, state, drive_v):
 
     It goes straight to where the controller finds it.
     """
-    function = functions_of(law, coefficients.feedforward_law).update
+    function = law_functions(law, coefficients.feedforward_law).update
     place = law.controls + a * CONTROL_BYTES + APPLIED
-    if _feedforward_call(law, a, function, place, drive_v) not in (OK, NONE):
-        note_failure(state, FEEDFORWARD_UPDATE + RAISED, np.nan)
+    if _call_feedforward(law, a, function, place, drive_v) not in (OK, NONE):
+        record_failure(state, FEEDFORWARD_UPDATE + RAISED, np.nan)
         return np.nan
     applied_um = carray(address_pointer(place), 1, np.float64)[0]
-    if not usable(applied_um):
-        note_failure(state, FEEDFORWARD_UPDATE, applied_um)
+    if not is_usable(applied_um):
+        record_failure(state, FEEDFORWARD_UPDATE, applied_um)
     return applied_um
 
 
-@seldom
-def admitted(law, number, coefficients):
+@jit_rare
+def are_counts_allowed(law, number, coefficients):
     """Whether all counts and indices in a law's coefficients, at an address, are what its kernels can work with."""
-    functions = functions_of(law, number)
+    functions = law_functions(law, number)
     rules = carray(address_pointer(law.rules), functions.first_rule + functions.rule_count, RULE)
     for rule in range(functions.first_rule, functions.first_rule + functions.rule_count):
         limits = rules[rule]

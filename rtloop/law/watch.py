@@ -16,10 +16,10 @@ LATE = int(Flag.TRIP_LATE)
 
 
 @jit
-def watch(coefficients, state, mode, adc_v, lateness_us):
+def lasting_causes(coefficients, state, mode, adc_v, lateness_us):
     """Flag bits of what one axis has been doing for too long; limits of 0 ticks or swings are off."""
     causes = 0
-    if coefficients.frozen_ticks > 0 and _frozen(coefficients, state, adc_v):
+    if coefficients.frozen_ticks > 0 and _is_frozen(coefficients, state, adc_v):
         causes |= FROZEN
     if coefficients.late_ticks > 0:
         state.late_count = state.late_count + 1 if lateness_us > coefficients.late_us else 0
@@ -42,7 +42,7 @@ def watch(coefficients, state, mode, adc_v, lateness_us):
 
 
 @jit
-def _frozen(coefficients, state, adc_v):
+def _is_frozen(coefficients, state, adc_v):
     """The same reading for long enough, although the drive has moved meanwhile."""
     if adc_v != state.frozen_adc_v:
         state.frozen_adc_v, state.frozen_from_v, state.frozen_count = adc_v, state.drive_v, 0
@@ -65,15 +65,15 @@ def _count_swings(coefficients, state):
         if position_um > extreme_um:
             state.swing_extreme_um = position_um
         elif position_um < extreme_um - coefficients.oscillation_um:
-            _swing(state, -1)
+            _begin_swing(state, -1)
     elif position_um < extreme_um:
         state.swing_extreme_um = position_um
     elif position_um > extreme_um + coefficients.oscillation_um:
-        _swing(state, 1)
+        _begin_swing(state, 1)
 
 
 @jit
-def _swing(state, direction):
+def _begin_swing(state, direction):
     state.swing_direction = direction
     state.swing_extreme_um = state.position_um
     state.swing_count += 1

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtloop.hil.native.compiled import checked
-from rtloop.law.layout import MAX_EXTRAS, told_by
-from rtloop.law.memory import records
-from rtloop.laws.binding import signatures_of
-from rtloop.laws.contract import Controller, Law, record_of
-from rtloop.laws.limited_return import SATURATED, LimitedLoop, gains_of
-from rtloop.laws.linearise import as_written
+from rtloop.hil.native.compiled import jit_strict
+from rtloop.law.layout import MAX_EXTRAS, control_dtype
+from rtloop.law.memory import new_records
+from rtloop.laws.binding import function_signatures
+from rtloop.laws.contract import Controller, Law, build_record
+from rtloop.laws.limited_return import SATURATED, LimitedLoop, dc_gains
+from rtloop.laws.linearise import python_function
 from rtloop.laws.purity import foreign_calls
 
 TICKS, SEED = 400, 7
@@ -33,7 +33,7 @@ SETTLING_TICKS = 2_000
 REACH_UM = 60.0
 BUMP = 1e-6
 """Of the command that a law is told to go on from, and of the error that it meets."""
-LATER, LATER_TICKS, FURTHER = 0.15, 5, 0.2
+EXTRA_SHARE, EXTRA_TICKS, EXTRA_OVERSHOOT = 0.15, 5, 0.2
 """By how much the return from a limit may take longer than without one, as a part and in ticks; by which part of the
 way it may overshoot further."""
 
@@ -52,12 +52,12 @@ class LawConformance:
         """The law on records of its own."""
         return Bench(self.law)
 
-    def test_it_builds_numbers_that_can_be_computed_with(self) -> None:
+    def test_build_gives_finite_numbers(self) -> None:
         """Every coefficient is finite, and the same options give the same bytes."""
-        built = record_of(self.law)
+        built = build_record(self.law)
         for name in built.dtype.names or ():
             assert np.all(np.isfinite(built[name].astype(float))), f"coefficient {name} is not finite: {built[name]}"
-        assert built.tobytes() == record_of(self.law).tobytes(), "the same options gave other coefficients"
+        assert built.tobytes() == build_record(self.law).tobytes(), "the same options gave other coefficients"
 
     def test_whole_numbers_are_bounded(self) -> None:
         """Whatever the functions use as an index has its range in `allowed_coefficients` and `allowed_state`."""
@@ -108,7 +108,7 @@ class LawConformance:
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
             assert np.all(np.isfinite(value)), f"tick {number} after the entry: {value}"
 
-    def test_it_goes_on_where_it_is_told_to(self, bench: Bench) -> None:
+    def test_enter_continues_from_the_command(self, bench: Bench) -> None:
         """Its `enter` leaves no more than BUMP; without one the loop's own offset does it."""
         if not isinstance(self.law, Controller) or type(self.law).enter is None:
             pytest.skip("the law has no enter of its own")
@@ -129,21 +129,21 @@ class LawConformance:
         free = bench.limited_loop(at_rest=True).unlimited_return()
         if free is None:
             pytest.skip("without a limit its loop around a lag with the gain of its model, or 1, does not come back")
-        most_ticks = int((1 + LATER) * free.ticks) + LATER_TICKS
+        most_ticks = int((1 + EXTRA_SHARE) * free.ticks) + EXTRA_TICKS
         saturated_ticks = max(SATURATED * free.ticks, self.saturated_ticks)
         limited = bench.limited_loop().limited_return(saturated_ticks, most_ticks)
         assert limited is not None, (
             f"wound up: {saturated_ticks} ticks beyond the limit, and it was not back after {most_ticks} ticks; "
             f"it takes {free.ticks} without a limit"
         )
-        assert limited.overshoot <= free.overshoot + FURTHER, (
+        assert limited.overshoot <= free.overshoot + EXTRA_OVERSHOOT, (
             f"wound up: back from the limit it overshot by {100 * limited.overshoot:.1f} % of the way; "
             f"without a limit by {100 * free.overshoot:.1f} %"
         )
 
     def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:
         """No memory taken, nothing printed, no interpreter, no mathematics that differs between processors."""
-        for name, calls in bench.foreign():
+        for name, calls in bench.calls_by_function():
             assert not calls, f"{name}: " + "; ".join(f"{called} {reason}" for called, reason in calls.items())
 
     def test_what_a_tick_costs(self, bench: Bench, record_property: Any) -> None:
@@ -156,7 +156,7 @@ class LawConformance:
 
 @cache
 def _compiled(function: Any, signature: Any) -> Any:
-    kernel = checked(function)
+    kernel = jit_strict(function)
     kernel.compile(signature)
     return kernel
 
@@ -166,20 +166,20 @@ class Bench:
 
     def __init__(self, law: Law, compiled: bool = True) -> None:
         law_records, self._law = law.records(law.count), law
-        self.coefficients: Any = records(law_records.coefficients, 1)
-        self.coefficients[:] = record_of(law)
-        self.state: Any = records(law_records.state, 1)
-        self._told: Any = records(told_by(law.count), 1) if law.count else None
+        self.coefficients: Any = new_records(law_records.coefficients, 1)
+        self.coefficients[:] = build_record(law)
+        self.state: Any = new_records(law_records.state, 1)
+        self._control: Any = new_records(control_dtype(law.count), 1) if law.count else None
         self._rows = (self.coefficients[0], self.state[0])
         self._kernels: dict[str, Any] = {}
-        self._signatures = signatures_of(type(law), law_records)
+        self._signatures = function_signatures(type(law), law_records)
         for name, signature in self._signatures.items():
-            python_kernel = as_written(getattr(type(law), name))
+            python_kernel = python_function(getattr(type(law), name))
             self._kernels[name] = _compiled(python_kernel, signature) if compiled else python_kernel
 
-    def _call(self, name: str, told: Any) -> Any:
+    def _call(self, name: str, law_input: Any) -> Any:
         with np.errstate(all="ignore"):
-            return self._kernels[name](*self._rows, told)
+            return self._kernels[name](*self._rows, law_input)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
         """What each tick gives, a number or one for each axis, and the state and the outputs after it."""
@@ -190,7 +190,7 @@ class Bench:
                 followed = float(self._call("update", random.uniform(-10, 10)))
                 yield value + followed, self.state.tobytes()
                 continue
-            control = self._told[0]
+            control = self._control[0]
             reach = 1e6 if wild and number % 97 == 0 else REACH_UM
             axes = None if self._law.count == 1 else self._law.count
             position_um, reference_um = random.uniform(-reach, reach, axes), random.uniform(-reach, reach, axes)
@@ -203,10 +203,10 @@ class Bench:
             self._call("update", control)
             yield value, self.state.tobytes() + control["outputs"].tobytes()
 
-    def _commands(self, told: Any) -> Any:
+    def _commands(self, control: Any) -> Any:
         """What the controller commands: a number, or a tuple with one for each of its axes."""
-        value = self._call("output", told)
-        return float(value) if self._law.count == 1 else tuple(told.command_um.tolist())
+        value = self._call("output", control)
+        return float(value) if self._law.count == 1 else tuple(control.command_um.tolist())
 
     def poison(self) -> None:
         """Ticks with what is no number; what it returns or raises then is its own affair."""
@@ -215,10 +215,10 @@ class Bench:
                 if self._law.count == 0:
                     self._call("output", value)
                     continue
-                for name in self._told.dtype.names:
-                    self._told[name] = value
-                self._call("output", self._told[0])
-                self._call("update", self._told[0])
+                for name in self._control.dtype.names:
+                    self._control[name] = value
+                self._call("output", self._control[0])
+                self._call("update", self._control[0])
             except (ArithmeticError, IndexError, ValueError):
                 continue
 
@@ -227,7 +227,7 @@ class Bench:
         if self._law.count == 0:
             return 0.0
         self.state.view(np.uint8)[:] = 0
-        control = self._told[0]
+        control = self._control[0]
         if self._law.count == 1:
             position_um, error_um, command_um = float(position_um[0]), float(error_um[0]), float(command_um[0])
         control.position_um, control.error_um, control.reference_um = position_um, error_um, position_um + error_um
@@ -237,17 +237,17 @@ class Bench:
         return self._commands(control)
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
-        """The law at the edge of what the limit can hold; one without `enter` is brought to rest there if `at_rest`."""
+        """The law at the edge of what the limit can hold; without `enter` it rests there if `create_at_rest`."""
         count = self._law.count
-        loop = LimitedLoop(self._follow, gains_of(self._law.model, count), REACH_UM)
+        loop = LimitedLoop(self._limited_tick, dc_gains(self._law.model, count), REACH_UM)
         self.enter(loop.edge_um, np.zeros(count), np.full(count, REACH_UM))
         if at_rest and "enter" not in self._kernels:
             loop.follow(loop.edge_um, SETTLING_TICKS, limited=False)
         return loop
 
-    def _follow(self, position_um: Any, reference_um: Any, limit_um: float) -> Any:
+    def _limited_tick(self, position_um: Any, reference_um: Any, limit_um: float) -> Any:
         """One tick with a limit of the command; what was applied. All (axes,)."""
-        control = self._told[0]
+        control = self._control[0]
         if self._law.count == 1:
             position_um, reference_um = float(position_um[0]), float(reference_um[0])
         control.position_um, control.reference_um, control.error_um = (
@@ -261,7 +261,7 @@ class Bench:
         self._call("update", control)
         return np.atleast_1d(np.array(control.applied_um))
 
-    def foreign(self) -> Iterator[tuple[str, dict[str, str]]]:
+    def calls_by_function(self) -> Iterator[tuple[str, dict[str, str]]]:
         """Of each function what it calls that a law may not."""
         for name, kernel in self._kernels.items():
             yield name, foreign_calls(kernel, self._signatures[name], self._law.libm)

@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rtloop.law.layout import whole_lines
+from rtloop.law.layout import cache_line_record
 from rtloop.law.memory import LawRecords, Rules
 from rtloop.laws.limited.announced import announce
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOptions
@@ -165,7 +165,7 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
             raise TypeError(f"{name} is {kind!r}; allowed: float, int, or (float, length) for an array")
         lengths = shape[0] if shape and isinstance(shape[0], tuple) else tuple(shape)
         found.append((name, _TYPES[kind], lengths))
-    return whole_lines(sorted(found, key=lambda field: -int(np.prod(field[2]))))
+    return cache_line_record(sorted(found, key=lambda field: -int(np.prod(field[2]))))
 
 
 def _announce(law: Law) -> None:
@@ -175,7 +175,7 @@ def _announce(law: Law) -> None:
         announce(law.kind, reference.file if reference is not None else type(law).__module__)
 
 
-def record_of(law: Law) -> Any:
+def build_record(law: Law) -> Any:
     """The coefficients that a law builds, shape (1,). Raises ValueError for a name or a shape that does not fit."""
     _announce(law)
     dtype = law.records().coefficients
@@ -183,26 +183,30 @@ def record_of(law: Law) -> Any:
     names = [name for name in dtype.names or () if name not in ("reserved", "scratch")]
     built = law.build()
     if not isinstance(built, Mapping):
-        raise ValueError(f"{_place(law)} returns {built!r}; a dict with a value for each coefficient is needed")
+        raise ValueError(
+            f"{_build_location(law)} returns {built!r}; a dict with a value for each coefficient is needed"
+        )
     if unknown := [name for name in built if name not in names]:
-        raise ValueError(f"{_place(law)} gives {', '.join(unknown)}; the coefficients are {', '.join(names)}")
+        raise ValueError(f"{_build_location(law)} gives {', '.join(unknown)}; the coefficients are {', '.join(names)}")
     if not law.shipped and (missing := [name for name in names if name not in built]):
-        raise ValueError(f"{_place(law)} gives no {', '.join(missing)}; the coefficients are {', '.join(names)}")
+        raise ValueError(
+            f"{_build_location(law)} gives no {', '.join(missing)}; the coefficients are {', '.join(names)}"
+        )
     for name, value in built.items():
         numbers, target = np.asarray(value), record[name]
         if numbers.dtype.kind not in "biuf":
-            raise ValueError(f"{_place(law)} gives {name} = {value!r}, which is no number")
+            raise ValueError(f"{_build_location(law)} gives {name} = {value!r}, which is no number")
         room = target.shape[1:]
         if numbers.ndim != len(room) or any(n > limit for n, limit in zip(numbers.shape, room, strict=True)):
             needed = f"an array of at most {room}" if room else "one number"
-            raise ValueError(f"{_place(law)} gives {name} as an array of {numbers.shape}; {needed} is needed")
+            raise ValueError(f"{_build_location(law)} gives {name} as an array of {numbers.shape}; {needed} is needed")
         if np.isnan(numbers).any():
-            raise ValueError(f"{_place(law)} gives {name} = {value!r}; NaN is not allowed")
+            raise ValueError(f"{_build_location(law)} gives {name} = {value!r}; NaN is not allowed")
         target[(0, *(slice(0, length) for length in numbers.shape))] = numbers
     return record
 
 
-def _place(law: Law) -> str:
+def _build_location(law: Law) -> str:
     """Return file, line and name of a law's `build`, for a message."""
     code = type(law).build.__code__
     part = "feedforward" if isinstance(law, Feedforward) else "controller"

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
-from rtloop.law.layout import told_by
+from rtloop.law.layout import control_dtype
 from rtloop.laws.contract import Feedforward, Law
 
 PER_TICK = ("output", "update", "enter")
@@ -61,7 +61,7 @@ def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mappi
         given[1]: _Parameter("state", records.state.names or (), True),
     }
     if not feedforward:
-        parameters[given[2]] = _Parameter("signal", told_by(max(law.axes, 1)).names or (), False)
+        parameters[given[2]] = _Parameter("signal", control_dtype(max(law.axes, 1)).names or (), False)
     yield from _wrong_fields(function, parameters)
     yield from _unknown_names(function, given, names)
     yield from _wrong_returns(function, law)

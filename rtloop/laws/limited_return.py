@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 Real = npt.NDArray[np.float64]
 LAG = 0.2
-BACK = 0.05
+BACK_SHARE = 0.05
 """Part of the way that is left when the loop counts as back."""
 BEYOND = 3.0
 MOST_TICKS = 5000
@@ -79,15 +79,15 @@ class LimitedLoop:
 
 def _ticks_until_back(part: Real) -> int | None:
     """Ticks until every axis has been once within BACK of 0, or beyond it; None where one has not."""
-    reached = np.any(part <= BACK, axis=0)
-    return int(np.argmax(part <= BACK, axis=0).max()) + 1 if reached.all() else None
+    reached = np.any(part <= BACK_SHARE, axis=0)
+    return int(np.argmax(part <= BACK_SHARE, axis=0).max()) + 1 if reached.all() else None
 
 
 def _overshoot(part: Real) -> float:
     return max(0.0, -float(part.min()))
 
 
-def gains_of(model: Any, axes: int) -> Real:
+def dc_gains(model: Any, axes: int) -> Real:
     """Gain at 0 Hz of each axis's model (axes,); 1 where there is none."""
     models = model if isinstance(model, tuple) else (model,) * axes
     return np.array([1.0 if axis_model is None else axis_model.transfer().dc_gain for axis_model in models])

@@ -11,33 +11,33 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.law.layout import told_by
-from rtloop.law.memory import records
-from rtloop.laws.contract import Controller, record_of
+from rtloop.law.layout import control_dtype
+from rtloop.law.memory import new_records
+from rtloop.laws.contract import Controller, build_record
 from rtloop.linear.realisation import System
 from rtloop.linear.sampled import Sampled
-from rtloop.linear.together import SampledTogether, SystemTogether
+from rtloop.linear.together import CoupledSystem, SampledCoupledSystem
 
 STEP = 1e-4
 AGREEMENT = 1e-4
 """Of the derivatives by STEP and by half of it: beyond, the law bends, or has a corner, at its rest."""
-MOST_STATES = 400
+MAX_STATES = 400
 Real = npt.NDArray[np.float64]
 
 
 def linear_part(law: Controller) -> Any:
     """What the law itself says of it, or else what is found. Raises ValueError where nothing can be."""
     declared = law.linear()
-    return linearised(law) if declared is None else declared
+    return linearise_at_rest(law) if declared is None else declared
 
 
-def linearised(law: Controller) -> Sampled | SampledTogether:
+def linearise_at_rest(law: Controller) -> Sampled | SampledCoupledSystem:
     """The law about its rest; of several axes where it has several.
 
     Raises ValueError where it has too many states, is not smooth there, or fails there."""
     tick = _Tick(law)
-    if tick.size > MOST_STATES:
-        raise ValueError(f"{tick.size} states; at most {MOST_STATES} are found out one by one")
+    if tick.size > MAX_STATES:
+        raise ValueError(f"{tick.size} states; at most {MAX_STATES} are found out one by one")
     try:
         with np.errstate(all="ignore"):
             wide, narrow = _derivatives(tick, STEP), _derivatives(tick, STEP / 2)
@@ -46,7 +46,9 @@ def linearised(law: Controller) -> Sampled | SampledTogether:
     except (ArithmeticError, IndexError, ValueError) as error:
         raise ValueError(f"at rest it fails: {type(error).__name__}: {error}") from error
     n = tick.size
-    is_minimal = _reached(narrow[:n, :n], narrow[:n, n:]) & _reached(narrow[:n, :n].T, narrow[n:, :n].T)
+    is_minimal = _reachable_states(narrow[:n, :n], narrow[:n, n:]) & _reachable_states(
+        narrow[:n, :n].T, narrow[n:, :n].T
+    )
     indices = np.concatenate([np.flatnonzero(is_minimal), np.arange(n, len(narrow))])
     wide, narrow, n = wide[np.ix_(indices, indices)], narrow[np.ix_(indices, indices)], int(is_minimal.sum())
     scale = np.abs(wide).max(axis=1, keepdims=True, initial=0.0) + 1e-12
@@ -54,11 +56,11 @@ def linearised(law: Controller) -> Sampled | SampledTogether:
         raise ValueError("it is not smooth at rest")
     a, b, c, d = narrow[:n, :n], narrow[:n, n:], narrow[n:, :n], narrow[n:, n:]
     if law.count > 1:
-        return SampledTogether(SystemTogether(a, b, c, d), law.period_s)
+        return SampledCoupledSystem(CoupledSystem(a, b, c, d), law.period_s)
     return Sampled(System(a, b[:, 0], c[0], float(d[0, 0])), law.period_s)
 
 
-def _reached(a: Real, b: Real) -> npt.NDArray[np.bool_]:
+def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:
     """States that an input reaches at all, (n,); with Aᵀ and Cᵀ those that an output sees. Counters are neither."""
     reachable = np.any(b != 0, axis=1)
     while True:
@@ -86,14 +88,14 @@ class _Tick:
 
     def __init__(self, law: Controller) -> None:
         keeps = law.records(law.count)
-        self._coefficients: Any = record_of(law).view(np.recarray)[0]
-        self._state = records(keeps.state, 1)
+        self._coefficients: Any = build_record(law).view(np.recarray)[0]
+        self._state = new_records(keeps.state, 1)
         self._fields = [name for name in keeps.state.names or () if keeps.state[name].base == np.float64]
         self._fields = [name for name in self._fields if name not in ("reserved", "scratch")]
-        self._output, self._update = as_written(type(law).output), as_written(type(law).update)
+        self._output, self._update = python_function(type(law).output), python_function(type(law).update)
         self.size = sum(int(np.prod(keeps.state[name].shape)) for name in self._fields)
         self.axes = law.count
-        self._told = told_by(law.count)
+        self._told = control_dtype(law.count)
 
     def __call__(self, states: Real, errors_um: Real) -> Real:
         self._state.view(np.uint8)[:] = 0
@@ -102,7 +104,7 @@ class _Tick:
             target = self._state[name].reshape(-1)
             target[:] = states[offset : offset + target.size]
             offset += target.size
-        control = records(self._told, 1)
+        control = new_records(self._told, 1)
         control.position_um, control.error_um = -errors_um, errors_um
         state = self._state[0]
         returned = self._output(self._coefficients, state, control[0])
@@ -115,6 +117,6 @@ class _Tick:
         )
 
 
-def as_written(function: Any) -> Callable[..., Any]:
+def python_function(function: Any) -> Callable[..., Any]:
     """What a kernel was compiled from."""
     return getattr(function, "py_func", function)

@@ -19,7 +19,7 @@ from rtloop.laws.options import LawOptions
 BASES = ("Controller", "CoupledController", "Feedforward")
 
 
-def mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
+def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
     """Yield the mistakes in the laws of a text, in the order of their lines.
 
     `names` are those that the text defines when it is run.

@@ -32,13 +32,13 @@ class LawOptions(Options):
         """The model of a law from a file is known to the process alone that ran the file: what was said is pickled."""
         if self._law is None or not self._law.text:
             return super().__reduce_ex__(protocol)
-        return _restored, (self._law, self.model_dump(exclude_unset=True))
+        return _restore_options, (self._law, self.model_dump(exclude_unset=True))
 
 
-def _restored(law: Any, said: dict[str, Any]) -> LawOptions:
+def _restore_options(law: Any, values: dict[str, Any]) -> LawOptions:
     from rtloop.laws.registry import law_class
 
-    options = law_class(law).options_model.model_validate(said)
+    options = law_class(law).options_model.model_validate(values)
     options.bind(law)
     return options
 

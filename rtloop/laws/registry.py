@@ -24,7 +24,7 @@ from types import ModuleType
 from rtloop.law.memory import Layout
 from rtloop.laws.contract import Law
 from rtloop.laws.limited.announced import announce, is_limited
-from rtloop.laws.mistakes import missing_law, mistakes
+from rtloop.laws.mistakes import find_mistakes, missing_law
 
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
@@ -62,7 +62,7 @@ def kinds() -> dict[str, str]:
     return dict(sorted({**installed, **BUILT_IN}.items()))
 
 
-def reference(kind: str) -> LawReference:
+def find_law(kind: str) -> LawReference:
     """A shipped law, or an installed one. Raises ValueError for a kind that is not known or cannot be imported."""
     if kind in BUILT_IN:
         return LawReference(kind)
@@ -73,7 +73,7 @@ def reference(kind: str) -> LawReference:
     announce(kind, module)
     try:
         file = inspect.getsourcefile(import_module(module))
-        return from_text(Path(file or "").read_text(encoding="utf-8"), str(file), kind)
+        return law_from_text(Path(file or "").read_text(encoding="utf-8"), str(file), kind)
     except (ImportError, OSError) as error:
         raise ValueError(f"law {kind!r}, {locations[kind]}: cannot be imported: {error}") from error
 
@@ -85,10 +85,10 @@ def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 
 
 def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
-    return tuple(LawReference(kind, text, file) for kind in sorted(_classes(_module(text, file))))
+    return tuple(LawReference(kind, text, file) for kind in sorted(_law_classes(_module(text, file))))
 
 
-def from_text(text: str, file: str, kind: str | None = None) -> LawReference:
+def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     """The law that a text defines; `kind` says which, where there are several. Raises ValueError."""
     announce(kind or Path(file).stem, file)
     laws = {law.kind: law for law in _laws_in(text, file)}
@@ -106,12 +106,12 @@ def law_class(law: LawReference) -> type[Law]:
     """The class of a law. Raises ValueError where its text cannot be run."""
     if law.text:
         announce(law.kind, law.file)
-        return _classes(_module(law.text, law.file))[law.kind]
+        return _law_classes(_module(law.text, law.file))[law.kind]
     module, _, name = BUILT_IN[law.kind].partition(":")
     return getattr(import_module(module), name)
 
 
-def layout_of(laws: Sequence[LawReference]) -> Layout:
+def law_layout(laws: Sequence[LawReference]) -> Layout:
     """The records of a loop that knows these laws."""
     return Layout(tuple(law_class(law).records(law.axes) for law in laws))
 
@@ -130,13 +130,13 @@ def _module(text: str, file: str) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error
-    for mistake in mistakes(text, vars(module)):
+    for mistake in find_mistakes(text, vars(module)):
         del sys.modules[name]
         raise ValueError(f"{file}, line {mistake.line}: {mistake.what}")
     return module
 
 
-def _classes(module: ModuleType) -> dict[str, type[Law]]:
+def _law_classes(module: ModuleType) -> dict[str, type[Law]]:
     """The laws that a module itself defines, by kind."""
     classes = [law for law in vars(module).values() if isinstance(law, type) and law.__module__ == module.__name__]
     return {law.kind: law for law in classes if issubclass(law, Law) and not inspect.isabstract(law)}

@@ -39,14 +39,14 @@ def antiwindup(system: System, form: Form) -> Real:
     Raises ValueError where the spectral radius is not below 1.
     """
     correction = np.zeros(system.b.size)
-    selected = _chosen(system, form)
+    selected = _corrected_states(system, form)
     if selected.size == 0:
         return correction
     part = System(system.a[np.ix_(selected, selected)], system.b[selected], system.c[selected], system.d)
     spread = _weights(part) @ part.c
     if (weight := float(part.c @ spread)) > 0:
         correction[selected] = spread / weight
-    radius = _radius(system.a - np.outer(system.a @ correction, system.c))
+    radius = _spectral_radius(system.a - np.outer(system.a @ correction, system.c))
     if not radius < 1:
         raise ValueError(
             f"controller: while its output is limited its states have spectral radius {radius:.9g}; below 1 is needed"
@@ -54,7 +54,7 @@ def antiwindup(system: System, form: Form) -> Real:
     return correction
 
 
-def antiwindup_together(a: Real, b: Real, c: Real) -> Real:
+def antiwindup_matrix(a: Real, b: Real, c: Real) -> Real:
     """M (n, m) with C M = I for a controller with m outputs, so that A(I − M C) is stable.
 
     For C M = I the outputs must differ: where they do not, what they have in common is shared out by least squares. The
@@ -79,7 +79,7 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
     """
     share = -math.expm1(-period_s / tracking_s) if tracking_s > 0 else 1.0
     outputs = c.size // max(a.shape[0], 1)
-    radius = _radius(a - share * a @ m.reshape(-1, outputs) @ c.reshape(outputs, -1)) if a.size else 0.0
+    radius = _spectral_radius(a - share * a @ m.reshape(-1, outputs) @ c.reshape(outputs, -1)) if a.size else 0.0
     if not radius < 1:
         raise ValueError(
             f"controller.tracking_s: {tracking_s:g} s leaves its states unstable while the command is limited "
@@ -99,11 +99,11 @@ def steady_state_gain(system: System) -> Real:
     return gain
 
 
-def _chosen(system: System, form: Form) -> npt.NDArray[np.intp]:
+def _corrected_states(system: System, form: Form) -> npt.NDArray[np.intp]:
     """The states that take up the correction."""
     states = np.arange(system.b.size)
     is_observable = np.abs(system.c) > 1e-9 * np.abs(system.c).max(initial=0.0)
-    unstable_blocks = [block for block in blocks(system.a) if _radius(system.a[block, block]) >= 1]
+    unstable_blocks = [block for block in blocks(system.a) if _spectral_radius(system.a[block, block]) >= 1]
     if unstable_blocks:
         return np.concatenate([states[block] for block in unstable_blocks])
     if form == "modal":
@@ -114,7 +114,7 @@ def _chosen(system: System, form: Form) -> npt.NDArray[np.intp]:
 def _weights(part: System) -> Real:
     """W, symmetric and positive."""
     diagonal_blocks = blocks(part.a)
-    if len(diagonal_blocks) > 1 and any(_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):
+    if len(diagonal_blocks) > 1 and any(_spectral_radius(part.a[block, block]) >= 1 for block in diagonal_blocks):
         return _covariance(part)
     weights = np.empty(part.b.size)
     for block in diagonal_blocks:
@@ -134,5 +134,5 @@ def _covariance(part: System) -> Real:
         raise ValueError("controller: no anti-windup exists for its unstable modes; a stable one is needed") from None
 
 
-def _radius(a: Real) -> float:
+def _spectral_radius(a: Real) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))

@@ -18,29 +18,29 @@ import numpy.typing as npt
 
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.antiwindup import antiwindup, steady_state_gain
-from rtloop.linear.holds import first_order_hold, held_matrices
+from rtloop.linear.holds import first_order_hold, hold_matrices
 from rtloop.linear.realisation import (
     Form,
     System,
-    around_unit_circle,
-    beside_imaginary_axis,
     cascade,
+    imaginary_axis_points,
+    modal_realisation,
     realise,
     row_bands,
-    scaled,
-    system_of,
+    scale_states,
+    unit_circle_points,
     well_conditioned_sum,
 )
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain
 
 Method = Literal["matched", "tustin", "foh", "zoh"]
-SEEN = 36.0
+MAX_EXPONENT = 36.0
 """exp(36) is 4e15: adding 1 to it is lost in rounding."""
 
 
 @dataclass(frozen=True, eq=False)
-class Discrete:
+class DiscreteTransfer:
     """A transfer function in z at one rate: `zeros` (m,), `poles` (n,), `gain`, and `system`, which realises it."""
 
     zeros: Complex
@@ -97,7 +97,7 @@ class DiscreteController:
         return self.system.response(np.exp(2j * np.pi * np.atleast_1d(np.asarray(hz, float)) * self.period_s))
 
 
-def discretise(
+def discretise_controller(
     transfer: Transfer, period_s: float, method: Method = "matched", prewarp_hz: float | None = None
 ) -> DiscreteController:
     """The controller at period `period_s`; `prewarp_hz` is the frequency that "tustin" keeps in its place.
@@ -107,7 +107,7 @@ def discretise(
     one that is held. Raises ValueError for a period, method or frequency that cannot be, and where no anti-windup
     exists.
     """
-    discrete = discretised(transfer, period_s, method, prewarp_hz)
+    discrete = discretise_transfer(transfer, period_s, method, prewarp_hz)
     a, b, c, d = discrete.system
     return DiscreteController(
         method, float(period_s), prewarp_hz, discrete.zeros, discrete.poles, discrete.gain, discrete.form,
@@ -115,35 +115,39 @@ def discretise(
     )  # fmt: skip
 
 
-def discretised(
+def discretise_transfer(
     transfer: Transfer, period_s: float, method: Method = "matched", prewarp_hz: float | None = None
-) -> Discrete:
+) -> DiscreteTransfer:
     """The transfer function alone, without what only a controller needs: for plants, too. Raises as `discretise`."""
-    _check(period_s, method, prewarp_hz)
+    _require_valid(period_s, method, prewarp_hz)
     if transfer.gain == 0 or transfer.order == 0:
-        no_roots, static = np.empty(0, dtype=complex), _static(transfer)
-        return Discrete(no_roots, no_roots, static.d, static, "modal")
+        no_roots, static = np.empty(0, dtype=complex), _static_system(transfer)
+        return DiscreteTransfer(no_roots, no_roots, static.d, static, "modal")
     if method in ("zoh", "foh"):
-        system, form = _held(transfer, period_s, method == "foh")
+        system, form = _exact_hold(transfer, period_s, method == "foh")
         zeros, gain = zeros_and_gain(system)
-        return Discrete(zeros, np.exp(transfer.poles * period_s), gain, system, form)
+        return DiscreteTransfer(zeros, np.exp(transfer.poles * period_s), gain, system, form)
     zeros, poles, gain = (
-        _matched(transfer, period_s) if method == "matched" else _tustin(transfer, period_s, prewarp_hz)
+        _map_matched(transfer, period_s) if method == "matched" else _map_tustin(transfer, period_s, prewarp_hz)
     )
-    return Discrete(zeros, poles, gain, *realise(zeros, poles, gain, around_unit_circle()))
+    return DiscreteTransfer(zeros, poles, gain, *realise(zeros, poles, gain, unit_circle_points()))
 
 
-def held(transfer: Transfer, period_s: float) -> System:
+def zero_order_hold(transfer: Transfer, period_s: float) -> System:
     """A plant behind a zero-order hold, as a state space alone: its zeros cost more than all the rest."""
-    _check(period_s, "zoh", None)
-    return _static(transfer) if transfer.gain == 0 or transfer.order == 0 else _held(transfer, period_s, False)[0]
+    _require_valid(period_s, "zoh", None)
+    return (
+        _static_system(transfer)
+        if transfer.gain == 0 or transfer.order == 0
+        else _exact_hold(transfer, period_s, False)[0]
+    )
 
 
-def _static(transfer: Transfer) -> System:
+def _static_system(transfer: Transfer) -> System:
     return System(np.empty((0, 0)), np.empty(0), np.empty(0), transfer.high_frequency_gain)
 
 
-def _check(period_s: float, method: str, prewarp_hz: float | None) -> None:
+def _require_valid(period_s: float, method: str, prewarp_hz: float | None) -> None:
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s!r}; a positive number of seconds is allowed")
     if method not in get_args(Method):
@@ -157,17 +161,17 @@ def _check(period_s: float, method: str, prewarp_hz: float | None) -> None:
         raise ValueError(f"prewarp_hz: {prewarp_hz!r}; {allowed}")
 
 
-def _matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, float]:
+def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, float]:
     """Zeros, poles, gain by z = exp(sT); the gain from the ratio at s = 0 with s and (z − 1)/T cancelled there.
 
     A zero whose image is beyond all digits, to the right of SEEN/T, has none: (z − image)/(1 − image) is 1.
     """
-    if np.any(transfer.poles.real * period_s > SEEN):
+    if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
             f"poles: {transfer.poles.real.max():g} rad/s to the right grows beyond all digits in a period of "
-            f"{period_s:g} s; at most {SEEN / period_s:g} rad/s is allowed"
+            f"{period_s:g} s; at most {MAX_EXPONENT / period_s:g} rad/s is allowed"
         )
-    is_representable = transfer.zeros.real * period_s <= SEEN
+    is_representable = transfer.zeros.real * period_s <= MAX_EXPONENT
     zeros, poles = (
         np.exp(roots * period_s).astype(complex) for roots in (transfer.zeros[is_representable], transfer.poles)
     )
@@ -179,10 +183,10 @@ def _matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex, flo
     for root, image in zip(transfer.poles, poles, strict=True):
         gain *= (1 - image) / -root if root else period_s
     infinite = poles.size - transfer.zeros.size
-    return _with_zeros_at_minus_one(zeros, infinite), poles, gain.real / 2.0**infinite
+    return _add_zeros_at_minus_one(zeros, infinite), poles, gain.real / 2.0**infinite
 
 
-def _tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:
+def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:
     """Zeros, poles, gain by s = w (z − 1)/(z + 1), w = 2/T, or such that s = jω₀ falls on z = exp(jω₀T)."""
     w = 2 / period_s
     if prewarp_hz is not None:
@@ -193,22 +197,22 @@ def _tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tu
     for i, pole in enumerate(transfer.poles):
         gain *= (w - transfer.zeros[i] if i < transfer.zeros.size else 1.0) / (w - pole)
     zeros, poles = (w + transfer.zeros) / (w - transfer.zeros), (w + transfer.poles) / (w - transfer.poles)
-    return _with_zeros_at_minus_one(zeros, poles.size - zeros.size), poles, gain.real
+    return _add_zeros_at_minus_one(zeros, poles.size - zeros.size), poles, gain.real
 
 
-def _with_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
+def _add_zeros_at_minus_one(zeros: Complex, count: int) -> Complex:
     """Zeros at infinity in s end at half the sampling rate."""
     return np.concatenate([zeros, np.full(count, -1.0 + 0j)]).astype(complex)
 
 
-def _held(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
+def _exact_hold(transfer: Transfer, period_s: float, ramp: bool) -> tuple[System, Form]:
     """Exact for a held input or for one that runs straight between samples."""
-    points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
+    points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     modal = well_conditioned_sum(transfer.zeros, transfer.poles, transfer.gain, points)
     if modal is not None:
         modal = first_order_hold(modal, period_s) if ramp else modal.zero_order_hold(period_s)
-        system = system_of(modal)
+        system = modal_realisation(modal)
     else:
-        continuous = scaled(cascade(transfer.zeros, transfer.poles, transfer.gain), points)
-        system = held_matrices(continuous, period_s, ramp)
-    return scaled(system, around_unit_circle()), "modal" if modal else "cascade"
+        continuous = scale_states(cascade(transfer.zeros, transfer.poles, transfer.gain), points)
+        system = hold_matrices(continuous, period_s, ramp)
+    return scale_states(system, unit_circle_points()), "modal" if modal else "cascade"

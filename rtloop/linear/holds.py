@@ -10,11 +10,11 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from rtloop.hil.modal import Complex, Modal
+from rtloop.hil.modal import Complex, ModalSystem
 from rtloop.linear.realisation import System
 
 
-def first_order_hold(modal: Modal, period_s: float) -> Modal:
+def first_order_hold(modal: ModalSystem, period_s: float) -> ModalSystem:
     """Exact discretisation of a sum of modes for an input that runs straight between samples (ramp invariant).
 
     With x = pT, φ₁ = (eˣ − 1)/x and φ₂ = (φ₁ − 1)/x, a mode r/(s − p) becomes rTφ₂ + rTφ₁²/(z − eˣ): the triangle hold
@@ -23,7 +23,7 @@ def first_order_hold(modal: Modal, period_s: float) -> Modal:
     x = modal.poles * period_s
     first, second = _phi(x)
     direct = modal.direct + (modal.residues * period_s * second).sum(axis=1).real
-    return Modal(np.exp(x), modal.residues * period_s * first**2, direct)
+    return ModalSystem(np.exp(x), modal.residues * period_s * first**2, direct)
 
 
 def _phi(x: Complex) -> tuple[Complex, Complex]:
@@ -36,7 +36,7 @@ def _phi(x: Complex) -> tuple[Complex, Complex]:
     return first, np.where(small, second, (first_outside - 1) / outside)
 
 
-def held_matrices(system: System, period_s: float, ramp: bool) -> System:
+def hold_matrices(system: System, period_s: float, ramp: bool) -> System:
     """Both from matrices, for a held input or a `ramp`; A stays upper quasi-triangular.
 
     The exponential of [A b 0; 0 0 1/T; 0 0 0]·T holds the answers to a step and to a ramp (Van Loan 1978).

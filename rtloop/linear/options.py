@@ -48,10 +48,10 @@ class TransferOptions(Options):
 
     def transfer(self) -> Transfer:
         """The transfer function."""
-        return self._built
+        return self._transfer
 
     @cached_property
-    def _built(self) -> Transfer:
+    def _transfer(self) -> Transfer:
         """Once, where the options are checked. Raises ValueError for an improper or malformed one."""
         if self.form == "zpk":
             zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))

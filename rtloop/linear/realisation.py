@@ -13,12 +13,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.modal import Complex, Modal, Real, RepeatedPoles, modal_sum
+from rtloop.hil.modal import Complex, ModalSystem, Real, RepeatedPoles, modal_sum
 
-MOST_CANCELLATION = 1e4
+MAX_CANCELLATION = 1e4
 """A sum of modes whose terms exceed their sum by more than this, somewhere, loses four of sixteen digits: cascade."""
 
-TOGETHER = 64
+CHUNK_SAMPLES = 64
 """Samples whose states are found at once."""
 
 Form = Literal["modal", "cascade"]
@@ -32,27 +32,27 @@ class System(NamedTuple):
     c: Real
     d: float
 
-    def response(self, at: npt.ArrayLike) -> Complex:
+    def response(self, complex_points: npt.ArrayLike) -> Complex:
         """d + c (xI − A)⁻¹ b at complex points `at` (k,), shape (k,)."""
-        return self.d + self.states(at) @ self.c
+        return self.d + self.states(complex_points) @ self.c
 
-    def states(self, at: npt.ArrayLike) -> Complex:
+    def states(self, complex_points: npt.ArrayLike) -> Complex:
         """(xI − A)⁻¹ b at complex points `at` (k,), shape (k, n)."""
-        points = np.atleast_1d(np.asarray(at, dtype=complex))
+        points = np.atleast_1d(np.asarray(complex_points, dtype=complex))
         pencil = points[:, None, None] * np.eye(self.b.size) - self.a
         inputs = np.broadcast_to(self.b[:, None].astype(complex), (points.size, self.b.size, 1))
         return np.asarray(np.linalg.solve(pencil, inputs)[..., 0], dtype=complex)
 
-    def driven(self, inputs: Real) -> Real:
+    def simulate_states(self, inputs: Real) -> Real:
         """States x_k of x⁺ = A x + b u from rest, (samples, n), by inputs (samples,); many samples at a time:
 
         x_k+m = A^m x_k + Σ_j A^(m−1−j) b u_k+j.
         """
         order = self.b.size
-        powers = np.array(list(accumulate(repeat(self.a, TOGETHER), np.matmul, initial=np.eye(order))))
-        ages = np.subtract.outer(np.arange(TOGETHER), np.arange(TOGETHER))
+        powers = np.array(list(accumulate(repeat(self.a, CHUNK_SAMPLES), np.matmul, initial=np.eye(order))))
+        ages = np.subtract.outer(np.arange(CHUNK_SAMPLES), np.arange(CHUNK_SAMPLES))
         answers = np.where(ages[..., None] >= 0, (powers[:-1] @ self.b)[ages], 0.0)
-        chunks = np.append(inputs, np.zeros(-inputs.size % TOGETHER)).reshape(-1, TOGETHER)
+        chunks = np.append(inputs, np.zeros(-inputs.size % CHUNK_SAMPLES)).reshape(-1, CHUNK_SAMPLES)
         chunk_states = np.einsum("sj,mjn->smn", chunks, answers, optimize=True)
         last_state = np.zeros(order)
         for chunk in chunk_states:
@@ -65,21 +65,21 @@ def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tup
     """A scaled real realisation and its form; `points` (k,) is where the response must keep its digits."""
     modal = well_conditioned_sum(zeros, poles, gain, points)
     if modal is None:
-        return scaled(cascade(zeros, poles, gain), points), "cascade"
-    return scaled(system_of(modal), points), "modal"
+        return scale_states(cascade(zeros, poles, gain), points), "cascade"
+    return scale_states(modal_realisation(modal), points), "modal"
 
 
-def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Complex) -> Modal | None:
+def well_conditioned_sum(zeros: Complex, poles: Complex, gain: float, points: Complex) -> ModalSystem | None:
     """The sum of modes, or None where it cancels too much to be used."""
     try:
         modal = modal_sum(zeros, poles, gain)
     except RepeatedPoles:
         return None
     terms = np.abs(modal.residues / (points[:, None] - modal.poles)).sum(axis=1) + np.abs(modal.direct)
-    return modal if np.all(terms <= MOST_CANCELLATION * np.abs(modal.response(points)[0])) else None
+    return modal if np.all(terms <= MAX_CANCELLATION * np.abs(modal.response(points)[0])) else None
 
 
-def system_of(modal: Modal) -> System:
+def modal_realisation(modal: ModalSystem) -> System:
     """The block-diagonal realisation of a sum of modes with one output."""
     a, b, c, d = modal.realise()
     return System(a, b, c[0], float(d[0]))
@@ -125,25 +125,27 @@ def _section(zeros: Complex, poles: Complex) -> System:
 
 def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
     """(poles, zeros) of each section: pairs of zeros go to the nearest pairs of poles, a single one to what is left."""
-    pole_groups, zero_groups = _twos(poles), _twos(zeros)
+    pole_groups, zero_groups = _root_pairs(poles), _root_pairs(zeros)
     sections: list[tuple[Complex, Complex]] = []
-    for above in zero_groups:
-        fitting = [g for g in pole_groups if g.size == above.size] or pole_groups
-        nearest = min(fitting, key=lambda group, above=above: float(np.abs(group[:, None] - above).min()))
+    for section_zeros in zero_groups:
+        fitting = [g for g in pole_groups if g.size == section_zeros.size] or pole_groups
+        nearest = min(
+            fitting, key=lambda group, section_zeros=section_zeros: float(np.abs(group[:, None] - section_zeros).min())
+        )
         pole_groups = [g for g in pole_groups if g is not nearest]
-        sections.append((nearest, above))
+        sections.append((nearest, section_zeros))
     sections += [(group, np.empty(0, dtype=complex)) for group in pole_groups]
     return sorted(sections, key=lambda section: float(section[0].real.max()))
 
 
-def _twos(roots: Complex) -> list[Complex]:
+def _root_pairs(roots: Complex) -> list[Complex]:
     """Sorted roots, as `conjugate_pairs` leaves them, in twos that have real coefficients; an odd real one last."""
     reals, pairs = roots[roots.imag == 0], roots[roots.imag != 0]
     groups = [pairs[i : i + 2] for i in range(0, pairs.size, 2)] + [reals[i : i + 2] for i in range(0, reals.size, 2)]
     return sorted(groups, key=lambda group: -group.size)
 
 
-def scaled(system: System, points: Complex) -> System:
+def scale_states(system: System, points: Complex) -> System:
     """The same system with each block's largest response over `points` brought near 1, for a unit input.
 
     Factors are powers of two, so that scaling rounds nothing, and equal within a block, which keeps rotations.
@@ -178,7 +180,7 @@ def row_bands(a: Real) -> npt.NDArray[np.int64]:
     return bands
 
 
-def beside_imaginary_axis(roots: Complex) -> Complex:
+def imaginary_axis_points(roots: Complex) -> Complex:
     """Points from a tenth of the smallest to ten times the largest of `roots` (rad/s), a little right of s = jω.
 
     On the axis itself a point could hit an undamped root.
@@ -187,6 +189,6 @@ def beside_imaginary_axis(roots: Complex) -> Complex:
     return (0.01 + 1j) * np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), 401)
 
 
-def around_unit_circle() -> Complex:
+def unit_circle_points() -> Complex:
     """Points just outside |z| = 1, up to nine tenths of half the sampling rate: zeros at z = −1 drown the rest."""
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

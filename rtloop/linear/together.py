@@ -13,11 +13,11 @@ from scipy.linalg import block_diag
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import System
 
-BESIDE_ONE = 1e-9
+DC_OFFSET = 1e-9
 """So far from z = 1 an integrator's response is taken: it has none there."""
 
 
-class SystemTogether(NamedTuple):
+class CoupledSystem(NamedTuple):
     """x⁺ = A x + B u, y = C x + D u (or x' for x⁺): `a` (n, n), `b` (n, m), `c` (m, n), `d` (m, m)."""
 
     a: Real
@@ -25,31 +25,31 @@ class SystemTogether(NamedTuple):
     c: Real
     d: Real
 
-    def response(self, at: npt.ArrayLike) -> Complex:
+    def response(self, complex_points: npt.ArrayLike) -> Complex:
         """D + C (xI − A)⁻¹ B at complex points `at` (k,), shape (k, m, m)."""
-        points = np.atleast_1d(np.asarray(at, dtype=complex))
+        points = np.atleast_1d(np.asarray(complex_points, dtype=complex))
         pencil = points[:, None, None] * np.eye(self.a.shape[0]) - self.a
         states = np.linalg.solve(pencil, np.broadcast_to(self.b, (points.size, *self.b.shape)))
         return np.asarray(self.d + self.c @ states, np.complex128)
 
-    def mixed(self, before: npt.ArrayLike | None = None, after: npt.ArrayLike | None = None) -> SystemTogether:
+    def transform(self, before: npt.ArrayLike | None = None, after: npt.ArrayLike | None = None) -> CoupledSystem:
         """The system behind a matrix, or in front of one, (m, m)."""
         first = np.eye(self.d.shape[1]) if before is None else np.asarray(before, float)
         last = np.eye(self.d.shape[0]) if after is None else np.asarray(after, float)
-        return SystemTogether(self.a, self.b @ first, last @ self.c, last @ self.d @ first)
+        return CoupledSystem(self.a, self.b @ first, last @ self.c, last @ self.d @ first)
 
 
-def beside_each_other(systems: list[System]) -> SystemTogether:
+def block_diagonal_system(systems: list[System]) -> CoupledSystem:
     """Systems of one input and one output each, none of which knows of the others."""
-    return SystemTogether(
+    return CoupledSystem(
         np.asarray(block_diag(*(system.a for system in systems))),
-        _columns([system.b for system in systems]),
-        _columns([system.c for system in systems]).T,
+        _state_columns([system.b for system in systems]),
+        _state_columns([system.c for system in systems]).T,
         np.diag([system.d for system in systems]),
     )
 
 
-def _columns(vectors: list[Real]) -> Real:
+def _state_columns(vectors: list[Real]) -> Real:
     """A column for each vector, which stands in it where its states are."""
     matrix, row = np.zeros((sum(vector.size for vector in vectors), len(vectors))), 0
     for column, vector in enumerate(vectors):
@@ -58,7 +58,7 @@ def _columns(vectors: list[Real]) -> Real:
     return matrix
 
 
-def tustin(system: SystemTogether, period_s: float, prewarp_hz: float | None = None) -> SystemTogether:
+def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = None) -> CoupledSystem:
     """By the bilinear rule, s = w (z − 1)/(z + 1). Raises ValueError for a frequency or a pole that cannot be."""
     w = 2 / period_s
     if prewarp_hz is not None:
@@ -71,7 +71,7 @@ def tustin(system: SystemTogether, period_s: float, prewarp_hz: float | None = N
         inverse = np.linalg.inv(w * states - system.a)
     except np.linalg.LinAlgError:
         raise ValueError(f"a: a pole at s = {w:g} has no image; another period is needed") from None
-    return SystemTogether(
+    return CoupledSystem(
         inverse @ (w * states + system.a),
         np.sqrt(2 * w) * inverse @ system.b,
         np.sqrt(2 * w) * system.c @ inverse,
@@ -80,10 +80,10 @@ def tustin(system: SystemTogether, period_s: float, prewarp_hz: float | None = N
 
 
 @dataclass(frozen=True, eq=False)
-class SampledTogether:
+class SampledCoupledSystem:
     """A controller of several axes, known by its matrices: from errors to commands, at one period."""
 
-    system: SystemTogether
+    system: CoupledSystem
     period_s: float
 
     @property
@@ -99,4 +99,4 @@ class SampledTogether:
     @cached_property
     def at_rest(self) -> Real:
         """C just beside z = 1, (m, m): large in the directions that integrate."""
-        return self.system.response(1.0 + BESIDE_ONE)[0].real
+        return self.system.response(1.0 + DC_OFFSET)[0].real

@@ -36,8 +36,8 @@ class Transfer:
 
     def __post_init__(self) -> None:
         require_order(max(np.size(self.zeros), np.size(self.poles)))
-        object.__setattr__(self, "zeros", _paired("zeros", self.zeros))
-        object.__setattr__(self, "poles", _paired("poles", self.poles))
+        object.__setattr__(self, "zeros", _conjugate_roots("zeros", self.zeros))
+        object.__setattr__(self, "poles", _conjugate_roots("poles", self.poles))
         object.__setattr__(self, "gain", float(_finite("gain", self.gain)))
         if self.zeros.size > self.poles.size:
             raise ValueError(
@@ -117,9 +117,9 @@ def require_order(order: int) -> None:
         raise ValueError(f"order {order}: at most {MAX_ORDER} is allowed")
 
 
-def factored_response(zeros: Complex, poles: Complex, gain: float, at: npt.ArrayLike) -> Complex:
+def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:
     """gain·Π(x − z)/Π(x − p) at complex points of any shape, a ratio at a time so that nothing overflows."""
-    points = np.asarray(at, dtype=complex)
+    points = np.asarray(complex_points, dtype=complex)
     value = np.full(points.shape, complex(gain))
     for i, pole in enumerate(poles):
         value *= (points - zeros[i] if i < zeros.size else 1.0) / (points - pole)
@@ -139,7 +139,7 @@ def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return numbers
 
 
-def _paired(name: str, roots: Complex) -> Complex:
+def _conjugate_roots(name: str, roots: Complex) -> Complex:
     """`roots`, checked, with exact conjugates, and read-only."""
     values = np.atleast_1d(np.asarray(roots, dtype=complex))
     if not np.all(np.isfinite(values)):

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.hil.trusted import open_found
+from rtloop.hil.trusted import open_without_link
 from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.parts import files_of_run
+from rtloop.recording.file.parts import run_files
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
@@ -78,7 +78,7 @@ def _await(client: Client, file: Path, end: int) -> None:
         try:
             run = present_run(client)
         except UnavailableError:
-            if files_of_run(file, ".mcap.part"):
+            if run_files(file, ".mcap.part"):
                 raise
             return  # the run is over; its files say what they have
         if run.file != file or run.written >= end:
@@ -96,10 +96,10 @@ def _cut(file: Path, first: int, end: int, folder: Path | None) -> dict[str, Any
 
 def _holding(file: Path, tick: int) -> list[Path]:
     """The last files of a run, from the one before that with `tick` on: a state of the law may stand in there."""
-    found = {*files_of_run(file, ".mcap"), *files_of_run(file, ".mcap.part")}
+    found = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(found, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
     for place in reversed(range(len(files))):
-        with Reader(files[place], tolerant=True, opener=open_found) as reader:
+        with Reader(files[place], tolerant=True, opener=open_without_link) as reader:
             if reader.first_tick <= tick:
                 return files[max(place - 1, 0) :]
     return files or [file]

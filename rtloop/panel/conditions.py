@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.hil.modal import Real
-from rtloop.signals import COMMON, FLAGS, MODE, PERIODS_MISSED, TICK, TRIP_MASK
+from rtloop.signals import COMMON_SIGNALS, FLAGS, MODE, PERIODS_MISSED, TICK, TRIP_MASK
 
 Places = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -108,7 +108,7 @@ class Window(Condition):
 class Tripped(Condition):
     """A cause of a trip appears among the flags, beside others or alone."""
 
-    source = COMMON[FLAGS].name
+    source = COMMON_SIGNALS[FLAGS].name
 
     def __init__(self) -> None:
         self._before: int | None = None
@@ -124,7 +124,7 @@ class Tripped(Condition):
 class ModeChanged(Condition):
     """Another mode is in force."""
 
-    source = COMMON[MODE].name
+    source = COMMON_SIGNALS[MODE].name
 
     def __init__(self) -> None:
         self._before: float | None = None
@@ -139,7 +139,7 @@ class ModeChanged(Condition):
 class Late(Condition):
     """A tick woke so late that whole periods were missed."""
 
-    source = COMMON[PERIODS_MISSED].name
+    source = COMMON_SIGNALS[PERIODS_MISSED].name
 
     def find(self, values: Real, gap: bool) -> Places:
         """The ticks that did."""
@@ -171,7 +171,7 @@ class Stepped(Condition):
 class Commanded(Condition):
     """A command took effect, as the events say; `ticks` are those at which one did, in order, and are taken away."""
 
-    source = COMMON[TICK].name
+    source = COMMON_SIGNALS[TICK].name
 
     def __init__(self, ticks: deque[int]) -> None:
         self._ticks = ticks

@@ -12,7 +12,7 @@ import numpy as np
 from rtloop.engine.memory import DIRECTORY_BYTES
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
-from rtloop.hil.trusted import release
+from rtloop.hil.trusted import close_descriptor
 from rtloop.supervision.paths import open_block
 
 
@@ -47,7 +47,7 @@ def open_mapping(path: Path) -> Mapping | None:
     try:
         return Mapping(fd) if os.pread(fd, 1, 0) == b"{" else None
     finally:
-        release(fd)
+        close_descriptor(fd)
 
 
 def is_at(mapping: Mapping, path: Path) -> bool:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.signals import COMMON, DEADLINE
+from rtloop.signals import COMMON_SIGNALS, DEADLINE
 
-DEADLINE_NS = COMMON[DEADLINE].name
+DEADLINE_NS = COMMON_SIGNALS[DEADLINE].name
 BATCH_S = 0.25
 
 

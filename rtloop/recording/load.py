@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
+from rtloop.recording.file.parts import RecordingPaths, RunReaders, find_files, missing_parts
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.recording.file.topics.events import Event
 from rtloop.recording.file.topics.overview import Overview, Range
-from rtloop.signals import COMMON, DEADLINE, PER_AXIS
+from rtloop.signals import AXIS_SIGNALS, COMMON_SIGNALS, DEADLINE
 from rtloop.signals import Signal as Column
 
 if TYPE_CHECKING:
@@ -50,15 +50,15 @@ class Recording:
         self._signals: dict[str, Signal] = {}
         self.problems: list[str] = []
         self.left_out: list[str] = []
-        with Parts(paths) as readers:
+        with RunReaders(paths) as readers:
             self.paths = tuple(reader.path for reader in readers)
             self.header: dict[str, Any] = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
-            self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated) for reader in readers)
-            self.skipped: list[Range] = [tick_range for reader in readers for tick_range in reader.skipped]
-            self.problems += absent_parts(readers)
-            self._note_problems(readers)
+            self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated_ticks) for reader in readers)
+            self.skipped: list[Range] = [tick_range for reader in readers for tick_range in reader.skipped_ranges]
+            self.problems += missing_parts(readers)
+            self._collect_problems(readers)
 
     @property
     def configuration(self) -> str:
@@ -68,14 +68,14 @@ class Recording:
     @cached_property
     def overview(self) -> Overview:
         """What is left of the ticks that were left out by intention."""
-        with self._reading() as readers:
+        with self._open_readers() as readers:
             return Overview(self.columns, np.concatenate([reader.overview for reader in readers]))
 
     @property
     def units(self) -> dict[str, str]:
         """Unit of each signal."""
         imported = self.header.get("imported", {}).get("units", {})
-        return {name: imported.get(name) or unit_of(name) for name in self.columns}
+        return {name: imported.get(name) or signal_unit(name) for name in self.columns}
 
     @property
     def time_s(self) -> Signal:
@@ -109,13 +109,13 @@ class Recording:
 
     def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
         """Arrays (n, names) of consecutive ticks, for what does not fit into memory."""
-        with self._reading() as readers:
+        with self._open_readers() as readers:
             for reader in readers:
                 yield from reader.blocks(names)
 
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
         """Arrays (n, names) of the ticks that were due between two times; chunks outside are not read."""
-        with self._reading() as readers:
+        with self._open_readers() as readers:
             for reader in readers:
                 entries = reader.chunks_between(start_s, end_s)
                 for rows in reader.blocks([self.columns[DEADLINE], *names], entries):
@@ -147,28 +147,28 @@ class Recording:
     def snapshots(self) -> Generator[Snapshot]:
         """The recorded states of the law, in order."""
         before = -1
-        with self._reading() as readers:
+        with self._open_readers() as readers:
             for reader in readers:
                 for snapshot in reader.snapshots(before):
                     before = snapshot.tick
                     yield snapshot
 
     @contextmanager
-    def _reading(self) -> Iterator[list[Reader]]:
+    def _open_readers(self) -> Iterator[list[Reader]]:
         """The files, opened once more; what turns out to be wrong with them is noted, however far they are read."""
-        with Parts(self.paths) as readers:
+        with RunReaders(self.paths) as readers:
             try:
                 yield readers
             finally:
-                self._note_problems(readers)
+                self._collect_problems(readers)
 
-    def _note_problems(self, readers: Sequence[Reader]) -> None:
+    def _collect_problems(self, readers: Sequence[Reader]) -> None:
         for reader in readers:
             for collected, reader_problems in ((self.problems, reader.problems), (self.left_out, reader.left_out)):
                 collected += [problem for problem in reader_problems if problem not in collected]
 
 
-def load(path: Files) -> Recording:
+def load(path: RecordingPaths) -> Recording:
     """Open a recording: a file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order.
 
     Raises RecordingError.
@@ -176,17 +176,17 @@ def load(path: Files) -> Recording:
     return Recording(find_files(path))
 
 
-def unit_of(name: str) -> str:
+def signal_unit(name: str) -> str:
     """Unit of a signal by its definition, or by the end of its name where the driver defined it."""
-    return described(name).unit
+    return describe_signal(name).unit
 
 
-def described(name: str) -> Column:
+def describe_signal(name: str) -> Column:
     """A signal of a record: its unit, and its meaning where it is one that every loop has."""
-    for signal in COMMON:
+    for signal in COMMON_SIGNALS:
         if name == signal.name:
             return signal
-    for signal in PER_AXIS:
+    for signal in AXIS_SIGNALS:
         if name.endswith(f"_{signal.name}"):
             return Column(name, signal.unit, f"{name.removesuffix(f'_{signal.name}')}: {signal.meaning}")
     return Column(name, SUFFIX_UNITS.get(name.rpartition("_")[2], ""), "")

@@ -161,4 +161,4 @@ class CanSupervision:
         if now_s - self._said_s >= LOG_PERIOD_S:
             self._said_s = now_s
             assert self._options is not None
-            log.warning("%s: %s", self._options.place, text)
+            log.warning("%s: %s", self._options.label, text)

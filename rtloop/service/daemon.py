@@ -16,7 +16,7 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import UnavailableError
-from rtloop.hil.trusted import Untrusted, open_folder, release
+from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_folder
 from rtloop.service.api.application import application
 from rtloop.service.api.connections import BACKLOG, settings
 from rtloop.service.can_bus import supervised_by_can
@@ -103,7 +103,7 @@ def _bind(path: Path, mode: int) -> socket.socket:
         try:
             group = os.fstat(folder).st_gid
         finally:
-            release(folder)
+            close_descriptor(folder)
         _clear(path)
         previous = os.umask(0o777)
         try:
@@ -115,7 +115,7 @@ def _bind(path: Path, mode: int) -> socket.socket:
         os.chmod(path, mode)
         listener.listen(BACKLOG)
         return listener
-    except Untrusted as error:
+    except UntrustedPath as error:
         listener.close()
         raise refusal(error) from None
     except OSError as error:

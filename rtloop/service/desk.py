@@ -22,7 +22,7 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
-from rtloop.recording.capture.names import Names
+from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.signals import Mode
 
@@ -69,7 +69,7 @@ class Taken(RtloopError):
 class Desk:
     """Commands to the loop of `block`, from any thread; the recorder finds who asked in `names`."""
 
-    def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: Names | None = None) -> None:
+    def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: RequesterNames | None = None) -> None:
         self._block, self._period_s, self._names = block, 1.0 / rate_hz, names
         self._lock = threading.Lock()
         self._identity = 0
@@ -95,7 +95,7 @@ class Desk:
             command["identity"] = identity = self._identity
             cursor = int(self._block["events_head"][0])
             if self._names is not None and asker.name != OPERATOR:
-                self._names.note(identity, asker.name)
+                self._names.store(identity, asker.name)
             if change is not None:
                 self._changes[identity] = change
                 if len(self._changes) > MOST_CHANGES:

@@ -30,7 +30,7 @@ from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError
 from rtloop.hil.trusted import open_own
-from rtloop.recording.file.recover import leftovers, recover
+from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.service.changing.building import expect_changes, prepare_limited
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk, Refused
@@ -322,7 +322,7 @@ class Service:
 
     def _recover_leftovers(self) -> None:
         """Complete what killed services left among the recordings; what cannot be is said and stays."""
-        for part in leftovers(Path(self.configuration.recording.folder)):
+        for part in find_leftovers(Path(self.configuration.recording.folder)):
             try:
                 report = recover(part, opener=open_own)
             except RtloopError as error:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rtloop import signals
-from rtloop.recording.load import described
+from rtloop.recording.load import describe_signal
 from rtloop.service.desk import Refused
 from rtloop.service.service import Service
 from rtloop.signals import Flag, Mode
@@ -51,7 +51,7 @@ def running_configuration(service: Service) -> dict[str, Any]:
     return live.as_it_runs | {
         "name": configuration.name,
         "rate_hz": plan.pacing.rate_hz,
-        "columns": [described(name)._asdict() for name in plan.columns],
+        "columns": [describe_signal(name)._asdict() for name in plan.columns],
         "block": str(block_path(configuration.name).resolve()),
         "recordings": str(Path(configuration.recording.folder).resolve()),
     }
@@ -82,7 +82,7 @@ def newest_signals(service: Service) -> dict[str, Any]:
     axes = {
         axis: {
             signal.name: _number(row[signals.axis_column(number, column)])
-            for column, signal in enumerate(signals.PER_AXIS)
+            for column, signal in enumerate(signals.AXIS_SIGNALS)
         }
         for number, axis in enumerate(supervisor.prepared.plan.axes)
     }

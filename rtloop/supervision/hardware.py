@@ -16,12 +16,12 @@ from typing import Annotated
 from pydantic import Field, TypeAdapter, ValidationError
 
 from rtloop.configuration.file import HIGHEST_RATE_HZ, Configuration, describe, load
-from rtloop.drivers.base import Driver, Wiring, index_of, require_channels
+from rtloop.drivers.base import Driver, Wiring, channel_index, require_channels
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.engine.ramp import require_short_ramp
-from rtloop.errors import ConfigError, RtloopError, UnavailableError, one_line, writing
-from rtloop.hil.trusted import Untrusted, open_file
+from rtloop.errors import ConfigError, RtloopError, UnavailableError, one_line_error, output_errors
+from rtloop.hil.trusted import UntrustedPath, open_file
 from rtloop.supervision.paths import new_file, refusal
 
 LARGEST_BYTES = 1 << 20
@@ -76,7 +76,7 @@ class Hardware:
         driver = kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
         require_channels(self.wiring, driver.facts)
         for wiring in self.wiring.values():
-            output = driver.facts.outputs[index_of(driver.facts.outputs, wiring.output)]
+            output = driver.facts.outputs[channel_index(driver.facts.outputs, wiring.output)]
             require_short_ramp("trip_slew_v_per_s", self.trip_slew_v_per_s, output)
         return driver
 
@@ -90,7 +90,7 @@ def keep(path: Path, hardware: Hardware) -> None:
     Raises OutputError, HostRefused for a folder that others may write to.
     """
     what, new = "the note of the hardware", path.with_name(f"{path.name}.new")
-    with writing(f"{path}: cannot make {what}"):
+    with output_errors(f"{path}: cannot make {what}"):
         with os.fdopen(new_file(new, what), "wb") as file:
             file.write(_AS_JSON.dump_json(hardware))
         os.replace(new, path)
@@ -106,7 +106,7 @@ def noted(path: Path) -> Hardware | None:
             hardware = _AS_JSON.validate_json(file.read(LARGEST_BYTES))
     except FileNotFoundError:
         return None
-    except Untrusted as error:
+    except UntrustedPath as error:
         raise refusal(error) from None
     except OSError as error:
         raise UnreadableNote(f"{path}: the note of the hardware cannot be read: {error.strerror or error}") from None
@@ -117,7 +117,7 @@ def noted(path: Path) -> Hardware | None:
     except ValidationError as error:
         raise _unusable(path, describe(error, "note.driver_options", None)[0]) from None
     except Exception as error:  # a third party's driver may raise anything
-        raise _unusable(path, one_line(error)) from error
+        raise _unusable(path, one_line_error(error)) from error
     return hardware
 
 
@@ -132,7 +132,7 @@ def configured_hardware(config: Path) -> Hardware:
     except DriverError:
         raise
     except Exception as error:  # a third party's driver may raise anything
-        text = str(error) if isinstance(error, ValueError) else one_line(error)
+        text = str(error) if isinstance(error, ValueError) else one_line_error(error)
         raise ConfigError(str(config), [f"driver.{text}"]) from error
     return hardware
 

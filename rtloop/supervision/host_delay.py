@@ -13,13 +13,13 @@ from typing import Any
 
 from pydantic import Field, ValidationError
 
-from rtloop.analysis.margins import delay_tolerated
+from rtloop.analysis.margins import delay_margin
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared
 from rtloop.errors import ConfigError, OutputError
 from rtloop.hil.options import Options
-from rtloop.hil.trusted import Untrusted, open_file, open_folder, release
+from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_file, open_folder
 from rtloop.supervision.paths import FOLDER_MODE, client_folders, refusal, runtime_folder
 
 MOST_BYTES = 1 << 16
@@ -67,11 +67,11 @@ def note_host_delay(configuration: Configuration, **measured: Any) -> None:
     kept = (before or HostDelay(rate_hz=rate_hz)).model_copy(update=measured)
     path = runtime_folder() / _name(configuration)
     try:
-        release(open_folder(path.parent, FOLDER_MODE))
+        close_descriptor(open_folder(path.parent, FOLDER_MODE))
         fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o640)
         with os.fdopen(fd, "w") as file:
             file.write(kept.model_dump_json())
-    except Untrusted as error:
+    except UntrustedPath as error:
         raise refusal(error) from None
     except OSError as error:
         raise OutputError(f"{path}: {error.strerror}") from None
@@ -98,7 +98,7 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
     """What a host takes of an axis's margin; None of an axis whose loop is not known, or not stable."""
     if check.on_model is None or not check.on_model.is_stable:
         return None
-    margin_s, _ = delay_tolerated(check.on_model)
+    margin_s, _ = delay_margin(check.on_model)
     wire = max(host.wire_ticks.get(check.name, 1) - 1 - check.delay_ticks, 0)
     period_us = US_PER_S / host.rate_hz
     more_us = host.lateness_us + wire * period_us

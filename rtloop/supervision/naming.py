@@ -7,13 +7,13 @@ from os.path import lexists
 from pathlib import Path
 
 from rtloop.configuration.prepare import Prepared
-from rtloop.errors import OutputError, writing
+from rtloop.errors import OutputError, output_errors
 
 
 def recording_path(prepared: Prepared, out: Path | None) -> Path:
     """A new path in the recordings' folder, which is made. Raises OutputError."""
     folder = out or Path(prepared.configuration.recording.folder)
-    with writing(f"{folder}: cannot make the folder for recordings"):
+    with output_errors(f"{folder}: cannot make the folder for recordings"):
         folder.mkdir(parents=True, exist_ok=True)
     stem = f"{prepared.plan.name}-{time.strftime('%Y%m%dT%H%M%S')}"
     for number in range(1, 1000):

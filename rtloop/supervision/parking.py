@@ -12,11 +12,18 @@ import numpy.typing as npt
 
 from rtloop.drivers.base import Driver
 from rtloop.drivers.errors import DriverError
-from rtloop.engine.memory import UNREADABLE, SharedBlock, Word, claimant
-from rtloop.engine.ramp import LONGEST_RAMP_S, found_v, output_indices, ramp_to_safe, safe_outputs_v, unusable_drives
-from rtloop.errors import RtloopError, UnavailableError, one_line
-from rtloop.hil.native.uncompiled import as_written
-from rtloop.hil.trusted import release
+from rtloop.engine.memory import UNREADABLE, SharedBlock, Word, claimant_pid
+from rtloop.engine.ramp import (
+    LONGEST_RAMP_S,
+    output_indices,
+    ramp_to_safe,
+    safe_outputs_v,
+    starting_outputs_v,
+    unusable_drives,
+)
+from rtloop.errors import RtloopError, UnavailableError, one_line_error
+from rtloop.hil.native.uncompiled import allow_uncompiled
+from rtloop.hil.trusted import close_descriptor
 from rtloop.supervision.account import Account
 from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, noted
 from rtloop.supervision.paths import block_path, hardware_path, open_block
@@ -98,12 +105,14 @@ def _last_block(path: Path, account: Account) -> Iterator[SharedBlock | None]:
         except EOFError:  # its service died before there was anything in it
             pass
         except UNREADABLE as error:
-            if (pid := claimant(fd)) is not None:
+            if (pid := claimant_pid(fd)) is not None:
                 raise UnavailableError(f"process {pid} drives the outputs; stop it, then park") from None
-            account.remarks.append(f"{path}: the shared block is not understood, and counts as none: {one_line(error)}")
+            account.remarks.append(
+                f"{path}: the shared block is not understood, and counts as none: {one_line_error(error)}"
+            )
         yield block
     finally:
-        release(fd)
+        close_descriptor(fd)
 
 
 @contextmanager
@@ -121,7 +130,7 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
     ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # nor for a drive that is no number
     beat_ns = block.load(Word.HEARTBEAT_NS)
     kill_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
-    while (pid := block.driven_by()) is not None:
+    while (pid := block.driver_pid()) is not None:
         if block.load(Word.HEARTBEAT_NS) != beat_ns:
             raise UnavailableError(f"process {pid} drives the outputs and its service is alive; stop that instead")
         if time.monotonic() > kill_s + KILL_S:
@@ -139,18 +148,20 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
     driver raises.
     """
     try:
-        with as_written():
+        with allow_uncompiled():
             return _ramp_down(driver, slew_v_per_s, noted_v)
     except DriverError:
         raise
     except Exception as error:
-        raise DriverError(f"driver {driver.kind!r}: its outputs could not be parked: {one_line(error)}") from error
+        raise DriverError(
+            f"driver {driver.kind!r}: its outputs could not be parked: {one_line_error(error)}"
+        ) from error
 
 
 def _ramp_down(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None) -> list[float]:
     pointers = driver.open()
     try:
-        from_v, index = found_v(driver, noted_v), output_indices(driver)
+        from_v, index = starting_outputs_v(driver, noted_v), output_indices(driver)
 
         def note(outputs_v: npt.NDArray[np.float64]) -> None:
             if noted_v is not None:

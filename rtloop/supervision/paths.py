@@ -1,6 +1,6 @@
 """Where a service keeps its socket and its shared block, which holds the last drive, so that others find them.
 
-What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.hil.trusted`).
+What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.hil.is_trusted`).
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rtloop.errors import HostRefused, OutputError, UnavailableError
-from rtloop.hil.trusted import Untrusted, open_file, open_folder, release
+from rtloop.errors import HostRefusal, OutputError, UnavailableError
+from rtloop.hil.trusted import UntrustedPath, close_descriptor, open_file, open_folder
 
 if TYPE_CHECKING:  # clients of the control API need none of it: half a second of import
     from rtloop.configuration.file import Configuration
@@ -65,8 +65,8 @@ def new_file(path: Path, what: str = "the shared block") -> int:
                 os.unlink(path.name, dir_fd=folder)
             return os.open(path.name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600, dir_fd=folder)
         finally:
-            release(folder)
-    except Untrusted as error:
+            close_descriptor(folder)
+    except UntrustedPath as error:
         raise refusal(error) from None
     except OSError as error:
         raise OutputError(f"{path}: cannot make {what}: {error.strerror}") from None
@@ -78,12 +78,12 @@ def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
         return open_file(path, flags)
     except FileNotFoundError:
         return None
-    except Untrusted as error:
+    except UntrustedPath as error:
         raise refusal(error) from None
     except OSError as error:
         raise UnavailableError(f"{path}: {error.strerror}") from None
 
 
-def refusal(error: Untrusted) -> HostRefused:
+def refusal(error: UntrustedPath) -> HostRefusal:
     """For a user: what is not believed, and why."""
-    return HostRefused(f"{error.filename}: {error.strerror}")
+    return HostRefusal(f"{error.filename}: {error.strerror}")

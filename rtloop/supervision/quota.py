@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
 from rtloop.hil.trusted import is_own, open_own
-from rtloop.recording.file.around import Around
+from rtloop.recording.file.around import EventWindow
 from rtloop.recording.file.reader import Reader
-from rtloop.values import counted
+from rtloop.values import count_text
 
 OTHERWISE_MADE = ("cut", "imported")
 """In the headers of what is no run's own file."""
@@ -135,7 +135,7 @@ class Quota:
                 status, number = entry.stat(follow_symlinks=False), int(match[2] or 1)
                 found.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
         if foreign:
-            what = f"{counted(len(foreign), 'recording')} of other users, such as {min(foreign)}"
+            what = f"{count_text(len(foreign), 'recording')} of other users, such as {min(foreign)}"
             self.failure = f"{self._folder}: {what}: not counted and never removed"
         return sorted(found)
 
@@ -159,7 +159,7 @@ class Quota:
                 header, totals = reader.header, reader.totals
                 if totals is None or header["name"] != self._name or any(map(header.get, OTHERWISE_MADE)):
                     return None
-                around = Around.of(header)
+                around = EventWindow.from_header(header)
                 before_s, after_s = (around.before_s, around.after_s) if around else (BEFORE_S, AFTER_S)
                 ticks = [event["tick"] for event in reader.events if event["kind"] in ("tripped", "driver_failed")]
                 rate_hz = header["rate_hz"]

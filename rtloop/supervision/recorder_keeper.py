@@ -15,14 +15,14 @@ from typing import Any
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
-from rtloop.hil.trusted import open_found
-from rtloop.recording.capture.names import Names
-from rtloop.recording.file.parts import files_of_run
+from rtloop.hil.trusted import open_without_link
+from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.file.parts import run_files
 from rtloop.recording.file.recover import recover
 from rtloop.supervision.child import Child
 from rtloop.supervision.quota import Quota, Removal
 from rtloop.supervision.stall import StallWatch
-from rtloop.values import counted
+from rtloop.values import count_text
 
 MODULE = "rtloop.recording.capture.recorder"
 STALL_S = 3.0
@@ -41,7 +41,9 @@ class RecorderKeeper:
     is lost while the ring still holds it. `start`, then `finish`, and `totals` once that has come to its end.
     """
 
-    def __init__(self, child: Child, block: SharedBlock, names: Names, path: Path, options: RecordingOptions) -> None:
+    def __init__(
+        self, child: Child, block: SharedBlock, names: RequesterNames, path: Path, options: RecordingOptions
+    ) -> None:
         self._child, self._block, self._names, self._path, self._options = child, block, names, path, options
         self._header: dict[str, Any] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
@@ -150,7 +152,7 @@ class RecorderKeeper:
         taken = self._block.load(Word.RECORDER_CURSOR)
         behind = int(self._block["ticks_head"][0]) != taken
         stuck = self._watch.stalled(taken, time.monotonic()) and behind
-        loop_ended = ProcessState.ended(self._block.load(Word.LOOP_STATE))
+        loop_ended = ProcessState.has_ended(self._block.load(Word.LOOP_STATE))
         died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
         if (died or stuck) and self.replacements < MAX_REPLACEMENTS:
             reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
@@ -177,22 +179,22 @@ class RecorderKeeper:
         if self.quota is not None:
             self._apply(self.quota, LAST_LOOK_S)
             if self.quota.removed:
-                files, mib = counted(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
+                files, mib = count_text(self.quota.removed, "file"), self.quota.removed_bytes / 2**20
                 self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed by recording.keep_gib")
         totals["paths"] = [str(path) for path in self._files(".mcap")]
         return totals
 
     def _files(self, suffix: str) -> list[Path]:
         """This run's files, in their order."""
-        return files_of_run(self._path, suffix)
+        return run_files(self._path, suffix)
 
     def _repair(self, part: Path) -> None:
         try:
-            report = recover(part, opener=open_found)
+            report = recover(part, opener=open_without_link)
         except RtloopError as error:
             self.notes.append(str(error))
             return
-        self.notes.append(f"{report['output']}: recovered, {counted(report['ticks'], 'tick')}")
+        self.notes.append(f"{report['output']}: recovered, {count_text(report['ticks'], 'tick')}")
         try:
             part.unlink()
         except OSError as error:

@@ -9,7 +9,7 @@ from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
-from rtloop.values import counted
+from rtloop.values import count_text
 
 REASONS = {LOW_SPACE: "less space is free than is to stay free (recording.min_free_mib)"}
 BEHIND = 4
@@ -67,4 +67,4 @@ class Gaps:
         if not self._reasons:
             return None
         self._reasons.clear()
-        return f"recorded again after {self._ill_s - self._begun_s:.1f} s; {counted(lost, 'tick')} lost"
+        return f"recorded again after {self._ill_s - self._begun_s:.1f} s; {count_text(lost, 'tick')} lost"

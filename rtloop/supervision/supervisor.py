@@ -25,7 +25,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
-from rtloop.recording.capture.names import Names
+from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.file.topics.events import trip_reason
 from rtloop.supervision.child import Child
 from rtloop.supervision.description import recording_header
@@ -73,7 +73,7 @@ class Processes:
     def __init__(self, block: Path | None = None) -> None:
         """`block` is where the shared block lies for others to find; none of this run's concern to others, if None."""
         self.fd = SharedBlock.reserve() if block is None else new_file(block)
-        self.names = Names.create()
+        self.names = RequesterNames.create()
         self.loop = Child("rtloop.engine.process", self.fd)
         self.recorder = Child(RECORDER, self.fd, names=self.names.fd)
 
@@ -264,7 +264,7 @@ class Supervisor:
 
     def _end(self) -> None:
         """Park first, if the loop died; then let the recorder finish."""
-        if not ProcessState.ended(self.block.load(Word.LOOP_STATE)):
+        if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
             died = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
             self.error = f"the loop's process {died}; {self._park()}"
             self.block.store(Word.LOOP_STATE, ProcessState.FAILED)

@@ -9,10 +9,10 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from rtloop.interchange.mapping import bare
+from rtloop.interchange.mapping import name_without_unit
 from rtloop.interchange.units import UnknownUnit, factor_between
 from rtloop.terminal.table import console, table
-from rtloop.values import counted
+from rtloop.values import count_text
 
 MOST = 60
 """Columns of a file that are shown."""
@@ -34,21 +34,21 @@ def print_import(report: Mapping[str, Any]) -> None:
     out.print(shown)
     _print_notes(out, report["notes"])
     length = f"{report['duration_s']:.6g} s at {report['rate_hz']:g} Hz, time: {escape(report['time'])}"
-    out.print(f"{escape(report['output'])}: {counted(report['ticks'], 'tick')}, {length}")
+    out.print(f"{escape(report['output'])}: {count_text(report['ticks'], 'tick')}, {length}")
 
 
 def print_listing(report: Mapping[str, Any]) -> None:
     """What is in a file, and how to import it."""
     out = console()
     rate = f", {report['rate_hz']:g} Hz by {escape(report['time'])}" if report["rate_hz"] else ""
-    out.print(f"[bold]{escape(report['file'])}[/]: {counted(report['rows'], 'row')}{rate}")
+    out.print(f"[bold]{escape(report['file'])}[/]: {count_text(report['rows'], 'row')}{rate}")
     _print_about(out, report["about"])
     shown = table("column", "unit", "least", "largest")
     for one in report["columns"][:MOST]:
         shown.add_row(escape(one["name"]), escape(one["unit"] or "?"), _number(one["least"]), _number(one["largest"]))
     out.print(shown)
     if len(report["columns"]) > MOST:
-        out.print(f"… and {counted(len(report['columns']) - MOST, 'column')} more; --json shows all of them")
+        out.print(f"… and {count_text(len(report['columns']) - MOST, 'column')} more; --json shows all of them")
     _print_notes(out, report["notes"])
     out.print("\nNothing was written. Which column is what, in which unit? Such as:\n")
     time = "" if report["rate_hz"] else " --rate HZ"
@@ -69,7 +69,7 @@ def _likely(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, 
         if one is not None:
             left.remove(one)
             fits = _converts(one["unit"], unit)
-            found.append((name, f"{bare(one['name'])} [{one['unit'] if fits else unit}]"))
+            found.append((name, f"{name_without_unit(one['name'])} [{one['unit'] if fits else unit}]"))
     return found
 
 

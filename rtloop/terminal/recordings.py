@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from rtloop.recording.replay.replay import ReplayReport
 from rtloop.terminal.table import console, table
-from rtloop.values import counted
+from rtloop.values import count_text
 
 METRICS = (
     ("rms_error_um", "rms error µm"),
@@ -30,16 +30,16 @@ def print_replay(path: Path, report: ReplayReport) -> None:
     """The verdict, the gaps, what is not verified and what cannot be, the first difference."""
     out = console()
     for gap in report.gaps:
-        out.print(f"gap: {counted(gap['count'], 'tick')} from tick {gap['first_tick']} on, missing in the recording")
+        out.print(f"gap: {count_text(gap['count'], 'tick')} from tick {gap['first_tick']} on, missing in the recording")
     _print_problems(out, report.problems)
     for entry in report.not_verified:
         out.print(f"[red]not verified[/]: {_range(entry)}{escape(entry['why'])}")
     out.print(f"not judged: {'; '.join(report.not_judged)}")
-    checked = f"{counted(report.ticks, 'tick')} and {counted(report.snapshots, 'snapshot')} of the law's state"
+    checked = f"{count_text(report.ticks, 'tick')} and {count_text(report.snapshots, 'snapshot')} of the law's state"
     if report.skipped:
-        stretches = counted(report.stretches, "stretch", "stretches")
+        stretches = count_text(report.stretches, "stretch", "stretches")
         checked += f" in {stretches}"
-        out.print(f"left out by intention: {counted(report.skipped, 'tick')} beside {stretches}")
+        out.print(f"left out by intention: {count_text(report.skipped, 'tick')} beside {stretches}")
     name, found = _name(path), report.first_difference
     if report.identical:
         out.print(f"[green]identical[/]: {name}: {checked} compared in bytes")
@@ -55,14 +55,14 @@ def _range(entry: dict[str, Any]) -> str:
     first, count = entry["first_tick"], entry["count"]
     if first is None:
         return ""
-    return f"ticks from {first} on: " if count is None else f"{counted(count, 'tick')} from tick {first} on: "
+    return f"ticks from {first} on: " if count is None else f"{count_text(count, 'tick')} from tick {first} on: "
 
 
 def print_differences(report: dict[str, Any]) -> None:
     """Largest and root mean square difference, signal by signal."""
     out = console()
     law, recording = _name(report["config"]), _name(report["recording"])
-    out.print(f"the law of {law} on the inputs of {recording}: {counted(report['ticks'], 'tick')}")
+    out.print(f"the law of {law} on the inputs of {recording}: {count_text(report['ticks'], 'tick')}")
     shown = table("difference", "largest", "at tick", "rms")
     for name, difference in report["signals"].items():
         shown.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")
@@ -75,7 +75,9 @@ def print_resimulation(report: dict[str, Any]) -> None:
     """Recorded and resimulated, side by side."""
     out = console()
     law = report["config"] or "the recorded law and rig"
-    out.print(f"the reference of {_name(report['recording'])} through {_name(law)}: {counted(report['ticks'], 'tick')}")
+    out.print(
+        f"the reference of {_name(report['recording'])} through {_name(law)}: {count_text(report['ticks'], 'tick')}"
+    )
     for axis in report["axes"]:
         before, after = axis["recorded"], axis["resimulated"]
         shown = table(f"axis {axis['name']}", "recorded", "resimulated")
@@ -97,9 +99,9 @@ def print_recovery(report: dict[str, Any]) -> None:
     if whole:
         out.print(f"{original} is whole, there was nothing to recover; {_name(report['output'])} is a copy")
         return
-    out.print(f"{_name(report['output'])}: {counted(report['ticks'], 'tick')} recovered from {original}")
+    out.print(f"{_name(report['output'])}: {count_text(report['ticks'], 'tick')} recovered from {original}")
     for first, count in report["gaps"]:
-        out.print(f"missing: {counted(count, 'tick')} from tick {first} on")
+        out.print(f"missing: {count_text(count, 'tick')} from tick {first} on")
     _print_problems(out, report["problems"])
     if not report["complete"]:
         out.print("the end of the run is not in it: what came after its last tick is not known")
@@ -111,17 +113,17 @@ def print_cut(report: dict[str, Any]) -> None:
     span = f"{report['first']} to {report['end'] - 1}"
     if report["begin"] < report["first"]:
         span += f", and what leads to them from tick {report['begin']} on"
-    ticks = counted(report["ticks"], "tick")
+    ticks = count_text(report["ticks"], "tick")
     out.print(f"{_name(report['output'])}: {ticks} of {_name(report['recording'])}: {span}")
     for first, count in report["gaps"]:
-        out.print(f"missing: {counted(count, 'tick')} from tick {first} on")
+        out.print(f"missing: {count_text(count, 'tick')} from tick {first} on")
     _print_problems(out, report["problems"])
 
 
 def print_export(report: dict[str, Any]) -> None:
     """What was written where."""
     out = console()
-    out.print(f"{_name(report['output'])}: {counted(report['ticks'], 'tick')}, {report['bytes'] / 2**20:.1f} MiB")
+    out.print(f"{_name(report['output'])}: {count_text(report['ticks'], 'tick')}, {report['bytes'] / 2**20:.1f} MiB")
     _print_problems(out, report["problems"])
 
 

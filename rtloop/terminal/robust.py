@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import click
 
-from rtloop.design.robust.search import Robust
-from rtloop.design.robust.section import kept
-from rtloop.design.robust.shape import Shaped, Subject
+from rtloop.design.robust.search import RobustDesign
+from rtloop.design.robust.section import certified_values
+from rtloop.design.robust.shape import Subject, TapDesign
 
 
-def print_robust(found: Robust) -> None:
+def print_robust(found: RobustDesign) -> None:
     """The worst of everything that is certified, on stderr: stdout is for the section itself."""
     click.echo(f"searched over {found.searched} scenarios; worst of {found.certificate.plants} plants:", err=True)
-    for name, value, where in kept(found.certificate):
+    for name, value, where in certified_values(found.certificate):
         click.echo(f"  {name} {value:.4g}   ({where})", err=True)
 
 
-def print_shaped(found: Shaped, subject: Subject) -> None:
+def print_shaped(found: TapDesign, subject: Subject) -> None:
     """What the taps keep, on stderr."""
     proof = found.proof
     for line in (

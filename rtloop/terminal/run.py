@@ -20,7 +20,7 @@ from rtloop.recording.views.summary import Summary
 from rtloop.signals import Mode
 from rtloop.terminal.progress import StatusLine
 from rtloop.terminal.table import console, figure, table
-from rtloop.values import counted
+from rtloop.values import count_text
 
 if TYPE_CHECKING:
     from rtloop.configuration.axis import AxisOptions
@@ -89,7 +89,9 @@ def print_summary(summary: Summary) -> None:
     shown.add_row("lost", str(summary.ticks_lost), "complete" if summary.complete else "[red]not complete[/]")
     if around := summary.around:
         came, on = summary.ticks_logged + summary.ticks_skipped, escape(", ".join(around["on"]))
-        kept = f"{counted(summary.stretches, 'stretch', 'stretches')}, {summary.ticks_logged:,} of {came:,} ticks kept"
+        kept = (
+            f"{count_text(summary.stretches, 'stretch', 'stretches')}, {summary.ticks_logged:,} of {came:,} ticks kept"
+        )
         shown.add_row("around events", f"{summary.stretches:,}", f"{kept}: {around['before_s']:g} s before and "
                       f"{around['after_s']:g} s after {on}")  # fmt: skip
     shown.add_row("time", f"{summary.duration_s:.3f} s", f"at {summary.rate_hz:g} Hz")
@@ -232,7 +234,7 @@ def _asked(configuration: Configuration, axis: AxisOptions) -> Iterator[tuple[st
     limits = [getattr(asked, key) for key in STEP_QUANTITIES]
     yield f"  {name} asks", ["–" if limit is None else f"≤ {limit:g}" for limit in limits]
     if asked.claims:
-        yield f"  {name} claims", [escape(asked.claimed(key)) or "–" for key in STEP_QUANTITIES]
+        yield f"  {name} claims", [escape(asked.claim_words(key)) or "–" for key in STEP_QUANTITIES]
 
 
 def print_drivers() -> None:

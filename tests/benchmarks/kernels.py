@@ -8,10 +8,10 @@ import numpy as np
 
 from rtloop.engine.assembly import law_at_rest
 from rtloop.hil.native.compiled import jit
-from rtloop.law.access import loop_of, state_of
+from rtloop.law.access import axis_state, loop_state
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import LawMemory, records
+from rtloop.law.memory import LawMemory, new_records
 from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
 from tests.benchmarks.measure import Effort, Spread, alternately, seconds
@@ -39,9 +39,9 @@ def run_law(law, adc_v, references, modes, conditions, out):
         adc[0], reference[0] = adc_v[k], references[k]
         evaluate(law, adc, reference, feed, conditions[0])
         update(law)
-        state = state_of(law, 0)
+        state = axis_state(law, 0)
         out[k, 0], out[k, 1] = state.command_um, state.demand_v
-        out[k, 2], out[k, 3] = state.drive_v, float(loop_of(law).tick_flags)
+        out[k, 2], out[k, 3] = state.drive_v, float(loop_state(law).tick_flags)
 
 
 def law_inputs(ticks: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
@@ -65,7 +65,7 @@ def check_law(adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> 
     modes[::700] = random.choice([int(mode) for mode in Mode], modes[::700].size, p=[0.1, 0.2, 0.2, 0.5])
     adc_v[9_999::10_000] = random.choice([np.nan, np.inf, 9.995, -6.5], adc_v[9_999::10_000].size)
     outs = [np.empty((adc_v.size, 4)) for _ in range(2)]
-    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), records(CONDITIONS, 1)
+    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), new_records(CONDITIONS, 1)
     for memory in (ours, theirs):
         memory.state["mode"] = int(Mode.OFF)
     run_law(ours.law, adc_v, references, modes, conditions, outs[0])
@@ -84,7 +84,7 @@ def law(effort: Effort) -> dict[str, Any]:
     adc_v, references = law_inputs(CHECKED_TICKS)
     check_law(adc_v, references)
     modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
-    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), records(CONDITIONS, 1)
+    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), new_records(CONDITIONS, 1)
     pair = alternately(
         lambda: run_law(ours.law, adc_v, references, modes, conditions, out),
         lambda: native.run_law((*native.arrays_of(theirs), adc_v, references, modes), adc_v.size, out),
@@ -145,7 +145,7 @@ def same_memory(one: LawMemory, other: LawMemory) -> bool:
     """Whether two laws remember the same, in bits, of what the drives depend on."""
     names = {"controller": ("controller",), "feedforward": ("inverse_plays_um", "model_plays_v")}
     return one.axes["drive_v"].tobytes() == other.axes["drive_v"].tobytes() and all(
-        one.of_law(0, slot, "state")[name].tobytes() == other.of_law(0, slot, "state")[name].tobytes()
+        one.slot_record(0, slot, "state")[name].tobytes() == other.slot_record(0, slot, "state")[name].tobytes()
         for slot in ("controller", "feedforward")
         for name in names[slot]
     )

@@ -10,10 +10,10 @@ from rtloop.engine.assembly import Assembly, law_at_rest
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.native.pointers import call
-from rtloop.law.access import state_of
+from rtloop.law.access import axis_state
 from rtloop.law.law import evaluate, update
 from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import records
+from rtloop.law.memory import new_records
 from rtloop.signals import Mode
 from tests.benchmarks.kernels import Differs, law_inputs, same_memory
 from tests.benchmarks.measure import Effort, in_turn, seconds, spread
@@ -37,7 +37,7 @@ def bare_ticks(pointers, clock, law, conditions, references, buffers, ticks):
         call(clock[1], clock[2], timing.ctypes.data)
         adc_v[0], reference[0] = inputs[0], references[k]
         evaluate(law, adc_v, reference, feed, conditions[0])
-        outputs[0] = state_of(law, 0).drive_v
+        outputs[0] = axis_state(law, 0).drive_v
         call(clock[1], clock[2], timing.ctypes.data)
         call(pointers[2], pointers[0], outputs.ctypes.data)
         call(clock[1], clock[2], timing.ctypes.data)
@@ -92,7 +92,7 @@ class Bare:
         clock, self._kept = due_clock(plan.pacing.rate_hz)
         self._clock, self._pointers = tuple(clock), tuple(self._tape.pointers())[:3]
         self._buffers = np.zeros(4), np.zeros(1), np.zeros(4)
-        self._conditions = records(CONDITIONS, 1)
+        self._conditions = new_records(CONDITIONS, 1)
 
     def further(self) -> None:
         """TICKS more."""

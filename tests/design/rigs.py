@@ -13,7 +13,7 @@ import numpy as np
 from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, identify_dynamics
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit, identify_hysteresis
-from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.measured import AxisRecording
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.options import (
     ConverterOptions,
@@ -47,13 +47,13 @@ class Rig:
     damping: float
     d0: float
 
-    def measure(self, drive_v: np.ndarray[Any, Any], period_s: float) -> Measured:
+    def measure(self, drive_v: np.ndarray[Any, Any], period_s: float) -> AxisRecording:
         """The rig driven from rest."""
         coefficients, state = build_rig(self.options, ["x"], period_s)
         adc_v = np.empty(drive_v.size)
         _record(coefficients, state, drive_v, adc_v)
         position = SENSOR_UM_PER_V * adc_v
-        return Measured("rig", period_s, drive_v, position, position, True, "", "")
+        return AxisRecording("rig", period_s, drive_v, position, position, True, "", "")
 
     def static_um(self, drive_v: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         """Position at rest, D(0)·P[u], sample by sample from the rig's own plays."""
@@ -124,7 +124,7 @@ def chirp_drive(volts: float = 1.0, duration_s: float = 2.0) -> np.ndarray[Any, 
     return volts * np.sin(2 * np.pi * 10.0 * np.expm1(rate * time_s) / rate)
 
 
-def excited(model: PlayModel, run: Measured) -> Excitation:
+def excited(model: PlayModel, run: AxisRecording) -> Excitation:
     return Excitation(run.name, model_output(model, run.drive_v), run.position_um, run.period_s)
 
 
@@ -154,7 +154,7 @@ def closeness(rig: Rig, shape: HysteresisFit, dynamics: DynamicsFit) -> Closenes
 def tightness(rig: Rig, actuator: PlayModel, error_um: float) -> tuple[float, float, float, float, float]:
     """ξ of the rig's true operator behind the inverse of eq (4), the parts of it that a sine and the worst command
     reach on the rig itself; then the same parts of what the identified operator promises, ξ plus its fit's error."""
-    inverse = EQ_4.without_dead_band().inverse()
+    inverse = EQ_4.remove_dead_band().inverse()
     true = residual_operator(PlayModel(rig.thresholds, rig.d0 * rig.weights), inverse, COMMAND_UM)
     found = residual_operator(actuator, inverse, COMMAND_UM)
     xi = true.bound_um(true.gain)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rtloop.design.synthesis.at_rate import dead_time, runs, within_rate
-from rtloop.design.synthesis.synthesise import DoesNotRun, synthesise
+from rtloop.design.synthesis.at_rate import dead_time, drop_fast_roots, is_runnable
+from rtloop.design.synthesis.synthesise import NotRunnable, synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
 from rtloop.linear.transfer import Transfer
 
@@ -33,7 +33,7 @@ def test_no_delay_is_one() -> None:
 def test_roots_far_beyond_the_rate_leave_their_gain() -> None:
     near = Transfer.from_zpk([-5.0], [-1.0, -3e4], 7.0)
     far = Transfer.from_zpk([*near.zeros, 4e13], [*near.poles, -6e12], 7.0 * 6e12 / -4e13)
-    found = within_rate(far, RATE_HZ)
+    found = drop_fast_roots(far, RATE_HZ)
     assert found.zeros.tolist() == near.zeros.tolist()
     assert found.poles.tolist() == near.poles.tolist()
     assert found.gain == pytest.approx(near.gain, rel=1e-12)
@@ -41,7 +41,7 @@ def test_roots_far_beyond_the_rate_leave_their_gain() -> None:
 
 def test_a_far_pole_stays_where_a_zero_would_be_left_without_one_or_it_is_unstable() -> None:
     for poles in ([-1e12], [1e12]):
-        kept = within_rate(Transfer.from_zpk([-5.0], poles, 1.0), RATE_HZ)
+        kept = drop_fast_roots(Transfer.from_zpk([-5.0], poles, 1.0), RATE_HZ)
         assert kept.poles.tolist() == poles
 
 
@@ -50,9 +50,9 @@ def test_too_high_an_order_does_not_run() -> None:
     rates = -np.arange(1.0, 26.0)
     for count, says in ((24, True), (25, False)):
         controller = Transfer.from_zpk(rates[: count - 1] - 0.5, rates[:count], 1.0)
-        assert runs(controller, MODE, RATE_HZ, "matched", None, 0) is says
+        assert is_runnable(controller, MODE, RATE_HZ, "matched", None, 0) is says
 
 
 def test_where_nothing_runs_the_message_says_what_would_help() -> None:
-    with pytest.raises(DoesNotRun, match=r"no controller of order 0 to 4 .* as it runs, .*; a longer settling_ms"):
+    with pytest.raises(NotRunnable, match=r"no controller of order 0 to 4 .* as it runs, .*; a longer settling_ms"):
         synthesise(MODE, PAPER_WEIGHTS._replace(disturbance=Transfer.from_zpk([], [], 0.0)), finish=lambda _: None)

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
-from rtloop.hysteresis.compensation import compensated, residual_operator
+from rtloop.hysteresis.compensation import compensated_output, residual_operator
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.play_model import PlayModel
 from tests.design.rigs import COMMAND_UM, EQ_4, drawn
 
-INVERSE = EQ_4.without_dead_band().inverse()
+INVERSE = EQ_4.remove_dead_band().inverse()
 RESIDUAL_RIG = PlayModel(np.array(THRESHOLDS_V), np.array(RESIDUAL_WEIGHTS_UM_PER_V))
 
 
@@ -31,7 +31,7 @@ def models(draw) -> PlayModel:
 def test_the_composition_is_the_operator_and_stays_within_its_bound(actuator, compensator, commands) -> None:
     inverse, v = compensator.without_dead_band().inverse(), COMMAND_UM * np.array(commands)
     residual = residual_operator(actuator, inverse, COMMAND_UM)
-    y = compensated(actuator, inverse, v)
+    y = compensated_output(actuator, inverse, v)
     size = max(1.0, float(np.abs(y).max()))
     assert np.allclose(y, model_output(residual.operator, v), atol=1e-7 * size)
     for gain in (residual.gain, residual.best_gain, 1.0):
@@ -47,7 +47,7 @@ def test_the_bound_is_reached(actuator, compensator) -> None:
     for gain in (residual.gain, residual.best_gain, 1.0):
         v = residual.worst_commands_um(gain)
         assert np.abs(v).max() <= COMMAND_UM * (1 + 1e-12)
-        left = compensated(actuator, inverse, v)[-1] - gain * v[-1]
+        left = compensated_output(actuator, inverse, v)[-1] - gain * v[-1]
         assert abs(left) == pytest.approx(residual.bound_um(gain), rel=1e-6, abs=1e-6)
 
 
@@ -70,7 +70,7 @@ def test_eq_3_as_printed_is_no_bound_where_weights_have_both_signs() -> None:
     """The paper's rig: a plain sine of 40 µm leaves 1.86 µm, |∫ r p(r) dr| is 1.52 µm, ξ is 2.28 µm."""
     residual = residual_operator(RESIDUAL_RIG, INVERSE, COMMAND_UM)
     v = COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 5001))
-    left = np.abs(compensated(RESIDUAL_RIG, INVERSE, v) - residual.gain * v).max()
+    left = np.abs(compensated_output(RESIDUAL_RIG, INVERSE, v) - residual.gain * v).max()
     assert residual.printed_bound_um == pytest.approx(1.523, abs=2e-3)
     assert left == pytest.approx(1.856, abs=2e-3)
     assert residual.bound_um(residual.gain) == pytest.approx(2.284, abs=2e-3)
@@ -86,7 +86,7 @@ def test_eq_3_is_the_bound_where_all_weights_have_one_sign() -> None:
 
 
 def test_an_exact_inverse_leaves_nothing() -> None:
-    behind = EQ_4.without_dead_band()
+    behind = EQ_4.remove_dead_band()
     residual = residual_operator(behind, behind.inverse(), COMMAND_UM)
     assert residual.gain == pytest.approx(1.0)
     assert residual.bound_um(1.0) < 1e-12
@@ -95,7 +95,7 @@ def test_an_exact_inverse_leaves_nothing() -> None:
 def test_the_dead_band_alone_leaves_what_the_model_of_eq_4_says() -> None:
     """0.747 µm of a 40 µm sine from rest, r_0 = 0.095 V being left out of the inverse."""
     v = COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 20_001))
-    assert np.abs(compensated(EQ_4, INVERSE, v) - v).max() == pytest.approx(0.747, abs=1e-3)
+    assert np.abs(compensated_output(EQ_4, INVERSE, v) - v).max() == pytest.approx(0.747, abs=1e-3)
 
 
 def test_a_compensator_that_does_not_increase_is_named() -> None:

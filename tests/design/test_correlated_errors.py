@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from rtloop.design.identification.dynamics.dynamics_fit import modes_of, static_gain_std
+from rtloop.design.identification.dynamics.dynamics_fit import estimate_modes, static_gain_std
 from rtloop.design.identification.dynamics.estimate_covariance import estimate_covariance
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.measured_levels import with_measured_levels
-from rtloop.design.identification.dynamics.prediction_error import Excitation, descended
+from rtloop.design.identification.dynamics.prediction_error import Excitation, minimise_errors
 
 PERIOD_S, TICKS, LONG, NOISE_UM = 1e-4, 4000, 3000, 0.02
 RESONANCE = 2 * np.pi * 800.0 * (-0.02 + 1j * np.sqrt(1 - 0.02**2))
@@ -26,15 +26,15 @@ def test_standard_deviations_are_the_spread_of_estimates_under_coloured_noise(po
     narrowest, widest = 0.8, 1.25
     for _ in range(150):
         noise_um = lfilter([1.0], [1.0, -pole], random.normal(0.0, NOISE_UM, TICKS))
-        run = Excitation("made", u, TRUTH.output(u) + noise_um, PERIOD_S)
-        model = descended(TRUTH, run, noise=False)
+        run = Excitation("made", u, TRUTH.simulate_output(u) + noise_um, PERIOD_S)
+        model = minimise_errors(TRUTH, run, noise=False)
         errors = model.errors(run.input, run.position_um)
         assert errors is not None
         covariances = [estimate_covariance(model, run, errors, white=white) for white in (False, True)]
-        (mode,) = modes_of(model, covariances[0], noise=True)
+        (mode,) = estimate_modes(model, covariances[0], noise=True)
         values.append([mode.frequency_hz, mode.damping, model.static_gain])
         for covariance, rows in zip(covariances, (stated, assumed_white), strict=True):
-            (mode,) = modes_of(model, covariance, noise=True)
+            (mode,) = estimate_modes(model, covariance, noise=True)
             rows.append([mode.frequency_std_hz, mode.damping_std, static_gain_std(model, covariance, noise=True)])
     spread = np.std(values, axis=0, ddof=1)
     ratios, white_ratios = (np.mean(rows, axis=0) / spread for rows in (stated, assumed_white))
@@ -51,7 +51,7 @@ def recorded(dwell_ticks: int, added_um: np.ndarray | float = 0.0) -> Excitation
     """The model of the hysteresis says 20.0 and 3.1 µm where the actuator holds 20.3 and 3.0."""
     true_um = held_levels(dwell_ticks, 0.0, 20.3, 0.0, 3.0)
     noise_um = np.random.default_rng(2).normal(0.0, NOISE_UM, true_um.size)
-    position_um = TRUTH.output(true_um) + noise_um + added_um
+    position_um = TRUTH.simulate_output(true_um) + noise_um + added_um
     return Excitation("made", held_levels(dwell_ticks, 0.0, 20.0, 0.0, 3.1), position_um, PERIOD_S)
 
 
@@ -75,5 +75,5 @@ def test_levels_are_left_alone_where_they_cannot_be_measured(reason: str) -> Non
 
 def test_two_levels_leave_nothing_to_correct() -> None:
     u = held_levels(LONG, 0.0, 20.0)
-    run = Excitation("made", u, 1.01 * TRUTH.output(u), PERIOD_S)
+    run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
     assert with_measured_levels(run) == (run, 0.0)

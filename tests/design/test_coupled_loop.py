@@ -9,7 +9,7 @@ import pytest
 from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, coupling_matrix
 from rtloop.hil.modal import Real
 from rtloop.linear.realisation import System
-from rtloop.linear.together import SampledTogether, SystemTogether, beside_each_other, tustin
+from rtloop.linear.together import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S = 1e-3
@@ -25,8 +25,8 @@ def loop(axes: int, seed: int) -> tuple[CoupledLoop, control.StateSpace, control
     coupling = np.eye(axes) + 0.2 * random.uniform(-1, 1, (axes, axes)) * (1 - np.eye(axes))
     delays = tuple(int(ticks) for ticks in random.integers(0, 3, axes))
     gains = 10.0 * PERIOD_S * (np.eye(axes) + 0.2 * random.uniform(-1, 1, (axes, axes)))
-    system = SystemTogether(np.eye(axes), np.eye(axes), gains, 0.1 * gains)
-    found = CoupledLoop(SampledTogether(system, PERIOD_S), CoupledPlant(transfers, delays, coupling))
+    system = CoupledSystem(np.eye(axes), np.eye(axes), gains, 0.1 * gains)
+    found = CoupledLoop(SampledCoupledSystem(system, PERIOD_S), CoupledPlant(transfers, delays, coupling))
     own = []
     for w, z, ticks in zip(omegas, dampings, delays, strict=True):
         held = control.c2d(control.ss(control.tf([w**2], [1.0, 2 * z * w, w**2])), PERIOD_S, "zoh")
@@ -60,7 +60,7 @@ def test_a_loop_broken_alone_is_that_of_the_others_closed(axes, seed):
     tracking = control.feedback(plant * controller, control.ss([], [], [], np.eye(axes), PERIOD_S))
     times_s = np.arange(300) * PERIOD_S
     for i in range(axes):
-        own = found.alone(i)
+        own = found.axis_loop(i)
         np.testing.assert_allclose(own.open(hz), 1 / found.sensitivity(hz)[:, i, i] - 1, rtol=1e-8)
         a, b, c, _ = own.matrices
         x, response = np.zeros(b.size), []
@@ -108,7 +108,7 @@ def test_gains_within_the_disk_margin_keep_it_stable():
 def test_tustin_is_that_of_python_control():
     random = np.random.default_rng(3)
     a: Real = random.normal(size=(4, 4)) - 5 * np.eye(4)
-    system = SystemTogether(a, random.normal(size=(4, 2)), random.normal(size=(2, 4)), random.normal(size=(2, 2)))
+    system = CoupledSystem(a, random.normal(size=(4, 2)), random.normal(size=(2, 4)), random.normal(size=(2, 2)))
     hz = np.array([1.0, 60.0, 300.0])
     found = tustin(system, PERIOD_S, 60.0).response(np.exp(2j * np.pi * hz * PERIOD_S))
     sampled = control.c2d(control.ss(*system), PERIOD_S, "tustin", prewarp_frequency=2 * np.pi * 60.0)
@@ -122,7 +122,7 @@ def test_tustin_is_that_of_python_control():
 def test_systems_beside_each_other_know_nothing_of_each_other():
     one = System(np.array([[0.5]]), np.array([2.0]), np.array([3.0]), 0.25)
     two = System(np.array([[0.1, 1.0], [0.0, 0.2]]), np.array([0.0, 1.0]), np.array([1.0, 0.0]), 0.0)
-    found = beside_each_other([one, two]).response([2.0])[0]
+    found = block_diagonal_system([one, two]).response([2.0])[0]
     np.testing.assert_allclose(found, np.diag([one.response(2.0)[0], two.response(2.0)[0]]))
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from rtloop.design.paper import PAPER_C
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 T = 1e-4
@@ -56,7 +56,7 @@ def worst_error(transfer: Transfer, method, prewarp_hz, hz=HZ) -> float:
     Ten zeros in one place leave a sum of doubles nothing but its rounding, in any realisation; and what lies nine
     powers of ten below the largest |C(z)| passes through unseen.
     """
-    controller = discretise(transfer, T, method, prewarp_hz)
+    controller = discretise_controller(transfer, T, method, prewarp_hz)
     wanted = np.array([exact(transfer.zeros, transfer.poles, transfer.gain, method, prewarp_hz, f) for f in hz])
     states = controller.system.states(np.exp(2j * np.pi * np.asarray(hz) * T))
     terms = np.abs(states) @ np.abs(controller.c) + abs(controller.d)
@@ -105,7 +105,7 @@ DISTINCT = {
 def test_every_shape_to_1e9(name, method, prewarp_hz) -> None:
     transfer = (REPEATED | DISTINCT)[name]
     assert worst_error(transfer, method, prewarp_hz) < 1e-9
-    form = discretise(transfer, T, method, prewarp_hz).form
+    form = discretise_controller(transfer, T, method, prewarp_hz).form
     assert form == "cascade" if name in REPEATED else form == "modal"
 
 
@@ -128,7 +128,7 @@ def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
     poles = (poles + poles if repeat and len(poles) <= 5 else poles) + ([0.0] if integrator else [])
     zeros = zeros[: len(poles)] if len(zeros) <= len(poles) else []
     transfer = Transfer.from_zpk(zeros, poles, float(np.prod([abs(p) or 1 for p in poles])))
-    controller = discretise(transfer, T, *how)
+    controller = discretise_controller(transfer, T, *how)
     assert worst_error(transfer, *how, hz=HZ[1::3]) < max(1e-7, rounding(controller, HZ[1::3]))
     a, b, c, m = controller.a, controller.b, controller.c, controller.antiwindup
     if np.abs(c).max(initial=0) > 1e-6:  # otherwise every pole has its zero
@@ -147,14 +147,14 @@ def test_against_scipy(method, theirs) -> None:
     """scipy.signal.cont2discrete on a well-conditioned system."""
     numerator, denominator = [2.0, 300.0, 5e4], np.polymul([1, 100], [1, 150, 9e4])
     num, den, _ = signal.cont2discrete((numerator, denominator), 1e-3, theirs)
-    controller = discretise(Transfer.from_transfer_function(numerator, denominator), 1e-3, method)
+    controller = discretise_controller(Transfer.from_transfer_function(numerator, denominator), 1e-3, method)
     _, wanted = signal.freqz(np.ravel(num), den, np.pi * np.array([0.01, 0.1, 0.5, 0.9]))
     assert controller.response([5, 50, 250, 450]) == pytest.approx(wanted, rel=1e-9)
 
 
 def test_modal_blocks_and_bands_of_the_paper() -> None:
     """Three real poles and a pair: rows touch 1, 1, 1, 2, 2 columns; rotations are scaled rotations."""
-    controller = discretise(PAPER_C, T, "matched")
+    controller = discretise_controller(PAPER_C, T, "matched")
     assert controller.form == "modal"
     assert controller.row_bands.tolist() == [[0, 1], [1, 2], [2, 3], [3, 5], [3, 5]]
     assert controller.a[3, 3] == controller.a[4, 4]
@@ -163,7 +163,7 @@ def test_modal_blocks_and_bands_of_the_paper() -> None:
 
 def test_states_are_of_comparable_size() -> None:
     """Each state's largest response to a unit sine lies near 1, though the modes' gains span 0.1 to 500."""
-    controller = discretise(PAPER_C, T, "matched")
+    controller = discretise_controller(PAPER_C, T, "matched")
     z = np.exp(2j * np.pi * np.geomspace(0.001, 4999, 2000) * T)
     peaks = np.abs(controller.system.states(z)).max(axis=0)
     assert np.all((peaks > 0.5) & (peaks < 2))
@@ -171,7 +171,7 @@ def test_states_are_of_comparable_size() -> None:
 
 def test_static_controller_has_no_states() -> None:
     for transfer in (Transfer.from_zpk([], [], 2.5), Transfer.from_zpk([], [-1], 0.0)):
-        controller = discretise(transfer, T, "matched")
+        controller = discretise_controller(transfer, T, "matched")
         assert controller.order == 0
         assert controller.a.shape == (0, 0)
         assert controller.row_bands.shape == (0, 2)
@@ -182,7 +182,7 @@ def test_static_controller_has_no_states() -> None:
 
 
 def test_integrating_state_takes_the_correction_and_has_no_steady_state() -> None:
-    controller = discretise(DISTINCT["integrator"], T, "tustin")
+    controller = discretise_controller(DISTINCT["integrator"], T, "tustin")
     integrating = np.flatnonzero(np.diag(controller.a) == 1)
     assert integrating.size == 1
     assert math.isinf(controller.dc_gain)
@@ -192,16 +192,16 @@ def test_integrating_state_takes_the_correction_and_has_no_steady_state() -> Non
 
 def test_dc_gain_is_kept() -> None:
     for method, prewarp_hz in METHODS:
-        assert discretise(PAPER_C, T, method, prewarp_hz).dc_gain == pytest.approx(593.569162, abs=1e-5)
+        assert discretise_controller(PAPER_C, T, method, prewarp_hz).dc_gain == pytest.approx(593.569162, abs=1e-5)
 
 
 def test_unstable_controller_is_limited_stably_or_refused() -> None:
-    controller = discretise(Transfer.from_factors(10, [[1, 50]], [[1, -30], [1, 700]]), T, "matched")
+    controller = discretise_controller(Transfer.from_factors(10, [[1, 50]], [[1, -30], [1, 700]]), T, "matched")
     error = controller.a - np.outer(controller.a @ controller.antiwindup, controller.c)
     assert np.abs(np.linalg.eigvals(error)).max() < 1
     hidden = Transfer.from_zpk([30.0], [30.0, -5.0], 1.0)  # the output does not see the unstable mode
     with pytest.raises(ValueError, match="controller: "):
-        discretise(hidden, T, "matched")
+        discretise_controller(hidden, T, "matched")
 
 
 @pytest.mark.parametrize(
@@ -216,18 +216,18 @@ def test_unstable_controller_is_limited_stably_or_refused() -> None:
 )
 def test_refusals(arguments, message) -> None:
     with pytest.raises(ValueError, match=message):
-        discretise(PAPER_C, *arguments)
+        discretise_controller(PAPER_C, *arguments)
 
 
 def test_roots_that_a_rule_cannot_map_are_refused() -> None:
     with pytest.raises(ValueError, match=r"poles: 8e\+06 rad/s to the right"):
-        discretise(Transfer.from_zpk([-1], [8e6], 1), T, "matched")
+        discretise_controller(Transfer.from_zpk([-1], [8e6], 1), T, "matched")
     with pytest.raises(ValueError, match="at infinity"):
-        discretise(Transfer.from_zpk([2 / T], [-1], 1), T, "tustin")
+        discretise_controller(Transfer.from_zpk([2 / T], [-1], 1), T, "tustin")
 
 
 def test_a_zero_too_far_to_the_right_to_be_seen_leaves_its_gain() -> None:
     """exp(800) has no digits beside 1; what is left is k/(z − p) with C(1) = C(0)."""
-    found = discretise(Transfer.from_zpk([8e6], [-100.0], -1e-5), T, "matched")
+    found = discretise_controller(Transfer.from_zpk([8e6], [-100.0], -1e-5), T, "matched")
     assert found.zeros.size == 0
     assert found.gain / (1 - math.exp(-100.0 * T)) == pytest.approx(0.8, rel=1e-12)

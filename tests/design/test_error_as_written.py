@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
-from rtloop.design.identification.hysteresis.judgement import together
-from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.hysteresis.judgement import combine_errors
+from rtloop.design.identification.measured import AxisRecording
 from rtloop.laws.shipped.play_model import PlayModel
 from tests.design.other_truths import bouc_wen, creeping_plays, part_of_a_drive, preisach, stepped_plays
 
@@ -29,14 +29,14 @@ def of_sines(random: np.random.Generator) -> tuple[Array, Array]:
     return 9 * np.sin(angle + np.linspace(-8, 0, SAMPLES)), sizes * np.sin(angle + np.linspace(0, 20, 2 * SAMPLES))
 
 
-def recorded(truth: Any, seed: int, drive_of: Any = of_strokes) -> Measured:
+def recorded(truth: Any, seed: int, drive_of: Any = of_strokes) -> AxisRecording:
     """A drive after a past that is not recorded, with an offset and 20 nm of noise."""
     random = np.random.default_rng(seed)
     past, drive = drive_of(random)
     clean = truth(np.concatenate([past, drive]))[past.size :] + random.uniform(-3, 3)
     position = clean + random.normal(0, 0.02, drive.size)
     shifted = np.append(position[0], position)  # a tick's position was measured before its drive was written
-    return Measured(f"part {seed}", 0.01, np.append(drive, drive[-1]), shifted, shifted, True, "", "")
+    return AxisRecording(f"part {seed}", 0.01, np.append(drive, drive[-1]), shifted, shifted, True, "", "")
 
 
 def true_um(truth: Any, model: PlayModel, seeds: Sequence[int], drive_of: Any = of_strokes) -> float:
@@ -60,9 +60,9 @@ def test_the_error_of_what_is_written_is_reported(truth: Any, drive_of: Any, cre
     What fades with the drive's path is not taken for creep.
     """
     found = identify_from_parts([recorded(truth, seed, drive_of) for seed in range(50, 53)], 5, "chebyshev-from-0")
-    assert ("creep" in found.terms) == creeps, found.tried
-    reported = together([one.as_written_rms_um for one in found.judgements])
-    true = true_um(truth, found.shape.model, range(100, 108), drive_of)
+    assert ("creep" in found.terms) == creeps, found.trial_errors_um
+    reported = combine_errors([one.written_rms_um for one in found.judgements])
+    true = true_um(truth, found.hysteresis.model, range(100, 108), drive_of)
     print(f"{truth.__name__}: reported {reported.rms_um:.4f} ± {reported.std_um:.4f}, true {true:.4f} µm")
     assert true > 0.3
     assert reported.rms_um == pytest.approx(true, rel=0.2)

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from rtloop.design.paper import PAPER_D
 from rtloop.design.synthesis.hinf.assumptions import NoController
-from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augment
 from rtloop.design.synthesis.hinf.norm import hinf_norm
 from rtloop.design.synthesis.hinf.solver import synthesise_hinf
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
@@ -24,13 +24,13 @@ NORMALISED_D = Transfer(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain / PAPER_D.dc_
 @pytest.mark.parametrize(("plant", "gamma_opt"), [(PAPER_D, 1.6761), (NORMALISED_D, 1.6802)])
 def test_the_papers_problem(plant, gamma_opt) -> None:
     """γ_opt of eqs (5), (15), (17), (19), recomputed independently; the controller has order 11, as the paper says."""
-    standard = augmented(plant, PAPER_WEIGHTS)
+    standard = augment(plant, PAPER_WEIGHTS)
     found = synthesise_hinf(standard)
     assert found.gamma_opt == pytest.approx(gamma_opt, abs=2e-3)
     assert found.gamma == pytest.approx(1.004 * found.gamma_opt)
     assert found.controller.a.shape == (11, 11)
     assert found.limiting.startswith("coupling")
-    loop = standard.closed_with(found.controller)
+    loop = standard.close_loop(found.controller)
     for norm in (dense_norm(*loop), hamiltonian_norm(*loop)):
         assert norm <= 1.002 * found.gamma
         assert norm == pytest.approx(found.achieved, rel=1e-4)
@@ -57,14 +57,14 @@ def test_a_scalar_plant_in_closed_form(a) -> None:
     found = synthesise_hinf(scalar_plant(a))
     if expected is not None:
         assert found.gamma_opt == pytest.approx(expected, rel=1e-6)
-    assert dense_norm(*scalar_plant(a).closed_with(found.controller)) <= 1.002 * found.gamma
+    assert dense_norm(*scalar_plant(a).close_loop(found.controller)) <= 1.002 * found.gamma
 
 
 def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
     """With free commands, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
     plant = Transfer.from_zpk([20.0], [-5.0, -40.0], -1.0)
     w1 = Transfer.from_zpk([-9.0], [-0.01], 0.5)
-    free = augmented(plant, PAPER_WEIGHTS._replace(
+    free = augment(plant, PAPER_WEIGHTS._replace(
         tracking=w1, command=Transfer.from_zpk([], [], 1e-5), disturbance=Transfer.from_zpk([], [], 0.0)
     ))  # fmt: skip
     assert synthesise_hinf(free).gamma_opt == pytest.approx(0.5 * 29 / 20.01, rel=1e-3)
@@ -75,7 +75,7 @@ def test_random_plants_keep_their_promise(seed) -> None:
     """Two independent norms of the loop stay below γ, with D11 and D22 not zero and unstable modes."""
     plant = random_plant(seed)
     found = synthesise_hinf(plant)
-    loop = plant.closed_with(found.controller)
+    loop = plant.close_loop(found.controller)
     assert dense_norm(*loop) <= 1.002 * found.gamma
     assert hamiltonian_norm(*loop) <= 1.002 * found.gamma
 
@@ -100,7 +100,7 @@ def test_random_plants_as_slicot(seed) -> None:
     found = synthesise_hinf(plant)
     gamma, controller = slicot(plant, 2 * found.gamma_opt)
     bare = plant._replace(d22=0 * plant.d22)
-    assert dense_norm(*bare.closed_with(controller)) <= 1.001 * gamma  # SLICOT's own promise, kept here
+    assert dense_norm(*bare.close_loop(controller)) <= 1.001 * gamma  # SLICOT's own promise, kept here
     assert found.gamma_opt == pytest.approx(gamma, rel=1e-4)
 
 
@@ -110,21 +110,21 @@ def test_where_slicot_promises_too_much(seed) -> None:
     plant = random_plant(seed)
     found = synthesise_hinf(plant)
     gamma, controller = slicot(plant, 2 * found.gamma_opt)
-    reached = dense_norm(*plant._replace(d22=0 * plant.d22).closed_with(controller))
+    reached = dense_norm(*plant._replace(d22=0 * plant.d22).close_loop(controller))
     assert reached > 1.1 * gamma
     assert gamma < found.gamma_opt <= reached * (1 + 1e-4)
 
 
 @pytest.mark.parametrize("plant", [PAPER_D, NORMALISED_D])
 def test_the_papers_problem_as_slicot(plant) -> None:
-    standard = augmented(plant, PAPER_WEIGHTS)
+    standard = augment(plant, PAPER_WEIGHTS)
     found = synthesise_hinf(standard)
     assert found.gamma_opt == pytest.approx(slicot(standard, 2 * found.gamma_opt)[0], rel=1e-4)
 
 
 def test_no_smaller_gamma_will_do() -> None:
     with pytest.raises(NoController, match=r"gamma: 1.676 cannot be reached; 1.676.* can. coupling"):
-        synthesise_hinf(augmented(PAPER_D, PAPER_WEIGHTS), gamma=1.676)
+        synthesise_hinf(augment(PAPER_D, PAPER_WEIGHTS), gamma=1.676)
 
 
 def changed(**parts) -> GeneralisedPlant:
@@ -169,7 +169,7 @@ def test_an_integrating_weight_is_refused_by_name() -> None:
     """W1 with a pole at 0: the error's integral is a mode that y does not show."""
     integrating = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0], 1.0))
     with pytest.raises(NoController, match="detectability: y does not show the mode at s = 0 rad/s"):
-        synthesise_hinf(augmented(PAPER_D, integrating))
+        synthesise_hinf(augment(PAPER_D, integrating))
 
 
 @settings(max_examples=10, deadline=None)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from rtloop.design.identification.dynamics.dynamics_fit import modes_of
-from rtloop.design.identification.dynamics.identify_delay import Candidate, simplest
+from rtloop.design.identification.dynamics.dynamics_fit import estimate_modes
+from rtloop.design.identification.dynamics.identify_delay import Candidate, simplest_candidates
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation
@@ -85,14 +85,14 @@ def candidate(ticks: int, poles: int, rms_um: float, independent: bool = True) -
 
 def test_a_candidate_whose_errors_follow_from_the_input_counts_only_where_there_is_no_other() -> None:
     dependent, sound = candidate(0, 4, 0.0297, independent=False), candidate(3, 3, 0.0302)
-    assert delays_of(simplest([dependent, sound])) == [3]
-    assert delays_of(simplest([dependent])) == [0]
+    assert delays_of(simplest_candidates([dependent, sound])) == [3]
+    assert delays_of(simplest_candidates([dependent])) == [0]
 
 
 def test_fewer_poles_win_among_equally_good_predictions_and_lose_against_a_clearly_better_one() -> None:
     equal = [candidate(0, 4, 0.0300), candidate(1, 3, 0.0302), candidate(2, 3, 0.0301)]
-    assert delays_of(simplest(equal)) == [1, 2]
-    assert delays_of(simplest([candidate(0, 3, 0.0300), candidate(1, 2, 0.0310)])) == [0]
+    assert delays_of(simplest_candidates(equal)) == [1, 2]
+    assert delays_of(simplest_candidates([candidate(0, 3, 0.0300), candidate(1, 2, 0.0310)])) == [0]
 
 
 def delays_of(candidates: list[Candidate]) -> list[int]:
@@ -129,7 +129,7 @@ def test_a_mode_that_is_over_within_a_sample_has_no_spread() -> None:
     """Poles at z = 1e-9, and at 0.01, of a model that was written down."""
     rates = np.log([1e-9, 0.01]) / PERIOD_S
     model = Innovations(PERIOD_S, rates + 0j, np.array([0.5, 0.5]) + 0j, np.zeros(2, complex), 1.0)
-    slow, fast = modes_of(model, np.eye(4), noise=False)
+    slow, fast = estimate_modes(model, np.eye(4), noise=False)
     assert slow.frequency_hz == pytest.approx(-np.log(0.01) / PERIOD_S / (2 * np.pi))
     assert np.isfinite(slow.frequency_std_hz)
     assert fast.frequency_hz == pytest.approx(14 / PERIOD_S / (2 * np.pi))

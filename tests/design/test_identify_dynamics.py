@@ -8,13 +8,13 @@ import pytest
 
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.inverse_hold import held_from
+from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
 from rtloop.design.identification.dynamics.prediction_error import Excitation, excited_order
 from rtloop.design.identification.dynamics.residuals import residual_tests
-from rtloop.design.identification.frequency_response import agreement, frequency_response
+from rtloop.design.identification.frequency_response import compare_responses, estimate_response
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.design.paper import PAPER_D
-from rtloop.hil.modal import Modal, modal_sum
+from rtloop.hil.modal import ModalSystem, modal_sum
 from tests.design.rigs import EQ_4, FAST_S, chirp_drive, closeness, drawn, excited, identified, step_drive
 
 PAIR_AND_REAL = Innovations(
@@ -56,7 +56,7 @@ def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:
     model = type(EQ_4)(rig.thresholds, rig.weights)
     fit = identify_dynamics(excited(model, rig.measure(step_drive(), FAST_S)), order=4)
     chirp = excited(model, rig.measure(chirp_drive(duration_s=4.0), FAST_S))
-    found = agreement(fit.model, frequency_response(chirp.input, chirp.position_um, FAST_S))
+    found = compare_responses(fit.model, estimate_response(chirp.input, chirp.position_um, FAST_S))
     assert found.median_deviation < 0.02
     assert found.from_hz < 20
     assert found.to_hz > 900
@@ -65,7 +65,9 @@ def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:
 def test_standard_deviations_are_those_of_repeated_experiments() -> None:
     """12 recordings with other noise: the spread of the estimates is the deviation that each of them reports."""
     drive, random = step_drive(duration_s=0.4), np.random.default_rng(3)
-    clean = Innovations(FAST_S, PAIR_AND_REAL.rates, PAIR_AND_REAL.residues, np.zeros(2, complex)).output(drive)
+    clean = Innovations(FAST_S, PAIR_AND_REAL.rates, PAIR_AND_REAL.residues, np.zeros(2, complex)).simulate_output(
+        drive
+    )
     runs = [Excitation("made", drive, clean + random.normal(0, 0.02, drive.size), FAST_S) for _ in range(12)]
     fits = [identify_dynamics(run, order=3) for run in runs]
     pairs = [min(fit.modes, key=lambda mode: mode.damping) for fit in fits]
@@ -97,7 +99,7 @@ def test_errors_are_those_of_the_armax_polynomials() -> None:
     """ε from A y − B u = C ε with the polynomials multiplied out, which is fine for three poles."""
     random = np.random.default_rng(2)
     u, y = random.normal(size=50), random.normal(size=50)
-    images, pair = PAIR_AND_REAL.images, PAIR_AND_REAL.discrete()
+    images, pair = PAIR_AND_REAL.z_poles, PAIR_AND_REAL.discrete()
     a = np.poly([images[0], images[0].conj(), images[1]]).real
 
     def numerator(residues: np.ndarray) -> np.ndarray:
@@ -116,7 +118,7 @@ def test_errors_are_those_of_the_armax_polynomials() -> None:
     assert np.allclose(PAIR_AND_REAL.errors(u, y), expected, atol=1e-10)
 
 
-def exactly_held(modal: Modal, period_s: float) -> list[tuple[mpmath.mpc, mpmath.mpc]]:
+def exactly_held(modal: ModalSystem, period_s: float) -> list[tuple[mpmath.mpc, mpmath.mpc]]:
     """Poles and residues of the zero-order hold at 50 digits."""
     found = []
     for pole, residue in zip(modal.poles, modal.residues[0], strict=True):
@@ -132,20 +134,20 @@ def test_the_inverse_hold_keeps_its_digits(case: str) -> None:
     random = np.random.default_rng(5)
     if case == "order 20":
         upper = -random.uniform(1, 500, 10) + 1j * np.geomspace(10, 2e4, 10)
-        modal = Modal(np.concatenate([upper, upper.conj()]), np.ones((1, 20), complex), np.zeros(1))
+        modal = ModalSystem(np.concatenate([upper, upper.conj()]), np.ones((1, 20), complex), np.zeros(1))
     elif case == "eq 5 below 5 kHz":
         full = modal_sum(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain)
         kept = np.abs(full.poles.imag) < np.pi / FAST_S
-        modal = Modal(full.poles[kept], full.residues[:, kept], np.zeros(1))
+        modal = ModalSystem(full.poles[kept], full.residues[:, kept], np.zeros(1))
     else:
-        modal = Modal(np.array([-1.0 + 0j, -1e5 + 0j]), np.array([[2.0 + 0j, -3e4 + 0j]]), np.zeros(1))
+        modal = ModalSystem(np.array([-1.0 + 0j, -1e5 + 0j]), np.array([[2.0 + 0j, -3e4 + 0j]]), np.zeros(1))
     with mpmath.workdps(50):
         held = exactly_held(modal, FAST_S)
-    discrete = Modal(
+    discrete = ModalSystem(
         np.array([complex(image) for image, _ in held]), np.array([[complex(r) for _, r in held]]), np.zeros(1)
     )
     rates = np.log(discrete.poles) / FAST_S
-    back = held_from(rates, discrete.residues, discrete.direct, FAST_S)
+    back = continuous_modal(rates, discrete.residues, discrete.direct, FAST_S)
     # a pole in z near 1 holds −1 rad/s at 1e-4 s to 1e-16/1e-4 only: that is the recording's own limit
     lost = 1e-15 / np.abs(modal.poles * FAST_S) + 1e-14
     assert np.all(np.abs(back.poles / modal.poles - 1) < lost)
@@ -166,17 +168,17 @@ def test_twenty_modes_and_slow_beside_fast_are_predicted_exactly() -> None:
             sums = [(2 if rate.imag else 1) * r * x for rate, r, x in zip(rates, residues, states, strict=True)]
             expected.append(float(mpmath.fsum(sums).real))
             states = [image * x + mpmath.mpf(float(value)) for image, x in zip(images, states, strict=True)]
-    assert np.allclose(model.output(u), expected, rtol=1e-11, atol=1e-12)
+    assert np.allclose(model.simulate_output(u), expected, rtol=1e-11, atol=1e-12)
 
 
 def test_residual_tests_tell_white_from_coloured_and_dependent() -> None:
     random = np.random.default_rng(6)
     u, e = random.normal(size=5000), random.normal(size=5000)
-    assert residual_tests(u, e, 6).white
-    assert residual_tests(u, e, 6).independent
+    assert residual_tests(u, e, 6).is_white
+    assert residual_tests(u, e, 6).is_independent
     coloured = e + 0.5 * np.roll(e, 1)
-    assert not residual_tests(u, coloured, 6).white
-    assert not residual_tests(u, e + 0.3 * np.concatenate([[0, 0], np.diff(u)[:-1]]), 6).independent
+    assert not residual_tests(u, coloured, 6).is_white
+    assert not residual_tests(u, e + 0.3 * np.concatenate([[0, 0], np.diff(u)[:-1]]), 6).is_independent
 
 
 def test_a_slow_sine_is_too_little_for_dynamics() -> None:

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtloop.design.identification.hysteresis.creep import creep_explains
+from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
-from rtloop.design.identification.hysteresis.thresholds import placed_thresholds
-from rtloop.design.identification.identified import feedforward_of, feedforward_section
-from rtloop.design.identification.measured import Measured, UnsuitableData, distinct, require_usable
+from rtloop.design.identification.hysteresis.thresholds import place_thresholds
+from rtloop.design.identification.identified import feedforward_section, parse_feedforward
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData, distinct, require_usable
 from rtloop.hil.stages.hysteresis import THRESHOLDS_V
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
@@ -25,11 +25,11 @@ from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
 DRIVES = st.lists(st.floats(-10, 10), min_size=1, max_size=60)
 
 
-def run_of(drive: np.ndarray, position: np.ndarray) -> Measured:
-    return Measured("made", SLOW_S, drive, position, position, True, "", "")
+def run_of(drive: np.ndarray, position: np.ndarray) -> AxisRecording:
+    return AxisRecording("made", SLOW_S, drive, position, position, True, "", "")
 
 
-def made_of(model: PlayModel, drive: np.ndarray, offset: float = 0.0) -> Measured:
+def made_of(model: PlayModel, drive: np.ndarray, offset: float = 0.0) -> AxisRecording:
     """A recording without noise or dynamics: a tick's position was measured before its drive was written."""
     return run_of(drive, offset + np.concatenate([[0.0], model_output(model, drive)[:-1]]))
 
@@ -54,7 +54,7 @@ def test_turning_points_alternate_and_leave_no_turn_out(drive: list[float]) -> N
 
 
 def test_chebyshev_thresholds_of_ten_volts_are_those_of_eq_4() -> None:
-    assert np.abs(placed_thresholds(15, 10.0, "chebyshev") - THRESHOLDS_V).max() < 0.05
+    assert np.abs(place_thresholds(15, 10.0, "chebyshev") - THRESHOLDS_V).max() < 0.05
 
 
 def test_h_over_h_of_eq_4() -> None:
@@ -85,7 +85,7 @@ def test_a_drawn_rig_is_found_within_one_percent_of_its_range(seed: int, placeme
     error = np.abs(model_output(fit.model, drive) - truth).max() / np.ptp(truth)
     print(f"seed {seed}, {placement}: error {100 * error:.3f} % of range")
     assert error <= 0.01
-    assert fit.invertible
+    assert fit.is_invertible
     assert fit.offsets_um[0] == pytest.approx(rig.options.plant.sensor.offset_um, abs=0.05)
     assert fit.model_loop.percent == pytest.approx(fit.measured_loop.percent, abs=0.5)
 
@@ -102,7 +102,7 @@ def test_weights_that_no_inverse_has_are_found_free_and_kept_invertible_on_reque
     runs, given_v = [made_of(true, slow_sine())], true.thresholds.tolist()
     free = identify_hysteresis(runs, thresholds_v=given_v, weights="free")
     assert np.allclose(free.model.weights, true.weights)
-    assert not free.invertible
+    assert not free.is_invertible
     with pytest.raises(UnsuitableData, match=r"every partial sum must be above 0.*invertible"):
         feedforward_section(free.model, [])
     kept = identify_hysteresis(runs, thresholds_v=given_v)
@@ -112,7 +112,7 @@ def test_weights_that_no_inverse_has_are_found_free_and_kept_invertible_on_reque
 
 def test_a_section_reads_back_to_the_same_bits() -> None:
     fit = identify_hysteresis([made_of(EQ_4, slow_sine())])
-    options = feedforward_of(feedforward_section(fit.model, ["from here"]), "made")
+    options = parse_feedforward(feedforward_section(fit.model, ["from here"]), "made")
     assert options.thresholds_v == tuple(fit.model.thresholds.tolist())
     assert options.weights_um_per_v == tuple(fit.model.weights.tolist())
 
@@ -168,7 +168,7 @@ def test_options_that_cannot_be_are_named() -> None:
     with pytest.raises(ValueError, match="placement: 'random'; allowed are auto, chebyshev, chebyshev-from-0, uniform"):
         identify_hysteresis([run_of(np.zeros(9), np.zeros(9))], placement="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="number of operators: 65; 1 to 64"):
-        placed_thresholds(65, 10.0, "uniform")
+        place_thresholds(65, 10.0, "uniform")
 
 
 @pytest.mark.parametrize("dead_band_v", [0.0, 0.1])
@@ -211,9 +211,9 @@ def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(trut
     """Half a micrometre per volt, with a lag of a second and a half in 25 s; noise of a nanometre."""
     drive = slow_sine(9.0)[::15]
     position = truth(drive) + 1e-3 * np.random.default_rng(3).normal(size=drive.size)
-    run = Measured("made", 15 * SLOW_S, drive, np.append(0.0, position[:-1]), position, True, "", "")
+    run = AxisRecording("made", 15 * SLOW_S, drive, np.append(0.0, position[:-1]), position, True, "", "")
     assert unexplained_um([run], identify_hysteresis([run])) > 0
-    assert creep_explains(run) == creeps
+    assert is_creep_likely(run) == creeps
 
 
 def test_a_copy_of_a_recording_is_no_independent_evidence() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from rtloop.design.identification.dynamics.identify_in_loop import identified_dynamics, identify_in_loop
-from rtloop.design.identification.dynamics.instrumental import Instrumented, whitening_of
-from rtloop.design.identification.dynamics.nested_models import Search
-from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
+from rtloop.design.identification.dynamics.identify_in_loop import identify_in_loop, identify_recorded_dynamics
+from rtloop.design.identification.dynamics.instrumental import InstrumentedRecording, fit_whitening
+from rtloop.design.identification.dynamics.nested_models import ModelSearch
+from rtloop.design.identification.dynamics.outside import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.measured import UnsuitableData
 from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
 from tests.design.loop_bound import bounds_percent
@@ -39,7 +39,7 @@ def test_order_delay_and_modes_of_a_drawn_loop_are_found() -> None:
     random = np.random.default_rng(5)
     loop = drawn_loop(random)
     noise = coloured(random, SAMPLES, loop.modes[0][0], 0.05)
-    fit = identified_dynamics(inside(loop, motion("sweep", random, SAMPLES, 6.0), noise), largest_order=6)
+    fit = identify_recorded_dynamics(inside(loop, motion("sweep", random, SAMPLES, 6.0), noise), largest_order=6)
     assert (fit.model.order, fit.delay_ticks) == (4, loop.delay_ticks)
     assert fit.method.startswith("refined instrumental variables")
     for mode, (hz, damping, _) in zip(fit.modes, loop.modes, strict=True):
@@ -82,17 +82,17 @@ def test_a_light_mode_is_found_first_beside_all_that_is_slow() -> None:
     noise = coloured(random, samples, loop.modes[0][0] * random.uniform(0.9, 1.1), 0.05)
     command = loop.in_loop(motion("steps", random, samples, 20.0), 0 * noise)["command_um"]
     position = loop.open(command, noise)["position_um"]
-    run = from_rest(LoopExcitation("drawn", command, position, PERIOD_S, command[np.newaxis]))
-    left = run.position_um - from_outside(replace(run, input=run.position_um))
-    found = Search(Instrumented(run, run.input), whitening_of(left, 4)).grown(None, loop.delay_ticks, 2)
+    run = shift_to_zero(LoopExcitation("drawn", command, position, PERIOD_S, command[np.newaxis]))
+    left = run.position_um - driven_input(replace(run, input=run.position_um))
+    found = ModelSearch(InstrumentedRecording(run, run.input), fit_whitening(left, 4)).grow(None, loop.delay_ticks, 2)
     assert abs(found[0].model.rates[0]) / 2 / np.pi == pytest.approx(loop.modes[0][0], rel=0.005)
 
 
 def test_noise_is_whitened_by_the_autoregression_that_made_it() -> None:
     made = np.array([1.0, -1.6, 0.9])
     noise = np.asarray(lfilter([1.0], made, np.random.default_rng(1).normal(size=50_000)))
-    assert whitening_of(noise)[:3] == pytest.approx(made, abs=0.02)
-    assert np.count_nonzero(whitening_of(noise, 1)) == 2
+    assert fit_whitening(noise)[:3] == pytest.approx(made, abs=0.02)
+    assert np.count_nonzero(fit_whitening(noise, 1)) == 2
 
 
 def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
@@ -101,7 +101,7 @@ def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
     noise = coloured(random, SAMPLES, 640.0, 0.1)
     run = inside(loop, reference, noise)
     clean = loop.in_loop(reference, np.zeros(SAMPLES))["command_um"]
-    driven = from_outside(run)
+    driven = driven_input(run)
     assert np.corrcoef(driven, clean)[0, 1] > 0.98
     assert np.corrcoef(run.input, clean)[0, 1] < 0.9
 
@@ -123,4 +123,4 @@ def test_what_is_not_enough_is_refused(reference, samples: int, says: str) -> No
 def test_a_closed_loops_order_is_chosen_on_what_is_held_out_alone() -> None:
     run = inside(one_mode(), np.zeros(4000), np.zeros(4000))
     with pytest.raises(ValueError, match="criterion 'aic'"):
-        identified_dynamics(run, criterion="aic")
+        identify_recorded_dynamics(run, criterion="aic")

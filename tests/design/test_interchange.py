@@ -11,12 +11,12 @@ from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.interchange import from_control, to_control
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.errors import MissingExtra
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 HZ = np.geomspace(0.1, 4900, 100)
 S = 2j * np.pi * HZ
-RUNNING = discretise(PAPER_C, 1e-4)
+RUNNING = discretise_controller(PAPER_C, 1e-4)
 GAIN, INTEGRATOR = Transfer.from_zpk([], [], 3.0), Transfer.from_zpk([], [0.0], 2.0)
 
 
@@ -59,7 +59,7 @@ def test_a_measured_response_goes_out_and_comes_back() -> None:
     back = from_control(there)
     assert back.hz == pytest.approx(HZ, rel=1e-15)
     assert back.response.tobytes() == measured.response.tobytes()
-    assert back.trusted.all()
+    assert back.is_trusted.all()
 
 
 @pytest.mark.parametrize(

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import loop_margins
 from rtloop.design.synthesis.specification import (
     CommandOptions,
     DisturbanceOptions,
     SensorOptions,
     SpecificationOptions,
 )
-from rtloop.design.verification.judgement import described, limits, specified
-from rtloop.design.verification.robustness import shift_tolerated, worst_of
-from rtloop.linear.discretise import discretise
+from rtloop.design.verification.judgement import loop_quantities, required_limits, specified_quantities
+from rtloop.design.verification.robustness import tolerated_shift, worst_values
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S, POLE, GAIN = 1e-3, 200.0, 3.0
@@ -43,12 +43,12 @@ PROPORTIONAL = Transfer.from_zpk([], [], GAIN)
     ],
 )  # fmt: skip
 def test_a_limit_has_a_direction(asked: SpecificationOptions, name: str, good: float, bad: float) -> None:
-    (found,) = limits(asked).items()
+    (found,) = required_limits(asked).items()
     assert found[0] == name
-    assert found[1].met(good)
-    assert found[1].met(found[1].value)
-    assert not found[1].met(bad)
-    assert not found[1].met(math.nan)
+    assert found[1].is_met_by(good)
+    assert found[1].is_met_by(found[1].value)
+    assert not found[1].is_met_by(bad)
+    assert not found[1].is_met_by(math.nan)
 
 
 OMEGA, ZETA = 2 * math.pi * 90.0, 0.02
@@ -59,9 +59,9 @@ def test_the_slowest_mode_near_the_resonance_in_closed_form() -> None:
     """P-control K of ω²/(s² + 2ζωs + ω²) leaves −ζω and moves the frequency to ω√(1 + K): near up to 1.85 ω."""
     for gain, found in ((0.5, 1e3 / (ZETA * OMEGA)), (2.3, 1e3 / (ZETA * OMEGA)), (2.6, 0.0)):
         loop = continuous_loop(Transfer.from_zpk([], [], gain), RESONANT)
-        values = specified(loop, SpecificationOptions(), OMEGA)
+        values = specified_quantities(loop, SpecificationOptions(), OMEGA)
         assert values["resonance_decay_ms"] == pytest.approx(found)
-    assert "resonance_decay_ms" not in specified(loop, SpecificationOptions())
+    assert "resonance_decay_ms" not in specified_quantities(loop, SpecificationOptions())
 
 
 def test_the_modulus_margin_is_the_least_distance_from_minus_one() -> None:
@@ -69,21 +69,27 @@ def test_the_modulus_margin_is_the_least_distance_from_minus_one() -> None:
     loop = continuous_loop(Transfer.from_factors(80.0, [], [[1, 0]]), Transfer.from_factors(1, [], [[0.01, 1]]))
     s = 1j * np.geomspace(1, 1e4, 200_001)
     distance = np.abs(1 + 80.0 / (s * (0.01 * s + 1))).min()
-    assert specified(loop, SpecificationOptions(modulus_margin=0.5))["modulus_margin"] == pytest.approx(distance)
+    assert specified_quantities(loop, SpecificationOptions(modulus_margin=0.5))["modulus_margin"] == pytest.approx(
+        distance
+    )
 
 
 def test_the_worst_of_several_plants_is_named() -> None:
     """A lag under integral control: twice the gain overshoots most and has the most bandwidth, half is the slowest."""
-    controller = discretise(Transfer.from_factors(60.0, [], [[1, 0]]), PERIOD_S)
+    controller = discretise_controller(Transfer.from_factors(60.0, [], [[1, 0]]), PERIOD_S)
     plants = [(name, Transfer(PLANT.zeros, PLANT.poles, factor * PLANT.gain), 0)
               for name, factor in (("as it is", 1.0), ("twice", 2.0), ("half", 0.5))]  # fmt: skip
-    found = worst_of(lambda plant, ticks: discrete_loop(controller, plant, ticks), plants, SpecificationOptions(), None)
+    found = worst_values(
+        lambda plant, ticks: discrete_loop(controller, plant, ticks), plants, SpecificationOptions(), None
+    )
     assert found["overshoot_percent"].plant == "twice"
     assert found["bandwidth_hz"].plant == "half"
     assert found["settling_ms"].plant == "half"
     assert found["settling_ms"].value == pytest.approx(1e3 * 3 / 30, rel=0.2)
     lost = [*plants, ("wild", Transfer(PLANT.zeros, PLANT.poles, 100 * PLANT.gain), 0)]
-    found = worst_of(lambda plant, ticks: discrete_loop(controller, plant, ticks), lost, SpecificationOptions(), None)
+    found = worst_values(
+        lambda plant, ticks: discrete_loop(controller, plant, ticks), lost, SpecificationOptions(), None
+    )
     assert {one.plant for one in found.values()} == {"wild"}
     assert all(math.isnan(one.value) for one in found.values())
 
@@ -92,16 +98,16 @@ def test_the_smaller_end_of_the_shift_counts() -> None:
     """Integral control K/s of a resonance is stable while K < 2ζω′: a shift of p % with ζ kept moves that by p %."""
     gain = 0.93 * 2 * ZETA * OMEGA
     controller = Transfer.from_factors(gain, [], [[1, 0]])
-    assert shift_tolerated(lambda plant: continuous_loop(controller, plant), RESONANT) == pytest.approx(7.0, abs=1e-3)
-    assert shift_tolerated(lambda plant: continuous_loop(controller, plant), PLANT) == math.inf
+    assert tolerated_shift(lambda plant: continuous_loop(controller, plant), RESONANT) == pytest.approx(7.0, abs=1e-3)
+    assert tolerated_shift(lambda plant: continuous_loop(controller, plant), PLANT) == math.inf
 
 
 def test_noise_of_the_sensor_in_position_and_command() -> None:
     """x⁺ = a x − b K (x + n): var x = (b K)² σ²/(1 − (a − b K)²), and v = −K (x + n) holds the noise itself."""
     sigma_nm, a = 10.0, math.exp(-POLE * PERIOD_S)
     b = 1 - a
-    loop = discrete_loop(discretise(PROPORTIONAL, PERIOD_S), PLANT)
-    found = described(loop, SensorOptions(noise_um=1e-3 * sigma_nm))
+    loop = discrete_loop(discretise_controller(PROPORTIONAL, PERIOD_S), PLANT)
+    found = loop_quantities(loop, SensorOptions(noise_um=1e-3 * sigma_nm))
     variance_x = (b * GAIN * sigma_nm) ** 2 / (1 - (a - b * GAIN) ** 2)
     assert found["noise_x_nm"] == pytest.approx(math.sqrt(variance_x))
     assert found["noise_v_nm"] == pytest.approx(GAIN * math.sqrt(variance_x + sigma_nm**2))
@@ -111,8 +117,12 @@ def test_noise_of_the_sensor_in_position_and_command() -> None:
 def test_a_gain_margin_may_lie_at_0_hz(held: bool) -> None:
     """L(0) = −0.4 is the nearest that L comes to −1: 2.5 times the gain, and a real pole is on its way out."""
     wrong_sign = Transfer.from_zpk([], [], -0.4)
-    loop = discrete_loop(discretise(wrong_sign, PERIOD_S), PLANT) if held else continuous_loop(wrong_sign, PLANT)
-    found = margins(loop)
+    loop = (
+        discrete_loop(discretise_controller(wrong_sign, PERIOD_S), PLANT)
+        if held
+        else continuous_loop(wrong_sign, PLANT)
+    )
+    found = loop_margins(loop)
     assert found.gain_margin == pytest.approx(2.5)
     assert found.gain_margin_hz == 0.0
     for gain, stable in ((0.4 * 2.49, True), (0.4 * 2.51, False)):

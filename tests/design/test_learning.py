@@ -9,9 +9,9 @@ import pytest
 from scipy import signal
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
-from rtloop.analysis.learning import LARGEST_CONTRACTION, learning
+from rtloop.analysis.learning import LARGEST_CONTRACTION, learning_gains
 from rtloop.analysis.reference import ReferencePath
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S, TICKS, SETTLED = 1e-4, 200, 40
@@ -31,7 +31,7 @@ def controller(gain: float) -> tuple[list[float], list[float]]:
 
 def loop(hz: float, gain: float) -> Loop:
     path = ReferencePath(TAPS, COMMAND_TAPS)
-    c = discretise(Transfer.from_transfer_function(*controller(gain)), PERIOD_S, "tustin")
+    c = discretise_controller(Transfer.from_transfer_function(*controller(gain)), PERIOD_S, "tustin")
     return discrete_loop(c, Transfer.from_transfer_function(*plant(hz)), 0, path)
 
 
@@ -54,13 +54,13 @@ def played(hz: float, gain: float, table: np.ndarray) -> np.ndarray:
 def test_the_error_shrinks_as_promised_wherever_the_resonance_is(truth_hz):
     """Each harmonic's error falls at least by the contraction; the whole to little more than what is not learned."""
     loops = [(f"{hz:g} Hz", loop(hz, 20.0)) for hz in (600.0, 570.0, 630.0)]
-    found = learning(loops, TICKS)
+    found = learning_gains(loops, TICKS)
     table, sizes = np.column_stack([WANTED_UM, 0 * WANTED_UM]), []
     for _ in range(4):
         error = WANTED_UM - played(truth_hz, 20.0, table)
         sizes.append(np.abs(np.fft.rfft(error)))
-        table = found.improved(table, error)
-    learned = found.learned
+        table = found.improve(table, error)
+    learned = found.is_learned
     assert learned[:10].all()
     assert not learned.all()
     for before, after in pairwise(sizes):
@@ -71,18 +71,18 @@ def test_the_error_shrinks_as_promised_wherever_the_resonance_is(truth_hz):
 
 def test_what_does_not_shrink_is_not_learned():
     """A plant that may answer with either sign at its second harmonic."""
-    found = learning([(f"{hz:g} Hz", loop(hz, 5.0)) for hz in (90.0, 110.0, 400.0)], TICKS)
-    assert found.learned[1]
-    assert np.all(found.contraction[~found.learned] >= LARGEST_CONTRACTION)
-    assert not found.learned.all()
+    found = learning_gains([(f"{hz:g} Hz", loop(hz, 5.0)) for hz in (90.0, 110.0, 400.0)], TICKS)
+    assert found.is_learned[1]
+    assert np.all(found.contraction[~found.is_learned] >= LARGEST_CONTRACTION)
+    assert not found.is_learned.all()
 
 
 def test_a_loop_that_is_unstable_somewhere_is_named():
     with pytest.raises(ValueError, match=r"resonance \+5 %: the loop is unstable there"):
-        learning([("resonance +0 %", loop(600.0, 20.0)), ("resonance +5 %", loop(600.0, 2000.0))], TICKS)
+        learning_gains([("resonance +0 %", loop(600.0, 20.0)), ("resonance +5 %", loop(600.0, 2000.0))], TICKS)
 
 
 def test_a_period_whose_error_would_not_shrink_is_refused():
     """Resonances far below and far above the scan: the answer has either sign, whatever the table."""
     with pytest.raises(ValueError, match=r"leaves \d.* of the error at 50 Hz; less than 0\.8 is needed"):
-        learning([("low", loop(20.0, 0.001)), ("high", loop(600.0, 0.001))], TICKS)
+        learning_gains([("low", loop(20.0, 0.001)), ("high", loop(600.0, 0.001))], TICKS)

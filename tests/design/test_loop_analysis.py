@@ -13,10 +13,10 @@ from rtloop.analysis.loop_analysis import (
     analyse_continuous,
     analyse_discrete,
 )
-from rtloop.analysis.perturbation import changes, maker, until_unstable, with_resonance_shifted
+from rtloop.analysis.perturbation import loop_builder, plant_changes, shift_resonance, stability_range
 from rtloop.analysis.step_response import step_response
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 T = 1e-4
@@ -57,15 +57,17 @@ def test_step_overshoot_of_d_eq_5() -> None:
 
 def test_resonance_shift_tolerated_by_the_paper() -> None:
     """Continuous: −3.9 … +2.4 %. Sampled with delay the loop is narrower upwards."""
-    assert until_unstable(maker(PAPER_C), PAPER_D, changes(PAPER_D)["resonance"]) == pytest.approx((3.9, 2.4), abs=0.05)
-    controller = discretise(PAPER_C, T, "matched")
+    assert stability_range(loop_builder(PAPER_C), PAPER_D, plant_changes(PAPER_D)["resonance"]) == pytest.approx(
+        (3.9, 2.4), abs=0.05
+    )
+    controller = discretise_controller(PAPER_C, T, "matched")
     for ticks in (0, 1, 2):
-        down, up = until_unstable(maker(controller, ticks), PAPER_D, changes(PAPER_D)["resonance"])
+        down, up = stability_range(loop_builder(controller, ticks), PAPER_D, plant_changes(PAPER_D)["resonance"])
         assert up < 2.0
         assert down > 5.0
-        assert analyse_discrete(controller, with_resonance_shifted(PAPER_D, up - 0.01), ticks).stable
-        assert not analyse_discrete(controller, with_resonance_shifted(PAPER_D, up + 0.01), ticks).stable
-        assert not analyse_discrete(controller, with_resonance_shifted(PAPER_D, -down - 0.01), ticks).stable
+        assert analyse_discrete(controller, shift_resonance(PAPER_D, up - 0.01), ticks).stable
+        assert not analyse_discrete(controller, shift_resonance(PAPER_D, up + 0.01), ticks).stable
+        assert not analyse_discrete(controller, shift_resonance(PAPER_D, -down - 0.01), ticks).stable
 
 
 @pytest.mark.parametrize(
@@ -79,13 +81,13 @@ def test_resonance_shift_tolerated_by_the_paper() -> None:
 )
 def test_sensitivity_peak_as_it_runs(method, prewarp_hz, none, one) -> None:
     """max|S| of eqs (5) and (20) at 10 kHz with 0 and 1 samples of delay, computed independently."""
-    controller = discretise(PAPER_C, T, method, prewarp_hz)
+    controller = discretise_controller(PAPER_C, T, method, prewarp_hz)
     assert analyse_discrete(controller, PAPER_D, 0).max_sensitivity == pytest.approx(none, abs=1e-3)
     assert analyse_discrete(controller, PAPER_D, 1).max_sensitivity == pytest.approx(one, abs=1e-3)
 
 
 def test_static_values_survive_sampling() -> None:
-    analysis = analyse_discrete(discretise(PAPER_C, T, "matched"), PAPER_D, 1)
+    analysis = analyse_discrete(discretise_controller(PAPER_C, T, "matched"), PAPER_D, 1)
     assert analysis.stable
     assert analysis.max_abs_pole < 1
     assert math.isnan(analysis.max_re_pole)
@@ -106,7 +108,7 @@ def test_discrete_step_equals_a_simulation_tick_by_tick() -> None:
         integral += 1e-3 * error
         queue.append(commands[-1])
         x = ad @ x + bd * queue.pop(0)
-    loop = discrete_loop(discretise(Transfer.from_factors(2, [], [[1, 0]]), 1e-3, "tustin"),
+    loop = discrete_loop(discretise_controller(Transfer.from_factors(2, [], [[1, 0]]), 1e-3, "tustin"),
                          Transfer.from_factors(9e4, [], [[1, 40, 9e4]]), 2)  # fmt: skip
     response = step_response(loop, 0.199)
     assert response.position[::POINTS] == pytest.approx(positions, abs=1e-12)
@@ -150,21 +152,21 @@ def test_gain_margin_of_a_conditionally_stable_loop() -> None:
 def test_gain_margin_at_half_the_sampling_rate() -> None:
     """x⁺ = x + k T e is stable for k T < 2, and reaches −1 at z = −1."""
     integrator = Transfer.from_factors(1, [], [[1, 0]])
-    analysis = analyse_discrete(discretise(Transfer.from_zpk([], [], 500.0), 1e-3), integrator)
+    analysis = analyse_discrete(discretise_controller(Transfer.from_zpk([], [], 500.0), 1e-3), integrator)
     assert analysis.gain_margin == pytest.approx(4.0)
     assert analysis.gain_margin_hz == pytest.approx(500)
     assert analysis.max_abs_pole == pytest.approx(0.5)
 
 
 def test_unstable_loop_is_reported_not_raised() -> None:
-    analysis = analyse_continuous(PAPER_C, with_resonance_shifted(PAPER_D, 5.0))
+    analysis = analyse_continuous(PAPER_C, shift_resonance(PAPER_D, 5.0))
     assert not analysis.stable
     assert analysis.max_re_pole > 0
     assert math.isnan(analysis.settling_time_s)
     assert math.isnan(analysis.peak_command)
     assert json.loads(json.dumps(analysis.as_dict(), allow_nan=False))["settling_time_s"] is None
-    shifted = with_resonance_shifted(PAPER_D, 5.0)
-    assert until_unstable(maker(PAPER_C), shifted, changes(shifted)["resonance"]) == (0.0, 0.0)
+    shifted = shift_resonance(PAPER_D, 5.0)
+    assert stability_range(loop_builder(PAPER_C), shifted, plant_changes(shifted)["resonance"]) == (0.0, 0.0)
 
 
 def test_undamped_plant_can_be_looked_at() -> None:
@@ -176,17 +178,17 @@ def test_undamped_plant_can_be_looked_at() -> None:
 
 
 def test_shifted_resonance_keeps_damping_and_static_gain() -> None:
-    moved = with_resonance_shifted(PAPER_D, 2.0)
+    moved = shift_resonance(PAPER_D, 2.0)
     assert moved.dc_gain == pytest.approx(PAPER_D.dc_gain)
     sizes = np.abs(PAPER_D.poles)
     lightest = np.argmin(np.abs(PAPER_D.poles + 27.5 - 3741.5j))
     assert np.min(np.abs(moved.poles - 1.02 * PAPER_D.poles[lightest])) < 1e-9 * sizes[lightest]
     with pytest.raises(ValueError, match="no complex poles"):
-        with_resonance_shifted(Transfer.from_zpk([], [-1], 1), 1.0)
+        shift_resonance(Transfer.from_zpk([], [-1], 1), 1.0)
 
 
 def test_refusals() -> None:
     with pytest.raises(ValueError, match="direct feedthrough"):
         analyse_continuous(PAPER_C, PAPER_C)
     with pytest.raises(ValueError, match="delay_ticks: -1"):
-        analyse_discrete(discretise(PAPER_C, T), PAPER_D, -1)
+        analyse_discrete(discretise_controller(PAPER_C, T), PAPER_D, -1)

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from rtloop.analysis.measured import excitation
-from rtloop.analysis.measured.measurement import Measurement, measurement
-from rtloop.analysis.measured.mode import light_mode
-from rtloop.analysis.measured.multisine import Grid, flattened, grid, played
-from rtloop.analysis.measured.recorded import periodic_part
-from rtloop.analysis.measured.response import Signals, response
+from rtloop.analysis.measured.measurement import LoopMeasurement, measure_loop
+from rtloop.analysis.measured.mode import fit_light_mode
+from rtloop.analysis.measured.multisine import LineGrid, excitation_sequence, low_crest_amplitudes, make_grid
+from rtloop.analysis.measured.recorded import find_periodic_part
+from rtloop.analysis.measured.response import PeriodSignals, measure_response
 from tests.design.measured_loops import RATE_HZ, TrueLoop
 
 AMPLITUDE_UM, FADE = 0.5, 500
@@ -26,23 +26,23 @@ LOOPS = (
 )
 
 
-def whole(lines: Grid, found: dict[str, np.ndarray], periods: int) -> Signals:
+def whole(lines: LineGrid, found: dict[str, np.ndarray], periods: int) -> PeriodSignals:
     parts = (found[name][lines.samples : (periods + 1) * lines.samples].reshape(periods, -1)
              for name in ("error_um", "command_um", "position_um"))  # fmt: skip
-    return Signals(*parts)
+    return PeriodSignals(*parts)
 
 
-def measured(loop: TrueLoop, near_hz: float, periods: int = 4, seed: int = 0) -> tuple[Measurement, float]:
+def measured(loop: TrueLoop, near_hz: float, periods: int = 4, seed: int = 0) -> tuple[LoopMeasurement, float]:
     """As a service does it; and how far the true position went, in any of the runs."""
-    lines = grid(RATE_HZ, 1.0, 2.0, 4400.0, near_hz)
-    period, furthest = excitation.first(lines, AMPLITUDE_UM), 0.0
-    found = loop.run(played(period, 2, 0.0, FADE), seed)
-    for aim in excitation.AIMS:
+    lines = make_grid(RATE_HZ, 1.0, 2.0, 4400.0, near_hz)
+    period, furthest = excitation.first_period(lines, AMPLITUDE_UM), 0.0
+    found = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed)
+    for aim in excitation.AMPLITUDE_RATIOS:
         furthest = max(furthest, float(np.abs(found["true_um"]).max()))
-        period = excitation.shaped(lines, period, whole(lines, found, 2), AMPLITUDE_UM, aim)
-        count = periods if aim == excitation.AIMS[-1] else 2
-        found = loop.run(played(period, count, 0.0, FADE), seed + 1)
-    return measurement(found, RATE_HZ, near_hz), max(furthest, float(np.abs(found["true_um"]).max()))
+        period = excitation.shape_period(lines, period, whole(lines, found, 2), AMPLITUDE_UM, aim)
+        count = periods if aim == excitation.AMPLITUDE_RATIOS[-1] else 2
+        found = loop.run(excitation_sequence(period, count, 0.0, FADE), seed + 1)
+    return measure_loop(found, RATE_HZ, near_hz), max(furthest, float(np.abs(found["true_um"]).max()))
 
 
 @pytest.mark.parametrize("loop", LOOPS, ids=lambda loop: f"{loop.hz:g} Hz, delay {loop.delay_ticks}")
@@ -69,15 +69,15 @@ def test_a_shifted_resonance_is_found(shift: float, noise_um: float) -> None:
 
 def test_standard_deviations_are_those_of_repeated_measurements() -> None:
     loop = TrueLoop(595.5, 0.007, 1, 40.0)
-    lines = grid(RATE_HZ, 0.5, 4.0, 4400.0, 595.5)
-    period = excitation.fitting(lines, *_answers(loop, lines), AMPLITUDE_UM)
-    reference = played(period, 3, 0.0, FADE)
+    lines = make_grid(RATE_HZ, 0.5, 4.0, 4400.0, 595.5)
+    period = excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM)
+    reference = excitation_sequence(period, 3, 0.0, FADE)
     errors, squares = [], []
     for seed in range(20):
-        found = response(lines, whole(lines, loop.run(reference, seed), 3))
+        found = measure_response(lines, whole(lines, loop.run(reference, seed), 3))
         true = loop.open(lines.hz)
         squares.append(np.abs(found.plant * found.controller / true - 1) ** 2 / found.spread**2)
-        mode = light_mode(found, RATE_HZ, 595.5)
+        mode = fit_light_mode(found, RATE_HZ, 595.5)
         assert mode is not None
         errors.append((mode.hz - loop.hz) / mode.hz_std)
     known = np.mean(squares, axis=0)[lines.hz < 1000]
@@ -88,19 +88,19 @@ def test_standard_deviations_are_those_of_repeated_measurements() -> None:
 def test_a_margin_says_how_far_off_it_is_where_the_light_mode_decides_it() -> None:
     """Between the lines about the mode, a margin is no more certain than the mode's frequency and damping."""
     loop = TrueLoop(150.0, 0.02, 0, 20.0)
-    lines = grid(RATE_HZ, 1.0, 2.0, 4400.0, loop.hz)
-    period = excitation.first(lines, AMPLITUDE_UM)
-    for aim in excitation.AIMS:
-        before = loop.run(played(period, 2, 0.0, FADE), seed=99)
-        period = excitation.shaped(lines, period, whole(lines, before, 2), AMPLITUDE_UM, aim)
-    reference, true = played(period, 4, 0.0, FADE), loop.margins(lines.hz[0], lines.hz[-1])
-    found = [measurement(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
+    lines = make_grid(RATE_HZ, 1.0, 2.0, 4400.0, loop.hz)
+    period = excitation.first_period(lines, AMPLITUDE_UM)
+    for aim in excitation.AMPLITUDE_RATIOS:
+        before = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed=99)
+        period = excitation.shape_period(lines, period, whole(lines, before, 2), AMPLITUDE_UM, aim)
+    reference, true = excitation_sequence(period, 4, 0.0, FADE), loop.margins(lines.hz[0], lines.hz[-1])
+    found = [measure_loop(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
     for name in ("gain_margin", "modulus_margin"):
         off = [(getattr(one, name).value - true[name]) / getattr(one, name).std for one in found]
         assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.7  # without the mode's own uncertainty: 2.3
 
 
-def _answers(loop: TrueLoop, lines: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _answers(loop: TrueLoop, lines: LineGrid) -> tuple[np.ndarray, np.ndarray]:
     """Position and command per reference."""
     opened = loop.open(lines.hz)
     z = np.exp(2j * np.pi * lines.hz / RATE_HZ)
@@ -110,10 +110,10 @@ def _answers(loop: TrueLoop, lines: Grid) -> tuple[np.ndarray, np.ndarray]:
 def test_what_is_not_linear_is_told_from_noise() -> None:
     """A command that is bent repeats itself from period to period: differences between them show nothing of it."""
     loop = TrueLoop(595.5, 0.02, 0, 40.0, noise_um=1e-4)
-    lines = grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
-    reference = played(excitation.fitting(lines, *_answers(loop, lines), AMPLITUDE_UM), 2, 0.0, FADE)
-    straight = response(lines, whole(lines, loop.run(reference), 2))
-    bent = response(lines, whole(lines, loop.run(reference, bend=lambda v: v + 5.0 * v**2), 2))
+    lines = make_grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
+    reference = excitation_sequence(excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM), 2, 0.0, FADE)
+    straight = measure_response(lines, whole(lines, loop.run(reference), 2))
+    bent = measure_response(lines, whole(lines, loop.run(reference, bend=lambda v: v + 5.0 * v**2), 2))
     assert np.median(straight.spread / straight.spread_of_noise) < 2
     assert np.median(bent.spread / bent.spread_of_noise) > 10
 
@@ -129,12 +129,12 @@ def test_where_nothing_stands_out_there_is_no_light_mode() -> None:
     near=st.one_of(st.none(), st.floats(100, 800)),
 )  # fmt: skip
 def test_lines_are_odd_and_some_are_silent(period_s: float, from_hz: float, octaves: float, near: float | None) -> None:
-    lines = grid(RATE_HZ, period_s, from_hz, from_hz * 2**octaves, near)
+    lines = make_grid(RATE_HZ, period_s, from_hz, from_hz * 2**octaves, near)
     assert np.all(lines.excited % 2 == 1)
     assert not set(lines.excited) & set(lines.silent)
     assert lines.hz[0] >= from_hz - 1e-9
     assert lines.hz[-1] <= from_hz * 2**octaves + 1e-9
-    wave = lines.waveform(flattened(lines, np.ones(lines.excited.size)))
+    wave = lines.waveform(low_crest_amplitudes(lines, np.ones(lines.excited.size)))
     assert np.abs(lines.amplitudes(wave)) == pytest.approx(np.ones(lines.excited.size))
     assert np.abs(np.fft.rfft(wave)[lines.silent]).max() < 1e-9 * lines.samples
 
@@ -142,24 +142,26 @@ def test_lines_are_odd_and_some_are_silent(period_s: float, from_hz: float, octa
 @pytest.mark.parametrize(("from_hz", "to_hz"), [(0.0, 100.0), (100.0, 50.0), (10.0, 4501.0), (10.0, 12.0)])
 def test_a_band_without_lines_is_refused(from_hz: float, to_hz: float) -> None:
     with pytest.raises(ValueError, match=r"allowed|needed"):
-        grid(RATE_HZ, 0.5, from_hz, to_hz)
+        make_grid(RATE_HZ, 0.5, from_hz, to_hz)
 
 
 def test_what_is_played_begins_gently_and_ends_at_what_was_held() -> None:
-    lines = grid(RATE_HZ, 0.5, 10.0, 1000.0)
-    samples = played(excitation.first(lines, 1.0), 3, 7.0, FADE)
+    lines = make_grid(RATE_HZ, 0.5, 10.0, 1000.0)
+    samples = excitation_sequence(excitation.first_period(lines, 1.0), 3, 7.0, FADE)
     assert abs(samples[0] - 7.0) < 1e-3
     assert samples[-1] == pytest.approx(7.0, abs=1e-12)
-    assert np.abs(np.diff(samples)).max() <= 1.01 * np.abs(np.diff(np.tile(excitation.first(lines, 1.0), 2))).max()
+    assert (
+        np.abs(np.diff(samples)).max() <= 1.01 * np.abs(np.diff(np.tile(excitation.first_period(lines, 1.0), 2))).max()
+    )
 
 
 def test_the_multisine_is_found_in_a_record_from_itself_alone() -> None:
-    lines = grid(RATE_HZ, 0.5, 10.0, 1000.0)
-    small = played(excitation.first(lines, 1.0), 2, 7.0, FADE)
-    large = played(3 * excitation.first(lines, 1.0), 4, 7.0, FADE)
+    lines = make_grid(RATE_HZ, 0.5, 10.0, 1000.0)
+    small = excitation_sequence(excitation.first_period(lines, 1.0), 2, 7.0, FADE)
+    large = excitation_sequence(3 * excitation.first_period(lines, 1.0), 4, 7.0, FADE)
     rest = np.full(3000, 7.0)
     ramp = 7.0 + 0.001 * np.arange(20_000)
-    part = periodic_part(np.concatenate([rest, small, rest, large, rest, ramp]))
+    part = find_periodic_part(np.concatenate([rest, small, rest, large, rest, ramp]))
     assert part is not None
     assert (part.samples, part.periods) == (lines.samples, 4)
     assert part.start == 3000 + small.size + 3000 + lines.samples
@@ -167,8 +169,10 @@ def test_the_multisine_is_found_in_a_record_from_itself_alone() -> None:
 
 
 def test_of_a_multisine_that_begins_at_once_the_first_period_is_left_out() -> None:
-    lines = grid(RATE_HZ, 0.5, 10.0, 1000.0)
-    part = periodic_part(np.concatenate([np.zeros(500), np.tile(excitation.first(lines, 1.0), 4), np.zeros(500)]))
+    lines = make_grid(RATE_HZ, 0.5, 10.0, 1000.0)
+    part = find_periodic_part(
+        np.concatenate([np.zeros(500), np.tile(excitation.first_period(lines, 1.0), 4), np.zeros(500)])
+    )
     assert part is not None
     assert part.periods == 3
     assert part.start in (500 + lines.samples, 501 + lines.samples)
@@ -178,31 +182,31 @@ def test_of_a_multisine_that_begins_at_once_the_first_period_is_left_out() -> No
 def test_a_reference_without_a_multisine_is_refused(reference: np.ndarray) -> None:
     still = dict.fromkeys(("error_um", "command_um", "position_um"), np.zeros(reference.size))
     with pytest.raises(ValueError, match="multisine is needed"):
-        measurement({"reference_um": reference, **still}, RATE_HZ)
+        measure_loop({"reference_um": reference, **still}, RATE_HZ)
 
 
 def test_a_period_with_a_missed_tick_is_left_out() -> None:
     loop = TrueLoop(595.5, 0.02, 0, 40.0)
-    lines = grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
-    found = loop.run(played(excitation.first(lines, 1.0), 4, 0.0, FADE))
+    lines = make_grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
+    found = loop.run(excitation_sequence(excitation.first_period(lines, 1.0), 4, 0.0, FADE))
     missed = np.zeros(found["reference_um"].size)
     missed[round(2.5 * lines.samples)] = 1.0
-    assert measurement({**found, "periods_missed": missed}, RATE_HZ).response.periods == 3
+    assert measure_loop({**found, "periods_missed": missed}, RATE_HZ).response.periods == 3
     missed[lines.samples :: lines.samples] = 1.0
     with pytest.raises(ValueError, match="2 are needed"):
-        measurement({**found, "periods_missed": missed}, RATE_HZ)
+        measure_loop({**found, "periods_missed": missed}, RATE_HZ)
 
 
 def test_what_reaches_the_command_past_the_controller_is_not_the_controllers() -> None:
     """A second row of taps, and a second column: the loop is the same, the error another."""
     loop = TrueLoop(595.5, 0.02, 1, 40.0, noise_um=1e-4)
-    lines = grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
-    reference = played(excitation.fitting(lines, *_answers(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
+    lines = make_grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
+    reference = excitation_sequence(excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
     taps, feed = [0.3, -0.1, 0.05], 0.2 * np.roll(reference, 7)
     past = signal.lfilter(taps, 1.0, reference) + feed
     found = loop.run(reference, past=past)
-    with_it = measurement({**found, "feed_um": feed}, RATE_HZ, 595.5, command_taps=taps)
-    without = measurement(found, RATE_HZ, 595.5)
+    with_it = measure_loop({**found, "feed_um": feed}, RATE_HZ, 595.5, command_taps=taps)
+    without = measure_loop(found, RATE_HZ, 595.5)
     true = loop.open(lines.hz)
     assert np.median(np.abs(with_it.response.plant * with_it.response.controller / true - 1)) < 1e-3
     assert np.median(np.abs(without.response.plant * without.response.controller / true - 1)) > 0.1

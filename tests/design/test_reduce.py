@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.synthesis.reduce import hankel_singular_values, order_for, reduce_order
+from rtloop.design.synthesis.reduce import hankel_singular_values, order_within, reduce_order
 from rtloop.linear.transfer import Transfer
 
 RNG = np.random.default_rng(20)
@@ -113,7 +113,7 @@ def test_glovers_bound_and_what_each_method_keeps(seed, keep, method) -> None:
 
 def test_the_order_follows_from_the_tolerance() -> None:
     hankel = np.array([10.0, 1.0, 0.1, 0.01])
-    assert [order_for(hankel, t) for t in (1.0, 0.2, 0.01, 1e-3, 1e-4, 0.0)] == [0, 1, 2, 3, 4, 4]
+    assert [order_within(hankel, t) for t in (1.0, 0.2, 0.01, 1e-3, 1e-4, 0.0)] == [0, 1, 2, 3, 4, 4]
     assert reduce_order(PAPER_D, tolerance=0.5).transfer.order < reduce_order(PAPER_D, tolerance=1e-3).transfer.order
 
 

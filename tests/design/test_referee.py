@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import loop_margins
 from rtloop.design.interchange import from_control, to_control
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.synthesis.hinf.augment import Matrices, augmented
+from rtloop.design.synthesis.hinf.augment import Matrices, augment
 from rtloop.design.synthesis.hinf.norm import hinf_norm
 from rtloop.design.synthesis.hinf.solver import synthesise_hinf
 from rtloop.design.synthesis.reduce import reduce_order
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS
-from rtloop.linear.discretise import discretise, discretised
+from rtloop.linear.discretise import discretise_controller, discretise_transfer
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S = 1e-4
@@ -41,7 +41,7 @@ def summary(system: control.StateSpace) -> tuple[float, float, float, float]:
 
 
 def ours(loop) -> tuple[float, float, float, float]:
-    found = margins(loop)
+    found = loop_margins(loop)
     return found.crossover_hz, found.phase_margin_deg, found.gain_margin, found.max_sensitivity
 
 
@@ -53,7 +53,7 @@ def test_the_papers_margins() -> None:
 @pytest.mark.parametrize("delay_ticks", [0, 1, 3])
 def test_the_papers_margins_as_it_runs(delay_ticks) -> None:
     """Sampled, python-control interpolates along a grid of frequencies; polynomials in z would be too bad for it."""
-    loop = discrete_loop(discretise(PAPER_C, PERIOD_S), PAPER_D, delay_ticks)
+    loop = discrete_loop(discretise_controller(PAPER_C, PERIOD_S), PAPER_D, delay_ticks)
     grid = control.frd(to_control(loop), np.geomspace(100.0, 5000.0, 3000))
     assert ours(loop) == pytest.approx(summary(grid), rel=2e-5)
 
@@ -79,8 +79,8 @@ def test_the_norm_of_the_papers_sensitivity() -> None:
     loop = continuous_loop(PAPER_C, PAPER_D)
     norm, omega = control.linfnorm(control.feedback(ONE, to_control(loop)))
     assert norm == pytest.approx(1.66854, abs=1e-5)
-    assert margins(loop).max_sensitivity == pytest.approx(norm, rel=1e-9)
-    assert margins(loop).max_sensitivity_hz == pytest.approx(omega / (2 * np.pi), rel=1e-4)
+    assert loop_margins(loop).max_sensitivity == pytest.approx(norm, rel=1e-9)
+    assert loop_margins(loop).max_sensitivity_hz == pytest.approx(omega / (2 * np.pi), rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", [None, *range(20)])
@@ -90,12 +90,12 @@ def test_zero_order_hold(seed) -> None:
     period_s = PERIOD_S if seed is None else 0.05
     there = control.c2d(to_control(plant), period_s, "zoh")
     z = np.exp(2j * np.pi * np.geomspace(1e-4, 0.49, 200))
-    assert discretised(plant, period_s, "zoh").system.response(z) == pytest.approx(there(z), rel=1e-10)
+    assert discretise_transfer(plant, period_s, "zoh").system.response(z) == pytest.approx(there(z), rel=1e-10)
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [("truncate", "truncate"), ("residualise", "matchdc")])
 def test_reduction_of_the_papers_controller_to_order_5(ours, theirs) -> None:
-    found = synthesise_hinf(augmented(PAPER_D, PAPER_WEIGHTS)).controller
+    found = synthesise_hinf(augment(PAPER_D, PAPER_WEIGHTS)).controller
     full = Transfer.from_state_space(found.a, found.b, found.c, found.d)
     there = control.balred(to_control(full), 5, method=theirs)
     s = 2j * np.pi * np.geomspace(0.01, 2e4, 400)

@@ -11,17 +11,17 @@ from scipy import signal
 from rtloop.analysis.closed_loop import sampled_plant
 from rtloop.cli import main
 from rtloop.design.robust import certificate
-from rtloop.design.robust.certificate import certified
-from rtloop.design.robust.controller import bounds, candidates, transfer_of
+from rtloop.design.robust.certificate import certify
+from rtloop.design.robust.controller import build_candidates, point_bounds, point_transfer
 from rtloop.design.robust.objective import Objective, Walls
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.scenarios import Family, Scenario, light_modes
-from rtloop.design.robust.search import minimise, robust_controller
+from rtloop.design.robust.search import find_robust_controller, minimise
 from rtloop.design.robust.section import robust_configuration
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions
-from rtloop.design.toml_text import section as text
-from rtloop.linear.discretise import discretise
+from rtloop.design.toml_text import write_section as text
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S = 1e-4
@@ -68,7 +68,7 @@ def at(polynomials, z):
 
 def written(controller: Transfer):
     """C(z) of the zeros, poles and gain that "matched" makes, as polynomials: numerator and denominator."""
-    found = discretise(controller, PERIOD_S, "matched")
+    found = discretise_controller(controller, PERIOD_S, "matched")
     return found.gain * np.real(np.poly(found.zeros)), np.real(np.poly(found.poles))
 
 
@@ -98,7 +98,7 @@ def decay_ms(controller, plant) -> float:
 
 
 def a_point(random) -> np.ndarray:
-    low, high = bounds(2)
+    low, high = point_bounds(2)
     return np.clip(np.array([-3.0, -3.0, *([-1.0, 0.5, -0.8, -0.5] * 2)]) + 0.4 * random.standard_normal(10), low, high)
 
 
@@ -121,12 +121,12 @@ def test_modes_that_are_damped_or_beyond_half_the_rate_do_not_move() -> None:
 
 def test_two_modes_move_by_themselves_in_every_combination() -> None:
     model = Transfer.from_zpk([], [*np.roots([1, 30, 3000.0**2]), *np.roots([1, 80, 8000.0**2])], 1.0)
-    found = {one.resonance for one in Family(model, 2, RANGE, PERIOD_S).corners()}
+    found = {one.resonance for one in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()}
     assert {(-8.0, 8.0), (8.0, -8.0), (0.0, 8.0), (0.0, 0.0)} <= found
-    assert {one.delay_ticks for one in Family(model, 2, RANGE, PERIOD_S).corners()} == {2}
+    assert {one.delay_ticks for one in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()} == {2}
     both = RANGE.model_copy(update={"delay_ticks": (0, 1)})
-    assert {one.delay_ticks for one in Family(model, 2, both, PERIOD_S).corners()} == {0, 1}
-    swept = [(one.delay_ticks, one.resonance[0]) for one in Family(model, 2, both, PERIOD_S).swept(3)]
+    assert {one.delay_ticks for one in Family(model, 2, both, PERIOD_S).corner_scenarios()} == {0, 1}
+    swept = [(one.delay_ticks, one.resonance[0]) for one in Family(model, 2, both, PERIOD_S).sweep_scenarios(3)]
     assert set(swept) == {(ticks, percent) for ticks in (0, 1) for percent in (-8.0, 0.0, 8.0)}
 
 
@@ -157,11 +157,11 @@ def test_what_is_written_is_the_controller_that_was_searched() -> None:
     rng, z = np.random.default_rng(5), np.exp(1j * np.linspace(0.01, 3.1, 200))
     for _ in range(50):
         point = a_point(rng)
-        numerator, denominator = written(transfer_of(point, PERIOD_S))
+        numerator, denominator = written(point_transfer(point, PERIOD_S))
         np.testing.assert_allclose(
-            at((numerator, denominator), z), candidates(point[None]).response(z)[0], rtol=1e-7
+            at((numerator, denominator), z), build_candidates(point[None]).response(z)[0], rtol=1e-7
         )  # fmt: skip
-        a, b, c, d = (part[0] for part in candidates(point[None]).matrices())
+        a, b, c, d = (part[0] for part in build_candidates(point[None]).matrices())
         by_states = signal.ss2tf(a, b[:, None], c[None], np.array([[d]]))
         np.testing.assert_allclose(at((by_states[0][0], by_states[1]), z), at((numerator, denominator), z), rtol=1e-5)
 
@@ -175,8 +175,8 @@ def test_what_is_searched_is_the_worst_of_the_closed_loops() -> None:
     for _ in range(20):
         point = a_point(rng)
         point[:2] = rng.uniform(-8.0, -4.0), -0.5
-        found = objective.measured(point[None])
-        controller = written(transfer_of(point, PERIOD_S))
+        found = objective.measure(point[None])
+        controller = written(point_transfer(point, PERIOD_S))
         radii, decays, peaks, at_5 = [], [], [], []
         for one in scenarios:
             plant = sampled(one.gain, one.resonance[0], one.damping, one.delay_ticks)
@@ -198,14 +198,14 @@ def test_what_is_searched_is_the_worst_of_the_closed_loops() -> None:
 def short_proofs():
     """Of fewer plants: each costs some ten milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(certificate, "SWEPT", 5)
-        patch.setattr(certificate, "DRAWN", 10)
+        patch.setattr(certificate, "SWEEP_POINTS", 5)
+        patch.setattr(certificate, "RANDOM_PLANTS", 10)
         yield
 
 
 @pytest.fixture(scope="module")
 def found(short_proofs):
-    return robust_controller(DesignOptions.model_validate(tomllib.loads(SPEC)))
+    return find_robust_controller(DesignOptions.model_validate(tomllib.loads(SPEC)))
 
 
 def test_a_controller_damps_the_resonance_and_keeps_its_walls_wherever_the_plant_lies(found) -> None:
@@ -232,12 +232,12 @@ def test_a_proof_is_what_its_worst_plants_do(found) -> None:
 def test_a_proof_names_the_plant_that_is_worst() -> None:
     """An integrator alone on a light mode: nearest to instability where the mode is lightest, the gain highest."""
     family = Family(STAGE, 0, RANGE, PERIOD_S)
-    controller = discretise(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
-    proof = certified(controller, family, Walls(2.0, 3.0, 0.1, 5.0))
+    controller = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
+    proof = certify(controller, family, Walls(2.0, 3.0, 0.1, 5.0))
     assert proof.radius.scenario.damping == 0.5
     assert proof.radius.scenario.gain == 5.0
-    unstable = discretise(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 200.0), PERIOD_S, "matched")
-    assert "unstable with" in certified(unstable, family, Walls(2.0, 3.0, 0.1, 5.0)).missed(proof_walls(), None)[0]
+    unstable = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 200.0), PERIOD_S, "matched")
+    assert "unstable with" in certify(unstable, family, Walls(2.0, 3.0, 0.1, 5.0)).violations(proof_walls(), None)[0]
 
 
 def proof_walls() -> Walls:
@@ -248,7 +248,7 @@ def test_what_cannot_be_is_refused_with_what_misses() -> None:
     raw = tomllib.loads(SPEC)
     raw["robust"] |= {"decay_ms": 0.05, "generations": 20, "restarts": 1}
     with pytest.raises(NoController, match=r"slowest mode around a resonance.* at most 0.05 is asked"):
-        robust_controller(DesignOptions.model_validate(raw))
+        find_robust_controller(DesignOptions.model_validate(raw))
 
 
 @pytest.mark.parametrize(

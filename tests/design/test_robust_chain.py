@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from rtloop.cli import main
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from rtloop.design.identification.dynamics.dynamics_fit import _within_reach
+from rtloop.design.identification.dynamics.dynamics_fit import _limit_fast_rates
 from rtloop.design.robust import certificate
 from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions
@@ -59,10 +59,10 @@ def recordings(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch) -> None:
     """In the proofs: those of the search and of the taps have tests of their own."""
-    monkeypatch.setattr(certificate, "SWEPT", 3)
-    monkeypatch.setattr(certificate, "DRAWN", 10)
-    monkeypatch.setattr(shape_module, "PLACES", 3)
-    monkeypatch.setattr(shape_module, "PROVED", 5)
+    monkeypatch.setattr(certificate, "SWEEP_POINTS", 3)
+    monkeypatch.setattr(certificate, "RANDOM_PLANTS", 10)
+    monkeypatch.setattr(shape_module, "SWEEP_PLACES", 3)
+    monkeypatch.setattr(shape_module, "PROOF_PLACES", 5)
 
 
 def automatically(recordings, folder, text: str):
@@ -130,10 +130,10 @@ def test_of_many_light_modes_those_that_stand_out_move_by_themselves() -> None:
     hz, damping, gain = [200.0, 500.0, 900.0, 1500.0], [0.02, 0.02, 0.003, 0.02], [0.9, 0.02, 0.06, 0.02]
     family = Family(modal(hz, damping, gain), 1, ScenarioOptions(), PERIOD_S)
     assert family.leading == (0, 2)  # g/2ζ: 22, 0.5, 10, 0.5
-    shifts = {one.resonance for one in family.corners()}
+    shifts = {one.resonance for one in family.corner_scenarios()}
     assert {(10.0, 0.0, -10.0, 0.0), (-10.0, 0.0, 10.0, 0.0), (10.0,) * 4, (-10.0,) * 4} <= shifts
     assert all(one[1] == one[3] == 0 or len(set(one)) == 1 for one in shifts)
-    assert np.all([len(set(one.resonance)) == 4 for one in family.drawn(20, 0)])  # the proof moves each
+    assert np.all([len(set(one.resonance)) == 4 for one in family.random_scenarios(20, 0)])  # the proof moves each
     bands = family.bands / (2 * np.pi)
     expected = [[110.0, np.sqrt(200 * 500)], [np.sqrt(500 * 900), np.sqrt(900 * 1500)]]
     np.testing.assert_allclose(bands, expected, rtol=1e-9)
@@ -143,7 +143,7 @@ def test_a_pole_beyond_reach_in_s_is_a_finite_one_that_answers_alike_at_the_tick
     """What identification makes of a delay by a part of a tick: a pole at z ≈ 0, here at −1e25 rad/s."""
     rates = np.array([-1e25, complex(-100.0, 5000.0), complex(-100.0, -5000.0)])
     residues = np.array([[0.3, 0.1 - 0.2j, 0.1 + 0.2j]])
-    reach, kept = _within_reach(rates, residues, PERIOD_S)
+    reach, kept = _limit_fast_rates(rates, residues, PERIOD_S)
     assert -20 / PERIOD_S < reach[0].real < -10 / PERIOD_S
     np.testing.assert_array_equal(reach[1:], rates[1:])
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 30) * PERIOD_S)

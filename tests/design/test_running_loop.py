@@ -11,10 +11,10 @@ from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant
 from rtloop.analysis.held_plant import POINTS
 from rtloop.analysis.reference import ReferencePath
 from rtloop.analysis.step_response import step_metrics, step_response
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.realisation import System
 from rtloop.linear.sampled import Sampled
-from rtloop.linear.together import SampledTogether, SystemTogether
+from rtloop.linear.together import CoupledSystem, SampledCoupledSystem
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S, OMEGA, ZETA, KI, KP = 1e-3, 2 * np.pi * 90.0, 0.1, 30.0, 0.05
@@ -92,10 +92,10 @@ def test_steps_of_the_loop_as_it_runs(path, delay_ticks: int) -> None:
 def test_steps_of_one_of_two_coupled_axes(path, delay_ticks: int) -> None:
     cross = 0.2
     one = controller().system
-    both = SystemTogether(np.eye(2), np.eye(2), KI * PERIOD_S * np.eye(2), KP * np.eye(2))
+    both = CoupledSystem(np.eye(2), np.eye(2), KI * PERIOD_S * np.eye(2), KP * np.eye(2))
     assert one.d == both.d[0, 0]
     plant = CoupledPlant((PLANT, PLANT), (delay_ticks,) * 2, np.array([[1.0, cross], [cross, 1.0]]))
-    loop = CoupledLoop(SampledTogether(both, PERIOD_S), plant).alone(0, path_of(*path))
+    loop = CoupledLoop(SampledCoupledSystem(both, PERIOD_S), plant).axis_loop(0, path_of(*path))
     assert loop.is_stable
     positions, commands = by_hand(delay_ticks, path, 2, cross)
     found = step_response(loop, (TICKS - 1) * PERIOD_S)
@@ -129,9 +129,10 @@ def test_figures_of_a_step_are_those_between_ticks(path) -> None:
 
 def test_without_an_integrator_the_command_path_moves_the_final_value() -> None:
     """P-control, K = 2, of D(0) = 1: x = (K F_x + F_v)/(1 + K)."""
-    loop = discrete_loop(discretise(Transfer.from_zpk([], [], 2.0), PERIOD_S), Transfer.from_zpk([], [-50.0], 50.0), 0,
+    controller = discretise_controller(Transfer.from_zpk([], [], 2.0), PERIOD_S)
+    loop = discrete_loop(controller, Transfer.from_zpk([], [-50.0], 50.0), 0,
                          ReferencePath(np.array([0.5, 0.4]), np.array([0.9, 0.2])))  # fmt: skip
-    assert loop.final == pytest.approx(((2 * 0.9 + 1.1) / 3, 2 * (0.9 - (2 * 0.9 + 1.1) / 3) + 1.1))
+    assert loop.final_values == pytest.approx(((2 * 0.9 + 1.1) / 3, 2 * (0.9 - (2 * 0.9 + 1.1) / 3) + 1.1))
     assert step_metrics(loop, ()).static_error_percent == pytest.approx(100 * abs(1 - 2.9 / 3))
 
 
@@ -142,7 +143,10 @@ def test_responses_to_the_reference_are_those_of_its_step(path) -> None:
     positions, commands = by_hand(1, path)
     tail = TICKS + 1  # what is left after so many ticks is far below the tolerance of a decayed answer
     back = np.exp(-2j * np.pi * hz[:, None] * PERIOD_S * np.arange(tail - 1))
-    position, command = loop.from_reference(hz)
-    for found, answer, final in ((position, positions[::POINTS], loop.final[0]), (command, commands, loop.final[1])):
+    position, command = loop.response_from_reference(hz)
+    for found, answer, final in (
+        (position, positions[::POINTS], loop.final_values[0]),
+        (command, commands, loop.final_values[1]),
+    ):
         assert abs(answer[-1] - final) < 1e-3
         np.testing.assert_allclose(found, (np.diff(answer, prepend=0.0) * back).sum(axis=1), atol=5e-3)

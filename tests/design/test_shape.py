@@ -12,16 +12,16 @@ from rtloop.cli import main
 from rtloop.design.robust import shape as shape_module
 from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
 from rtloop.design.robust.programme import Bounds
-from rtloop.design.robust.responses import responses
-from rtloop.design.robust.shape import Subject, fastest_settling, programme_of, shaped
+from rtloop.design.robust.responses import step_responses
+from rtloop.design.robust.shape import Subject, build_programme, design_taps, fastest_settling
 from rtloop.errors import NoDesign
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 PERIOD_S, FINE = 1e-4, 10
 OMEGA, RATIO = 2 * np.pi * 600.0, 0.15
 STAGE = Transfer.from_factors(OMEGA**2, [], [[1.0, 2 * RATIO * OMEGA, OMEGA**2]])
-CONTROLLER = discretise(Transfer.from_zpk([], [0.0], 500.0), PERIOD_S, "matched")
+CONTROLLER = discretise_controller(Transfer.from_zpk([], [0.0], 500.0), PERIOD_S, "matched")
 BOUNDS = Bounds(0.05, 40.0, -40.0, -46.0, 46.0)
 OPTIONS = ShapeOptions(
     taps=20, points_per_tick=4, scenarios=ScenarioOptions(resonance_percent=4.0, damping=(1.0,), gain_percent=0.0)
@@ -56,7 +56,7 @@ def simulated(taps, command_taps, shift_percent: float, delay_ticks: int, ticks:
 
 @pytest.mark.parametrize("delay_ticks", [0, 1, 2])
 def test_responses_are_those_of_the_loop_between_ticks_too(delay_ticks) -> None:
-    found = responses(CONTROLLER, STAGE, delay_ticks, FINE, 150)
+    found = step_responses(CONTROLLER, STAGE, delay_ticks, FINE, 150)
     for part, rows in enumerate([([1.0], [0.0]), ([0.0], [1.0])]):
         x, v = simulated(*rows, 0.0, delay_ticks, 150)
         np.testing.assert_allclose(found.position[part], x, atol=1e-9)
@@ -67,15 +67,15 @@ def test_responses_are_those_of_the_loop_between_ticks_too(delay_ticks) -> None:
 def few_places():
     """Of each resonance: the tests' own simulation looks between them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shape_module, "PLACES", 3)
-        patch.setattr(shape_module, "PROVED", 9)
-        patch.setattr(shape_module, "CURVE", (0.95, 1.1, 6))
+        patch.setattr(shape_module, "SWEEP_PLACES", 3)
+        patch.setattr(shape_module, "PROOF_PLACES", 9)
+        patch.setattr(shape_module, "CURVE_RANGE", (0.95, 1.1, 6))
         yield
 
 
 @pytest.fixture(scope="module")
 def found(few_places):
-    return shaped(SUBJECT)
+    return design_taps(SUBJECT)
 
 
 def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is(found) -> None:
@@ -99,18 +99,18 @@ def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is
 def test_nothing_faster_exists_and_less_overshoot_costs_time(found) -> None:
     """A point below the fastest there are no taps; the least overshoot never rises with the settling time."""
     family = SUBJECT.family()
-    programme = programme_of(SUBJECT, [family.nominal, *family.swept(3)])
+    programme = build_programme(SUBJECT, [family.nominal, *family.sweep_scenarios(3)])
     fastest = fastest_settling(programme, 0.004)
     assert fastest * 0.1 <= found.fastest_ms + 1e-9
-    assert not programme.feasible(fastest - 0.25, 0.004)
-    least = [programme.least_overshoot(fastest + more).overshoot for more in (0.0, 1.0, 3.0)]
+    assert not programme.is_feasible(fastest - 0.25, 0.004)
+    least = [programme.least_overshoot_taps(fastest + more).overshoot for more in (0.0, 1.0, 3.0)]
     assert least[0] >= least[1] - 1e-9 >= least[2] - 2e-9
     assert least[0] <= 0.004
 
 
 def test_more_time_makes_a_quieter_command(found) -> None:
     later = OPTIONS.model_copy(update={"settling_ms": found.fastest_ms + 0.3})
-    calm = shaped(Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, later))
+    calm = design_taps(Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, later))
     assert calm.settling_ms == pytest.approx(found.fastest_ms + 0.3)
     assert calm.variation < found.variation
     x, _ = simulated(calm.taps.reference, calm.taps.command, 4.0, 1)
@@ -122,16 +122,16 @@ def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
     with pytest.raises(
         NoDesign, match=r"settling_ms: 0.4 ms cannot be .* the fastest is .*no limit on v .* relaxed by"
     ):
-        shaped(asked)
+        design_taps(asked)
     wide = OPTIONS.scenarios.model_copy(update={"gain_percent": 4.0})
     with pytest.raises(NoDesign, match=r"overshoot_percent: 0.0001 % cannot be kept .* the least is"):
-        shaped(Subject(CONTROLLER, STAGE, 1, BOUNDS, 1e-6, OPTIONS.model_copy(update={"scenarios": wide})))
+        design_taps(Subject(CONTROLLER, STAGE, 1, BOUNDS, 1e-6, OPTIONS.model_copy(update={"scenarios": wide})))
 
 
 def test_bounds_let_every_step_between_allowed_levels_stay_within_the_drive() -> None:
     """v = a·s + h·w for every level a, step h, and w at its bounds; at one end or another it reaches the drive."""
     for bounds, static in ((BOUNDS, 0.97), (Bounds(0.05, 40.0, 0.0, 0.0, 44.0), 1.02)):
-        low, high = (float(value) for value in bounds.command(np.array(static)))
+        low, high = (float(value) for value in bounds.command_limits(np.array(static)))
         starts = np.linspace(bounds.lowest_um, bounds.step_um, 41)
         reached = []
         for w in (low, high):
@@ -252,8 +252,8 @@ def test_a_configuration_that_taps_cannot_be_made_for_is_said(tmp_path, old, new
 )
 def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, missed, said) -> None:
     """A plant that no programme has seen misses what is promised, whatever is tried: that is no warning."""
-    monkeypatch.setattr(shape_module, "ROUNDS", 2)
-    real = shape_module.judged_of
-    monkeypatch.setattr(shape_module, "judged_of", lambda *of: real(*of)._replace(**missed))
+    monkeypatch.setattr(shape_module, "MOST_ROUNDS", 2)
+    real = shape_module.measure_step
+    monkeypatch.setattr(shape_module, "measure_step", lambda *of: real(*of)._replace(**missed))
     with pytest.raises(NoDesign, match=said):
-        shaped(SUBJECT)
+        design_taps(SUBJECT)

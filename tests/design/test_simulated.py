@@ -15,14 +15,14 @@ from rtloop.configuration.axis import LimitsOptions
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SimulationOptions
-from rtloop.design.verification.bench import Bench, Stand
-from rtloop.design.verification.judgement import described
-from rtloop.design.verification.simulated import between_ticks, kept_by_most, simulate
+from rtloop.design.verification.bench import Bench, HardwareModel
+from rtloop.design.verification.judgement import loop_quantities
+from rtloop.design.verification.simulated import intersample_positions, simulate, step_quantiles
 from rtloop.errors import ConfigError
 from rtloop.hil.options import Options
-from rtloop.hysteresis.leftover import with_hysteresis_left
+from rtloop.hysteresis.leftover import add_residual_hysteresis
 from rtloop.laws.shipped.play_model import PlayModel
-from rtloop.signals import axis_column, columns
+from rtloop.signals import axis_column, column_names
 from tests.recording.real_loop import ROOT, RealLoop, changed
 
 PAPER = load(ROOT / "deploy" / "paper.toml")
@@ -84,7 +84,7 @@ def test_a_simulation_is_the_run_itself() -> None:
     recorded = RealLoop(text)
     recorded.run(1500)
     rows = recorded.block.ring("ticks").slots[:1500]
-    names = columns(["x"], ["x_true_position_um", "x_hysteresis_um"])
+    names = column_names(["x"], ["x_true_position_um", "x_hysteresis_um"])
     run = Bench(PAPER, {}).run("x", (0.0, 20.0, -20.0), 0.05)
     assert tuple(run) == names
     for name, column in zip(names, rows.T, strict=True):
@@ -96,7 +96,7 @@ def test_a_simulation_is_the_run_itself() -> None:
 def test_positions_between_ticks_are_those_of_the_held_displacement() -> None:
     bench = Bench(linear(), {})
     run = bench.run("x", (0.0, 10.0), 0.02)
-    found = between_ticks(bench.rig, run, "x", RATE_HZ)
+    found = intersample_positions(bench.rig, run, "x", RATE_HZ)
     a = np.array([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]])
     grown = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) / RATE_HZ / POINTS)
     state, positions = np.zeros(2), []
@@ -113,7 +113,7 @@ def test_what_moves_it_besides_is_straight_between_ticks() -> None:
     text = LINEAR.replace("[driver.plant.sensor]", "[driver.plant.disturbance]\nstep_um = 2.0\n[driver.plant.sensor]")
     bench = Bench(parse(text, "linear", Path(), "linear"), {})
     run = bench.run("x", (0.0,), 0.02)
-    found = between_ticks(bench.rig, run, "x", RATE_HZ)
+    found = intersample_positions(bench.rig, run, "x", RATE_HZ)
     np.testing.assert_allclose(found[::POINTS], run["x_true_position_um"], atol=1e-12)
     assert found.max() > 1.0
 
@@ -125,7 +125,7 @@ def test_a_linear_rig_is_simulated_as_it_is_predicted() -> None:
     assert check.plant is not None
     assert check.running is not None
     found = simulate(Bench(configuration, {}), configuration.axes[0], 1 / KI, DesignOptions())
-    noise = described(check.loop(check.plant, 0), SensorOptions(noise_um=0.02))
+    noise = loop_quantities(check.loop(check.plant, 0), SensorOptions(noise_um=0.02))
     assert found.noise_x_nm == pytest.approx(noise["noise_x_nm"], rel=0.1)
     assert found.noise_v_nm == pytest.approx(noise["noise_v_nm"], rel=0.1)
     largest = found.steps[-1]
@@ -158,7 +158,9 @@ sections = [[0.2, 0.1, 0.05, -0.9, 0.25]]
     bench = Bench(configuration, {})
     run = bench.run("x", (0.0, 10.0), 0.1)
     answer = step_response(check.loop(check.plant, check.delay_ticks), 0.0999)
-    np.testing.assert_allclose(10.0 * answer.position, between_ticks(bench.rig, run, "x", RATE_HZ)[8000:], atol=1e-8)
+    np.testing.assert_allclose(
+        10.0 * answer.position, intersample_positions(bench.rig, run, "x", RATE_HZ)[8000:], atol=1e-8
+    )
     np.testing.assert_allclose(10.0 * answer.command[::POINTS], run["x_command_um"][1000:], atol=1e-8)
 
 
@@ -185,7 +187,7 @@ def test_noise_at_rest_is_that_of_a_run(paper) -> None:
     recorded.run(15_000)
     rows = recorded.block.ring("ticks").slots[5_000:15_000]
     assert len(rows) == 10_000
-    names = columns(["x"], ["x_true_position_um", "x_hysteresis_um"])
+    names = column_names(["x"], ["x_true_position_um", "x_hysteresis_um"])
     rms = {name: 1e3 * rows[:, names.index(name)].std() for name in ("x_command_um", "x_true_position_um")}
     assert paper.noise_v_nm == pytest.approx(rms["x_command_um"], rel=0.35)
     assert paper.noise_x_nm == pytest.approx(rms["x_true_position_um"], rel=0.6)
@@ -204,7 +206,7 @@ def test_an_amplifier_with_one_side_steps_to_that_side() -> None:
 def test_a_model_stands_for_hardware() -> None:
     """With the hysteresis that a compensation experiment found, and without."""
     card = replace(PAPER, driver_kind="card", driver_options=Options())
-    stand = Stand(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
+    stand = HardwareModel(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
     design = DesignOptions.model_validate({"simulation": {"steps_um": [20.0]}})
     found = [
         simulate(Bench(card, {"x": one}), card.axes[0], 0.031, design)
@@ -246,7 +248,7 @@ def test_what_cannot_run_is_not_simulated() -> None:
 def test_hysteresis_that_is_left_is_as_much_as_was_said(percent: float) -> None:
     """h/H of the changed actuator behind the inverse of the model, by plays written down here."""
     model = PlayModel(np.array([0.0, 1.0, 2.0, 4.0, 6.0]), np.array([1.3, 0.3, 0.2, 0.3, 0.2]))
-    changed_model = with_hysteresis_left(model, percent, 10.0)
+    changed_model = add_residual_hysteresis(model, percent, 10.0)
     inverse = model.inverse()
     top = float(np.maximum(10.0 - model.thresholds, 0) @ model.weights)
     v = top * np.interp(np.arange(6001), [0, 1000, 3000, 5000, 6000], [0, 1, -1, 1, 0])
@@ -284,5 +286,5 @@ def test_as_many_steps_keep_what_is_said_of_them() -> None:
 def test_steps_that_did_not_reach_their_reference_count_as_the_worst() -> None:
     """95 of 100 steps keep what is promised; where fewer reach their reference there is no promise."""
     good, unreached = [1.0, 2.0, 0.1], [np.nan, np.inf, 100.0]
-    assert kept_by_most(np.array([good] * 97 + [unreached] * 3)) == tuple(good)
-    assert kept_by_most(np.array([good] * 90 + [unreached] * 10)) == (np.inf, np.inf, 100.0)
+    assert step_quantiles(np.array([good] * 97 + [unreached] * 3)) == tuple(good)
+    assert step_quantiles(np.array([good] * 90 + [unreached] * 10)) == (np.inf, np.inf, 100.0)

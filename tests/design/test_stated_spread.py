@@ -8,7 +8,7 @@ from scipy import stats
 
 from rtloop.analysis.measured.loop import MeasuredLoop
 from rtloop.analysis.measured.margins import measured_margins
-from rtloop.design.identification.hysteresis.judgement import together
+from rtloop.design.identification.hysteresis.judgement import combine_errors
 
 DRAWS = 1000
 CHANCE = 1e-6
@@ -27,7 +27,7 @@ def test_the_error_of_several_recordings_spreads_as_stated():
     """Thirty recordings of 20 normal errors each; what is stated is right in the mean of its square."""
     errors_um = np.random.default_rng(1).normal(0.0, 0.3, (DRAWS, 30, 20))
     rms_um = np.sqrt(np.mean(errors_um**2, axis=2))
-    found = [together(row.tolist()) for row in rms_um]
+    found = [combine_errors(row.tolist()) for row in rms_um]
     stated = np.sqrt(np.mean([one.std_um**2 for one in found]))
     assert stated == pytest.approx(0.3 / np.sqrt(2 * 30 * 20), rel=0.02)  # σ/√(2n), of n normal errors
     require_stated(stated, np.array([one.rms_um for one in found]), room=0.02)

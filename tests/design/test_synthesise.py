@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from rtloop.analysis.closed_loop import continuous_loop, realised
-from rtloop.analysis.step_response import position_at
+from rtloop.analysis.closed_loop import continuous_loop, realise_transfer
+from rtloop.analysis.step_response import position_after_step
 from rtloop.cli import main
 from rtloop.design.paper import PAPER_C, PAPER_D
-from rtloop.design.synthesis.hinf.augment import Matrices, augmented
+from rtloop.design.synthesis.hinf.augment import Matrices, augment
 from rtloop.design.synthesis.synthesise import synthesise
 from rtloop.design.synthesis.weights import PAPER_WEIGHTS, tracking_weight
 from rtloop.laws.shipped.options import TransferControllerOptions
@@ -55,7 +55,7 @@ def test_the_step_is_that_of_the_printed_controller() -> None:
     ours, printed = continuous_loop(PAPER.controller, PAPER_D), continuous_loop(PAPER_C, PAPER_D)
     assert ours.is_stable
     times = np.linspace(0, 0.03, 301)
-    assert max(abs(position_at(ours, t) - position_at(printed, t)) for t in times) < 0.02
+    assert max(abs(position_after_step(ours, t) - position_after_step(printed, t)) for t in times) < 0.02
 
 
 def test_truncation_has_no_direct_part_and_residualisation_has() -> None:
@@ -67,11 +67,11 @@ def test_truncation_has_no_direct_part_and_residualisation_has() -> None:
 
 def test_the_order_is_the_lowest_that_loses_little() -> None:
     """The norm that is reported is that of an independent grid."""
-    standard = augmented(PAPER_D, PAPER_WEIGHTS)
+    standard = augment(PAPER_D, PAPER_WEIGHTS)
     for loss, order in ((0.1, 5), (0.005, 8), (1e-5, 10)):
         found = synthesise(PAPER_D, PAPER_WEIGHTS, largest_loss=loss)
-        a, b, c, d = realised(found.controller)
-        norm = dense_norm(*standard.closed_with(Matrices(a, b[:, None], c[None], np.array([[d]]))))
+        a, b, c, d = realise_transfer(found.controller)
+        norm = dense_norm(*standard.close_loop(Matrices(a, b[:, None], c[None], np.array([[d]]))))
         assert found.controller.order == order
         assert norm == pytest.approx(found.achieved, rel=1e-4)
         assert norm <= (1 + loss) * found.hinf.gamma * (1 + 1e-5)

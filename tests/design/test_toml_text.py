@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtloop.design.toml_text import edited, section
+from rtloop.design.toml_text import edit_text, write_section
 
 WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=10)
 KEYS = st.text("abcdefgh_", min_size=1, max_size=4)
@@ -20,17 +20,17 @@ TABLES = st.dictionaries(KEYS, VALUES, max_size=5)
 
 @given(TABLES)
 def test_whatever_is_written_is_read(values):
-    assert tomllib.loads(section("", values, ["a comment", ""])) == values
+    assert tomllib.loads(write_section("", values, ["a comment", ""])) == values
 
 
 @given(TABLES, TABLES)
 def test_whatever_is_changed_says_what_it_should(old, new):
-    assert tomllib.loads(edited(section("", old), new, ["why"])) == new
+    assert tomllib.loads(edit_text(write_section("", old), new, ["why"])) == new
 
 
 @pytest.mark.parametrize("number", [0.1, 1e-300, 5e-324, 1e22, -0.0, float("inf"), np.float64(2 / 3)])
 def test_a_number_keeps_its_bits(number):
-    found = tomllib.loads(section("x", {"a": number}))["x"]["a"]
+    found = tomllib.loads(write_section("x", {"a": number}))["x"]["a"]
     assert np.float64(found).tobytes() == np.float64(number).tobytes()
 
 
@@ -60,7 +60,7 @@ def test_comments_are_kept_and_what_is_new_has_its_place():
     del values["loop"]["mode"]
     values["axis"][0] |= {"specification": "spec.toml", "controller": {"gain": 3.0, "poles": [[-1.0, 2.0]] * 12}}
     values["axis"][0]["feedforward"]["weights"] = [4.0]
-    found = edited(TEXT, values, ["made anew"])
+    found = edit_text(TEXT, values, ["made anew"])
     assert tomllib.loads(found) == values
     assert found.startswith("# made anew\n")
     for line in ("# the stage on the left table", "# as fast as the sensor", "# along the beam", "# where the disk is"):
@@ -80,4 +80,4 @@ def test_comments_are_kept_and_what_is_new_has_its_place():
 def test_other_ways_to_write_the_same(text):
     values = tomllib.loads(text)
     values["axis"][0] |= {"controller": {"gain": 3.0}, "specification": "a.toml"}
-    assert tomllib.loads(edited(text, values)) == values
+    assert tomllib.loads(edit_text(text, values)) == values

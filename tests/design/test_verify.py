@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.analysis.closed_loop import continuous_loop, discrete_loop
-from rtloop.analysis.perturbation import changes as robust_changes
-from rtloop.analysis.perturbation import maker, until_unstable, with_damping_changed, with_gain_changed
+from rtloop.analysis.perturbation import change_damping, change_gain, loop_builder, stability_range
+from rtloop.analysis.perturbation import plant_changes as robust_changes
 from rtloop.cli import main
 from rtloop.commands.design.verify import verified, with_simulation
 from rtloop.configuration.cautions import cautions
@@ -22,17 +22,17 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.design.verification import text
-from rtloop.design.verification.judgement import Limit, described, held_up_to, specified
+from rtloop.design.verification.judgement import Limit, held_frequency_hz, loop_quantities, specified_quantities
 from rtloop.design.verification.plain import as_dict
-from rtloop.design.verification.robustness import delay_margin_us, delay_ticks_tolerated, until_missed
+from rtloop.design.verification.robustness import delay_margin_us, range_until_missed, tolerated_delay_ticks
 from rtloop.design.verification.text import answer
 from rtloop.design.verification.verify import Robustness
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PAPER_LOOP = continuous_loop(PAPER_C, PAPER_D)
-RUNNING = discretise(PAPER_C, 1e-4, "tustin", 595.5)
+RUNNING = discretise_controller(PAPER_C, 1e-4, "tustin", 595.5)
 MODEST = "[specification]\nsettling_ms = 5.0\novershoot_percent = 3.0\nstatic_error_percent = 0.2\n"
 
 
@@ -149,19 +149,23 @@ def test_robustness_that_is_asked_for(tmp_path) -> None:
     """The paper's resonance may rise by 1.82 % at 10 kHz, and rings for 31 ms; max |S| is 1.654."""
     held = MODEST + "modulus_margin = 0.6\nresonance_decay_ms = 32.0\nresonance_shift_percent = 1.8\n"
     found = judged(tmp_path, held)
-    assert found.meets
+    assert found.meets_specification
     rows = {row.name: row for row in found.rows}
     assert rows["resonance_shift_percent"].running == pytest.approx(1.82, abs=0.005)
     assert rows["modulus_margin"].running == pytest.approx(1 / 1.65383, abs=1e-4)
     missed = MODEST + "modulus_margin = 0.61\nresonance_decay_ms = 30.0\nresonance_shift_percent = 1.9\n"
     found = judged(tmp_path, missed)
-    assert [row.name for row in found.missed] == ["resonance_decay_ms", "resonance_shift_percent", "modulus_margin"]
+    assert [row.name for row in found.missed_rows] == [
+        "resonance_decay_ms",
+        "resonance_shift_percent",
+        "modulus_margin",
+    ]
 
 
 def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     scenarios = "[scenarios]\nresonance_percent = {}\ndamping = [1.0]\ngain_percent = 0.0\n"
     found = judged(tmp_path, MODEST + scenarios.format(1.0))
-    assert found.meets
+    assert found.meets_specification
     assert found.scenarios is not None
     worst = {row.name: (row, one) for row, one in found.scenarios.rows}
     row, one = worst["overshoot_percent"]
@@ -172,12 +176,12 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     )
     assert found.scenarios is not None
     assert [row.name for row, _ in found.scenarios.missed] == ["modulus_margin"]  # taps mend what a step does
-    assert not found.missed
-    assert not found.meets
+    assert not found.missed_rows
+    assert not found.meets_specification
     found = judged(tmp_path, MODEST + scenarios.format(3.0))
     assert found.scenarios is not None
-    assert not found.missed
-    assert not found.meets
+    assert not found.missed_rows
+    assert not found.meets_specification
     assert "settling (5 %) with resonance +3 %" in answer(found)
     assert text.scenarios(found)[0][0] == f"worst of {found.scenarios.count} scenarios, linear"
     assert as_dict(replace(found, examine=nothing_moved))["scenarios"]["rows"][0]["met"] is False
@@ -190,13 +194,13 @@ def nothing_moved() -> Robustness:
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path) -> None:
     shown = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
-    assert shown.meets
+    assert shown.meets_specification
     assert shown.simulated is not None
     assert shown.simulated.met(shown.simulated.steps[0], "overshoot_percent") is False
     assert shown.simulated.left_out_um == (60.0,)
     assert any("Left out: steps of 60 µm" in note for note in text.simulation_notes(shown))
     found = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
-    assert not found.meets
+    assert not found.meets_specification
     assert "simulated, settling (5 %) of 2 µm steps" in answer(found)
 
 
@@ -208,7 +212,7 @@ def test_a_stated_hysteresis_makes_the_steps_count(tmp_path) -> None:
     found = judged(tmp_path, spec + "[simulation]\nresidual_percent = 3.0\n", simulated=True)
     assert found.simulated is not None
     assert 18.0 in [step.height_um for step in found.simulated.steps]
-    assert not found.meets
+    assert not found.meets_specification
     assert "of 18 µm steps" in answer(found)
 
 
@@ -285,7 +289,7 @@ def test_faults_of_the_user(tmp_path, monkeypatch) -> None:
 def test_delay_margin_is_phase_margin_over_crossover() -> None:
     """75.54° at 94.53 Hz, eqs (5) and (20); as it runs, 21 samples and no more."""
     assert delay_margin_us(PAPER_LOOP) == pytest.approx(1e6 * 75.54 / 360 / 94.53, rel=1e-3)
-    ticks = delay_ticks_tolerated(lambda ticks: discrete_loop(RUNNING, PAPER_D, ticks))
+    ticks = tolerated_delay_ticks(lambda ticks: discrete_loop(RUNNING, PAPER_D, ticks))
     assert discrete_loop(RUNNING, PAPER_D, ticks).is_stable
     assert not discrete_loop(RUNNING, PAPER_D, ticks + 1).is_stable
     assert ticks == int(delay_margin_us(discrete_loop(RUNNING, PAPER_D)) / 100)
@@ -293,13 +297,13 @@ def test_delay_margin_is_phase_margin_over_crossover() -> None:
 
 def test_the_gain_may_rise_by_the_gain_margin() -> None:
     change = robust_changes(PAPER_D)["gain"]
-    assert until_unstable(maker(PAPER_C), PAPER_D, change).up == pytest.approx(100 * (2.529 - 1), abs=0.5)
-    assert until_unstable(maker(PAPER_C), PAPER_D, change).down is None
-    assert with_gain_changed(PAPER_D, 50).dc_gain == pytest.approx(1.5 * PAPER_D.dc_gain)
+    assert stability_range(loop_builder(PAPER_C), PAPER_D, change).up == pytest.approx(100 * (2.529 - 1), abs=0.5)
+    assert stability_range(loop_builder(PAPER_C), PAPER_D, change).down is None
+    assert change_gain(PAPER_D, 50).dc_gain == pytest.approx(1.5 * PAPER_D.dc_gain)
 
 
 def test_damping_changes_alone() -> None:
-    halved = with_damping_changed(PAPER_D, -50)
+    halved = change_damping(PAPER_D, -50)
     light = halved.poles[np.argmin(-halved.poles.real / np.abs(halved.poles))]
     assert -light.real / abs(light) == pytest.approx(0.5 * 27.5 / math.sqrt(1.4e7))
     assert abs(light) == pytest.approx(math.sqrt(1.4e7))
@@ -307,22 +311,22 @@ def test_damping_changes_alone() -> None:
 
 
 def test_an_unstable_loop_tolerates_nothing_and_meets_nothing() -> None:
-    loud = with_gain_changed(PAPER_D, 400)
+    loud = change_gain(PAPER_D, 400)
     asked = SpecificationOptions(overshoot_percent=50.0)
-    assert until_unstable(maker(PAPER_C), loud, robust_changes(loud)["gain"]) == (0.0, 0.0)
-    values = specified(continuous_loop(PAPER_C, loud), asked)
+    assert stability_range(loop_builder(PAPER_C), loud, robust_changes(loud)["gain"]) == (0.0, 0.0)
+    values = specified_quantities(continuous_loop(PAPER_C, loud), asked)
     assert all(math.isnan(value) for value in values.values())
     limit = Limit(50.0, True)
-    assert not limit.met(values["overshoot_percent"])
+    assert not limit.is_met_by(values["overshoot_percent"])
     gain = robust_changes(loud)["gain"]
-    assert until_missed(maker(RUNNING), loud, gain, asked, {"overshoot_percent": limit}) == (0.0, 0.0)
+    assert range_until_missed(loop_builder(RUNNING), loud, gain, asked, {"overshoot_percent": limit}) == (0.0, 0.0)
 
 
 def test_noise_of_a_first_order_loop_in_closed_form() -> None:
     """An integrator as the plant, k as the controller: x⁺ = (1 − kT)x − kT n has rms n·√(kT/(2 − kT))."""
     integrator = Transfer.from_factors(1, [], [[1, 0]])
-    loop = discrete_loop(discretise(Transfer.from_zpk([], [], 500.0), 1e-3), integrator)
-    found = described(loop, SensorOptions(noise_um=0.1, resolution_um=0.0))
+    loop = discrete_loop(discretise_controller(Transfer.from_zpk([], [], 500.0), 1e-3), integrator)
+    found = loop_quantities(loop, SensorOptions(noise_um=0.1, resolution_um=0.0))
     assert found["noise_x_nm"] == pytest.approx(100 * math.sqrt(0.5 / 1.5), rel=1e-9)
     assert SensorOptions(resolution_um=0.012).deviation_um == pytest.approx(0.012 / math.sqrt(12))
 
@@ -330,14 +334,14 @@ def test_noise_of_a_first_order_loop_in_closed_form() -> None:
 def test_how_far_the_sensitivity_is_held_in_closed_form() -> None:
     """S = s/(s + k) stays below m up to k·m/√(1 − m²)."""
     loop = continuous_loop(Transfer.from_zpk([], [], 50.0), Transfer.from_factors(1, [], [[1, 0]]))
-    assert held_up_to(loop, 0.1) == pytest.approx(50 * 0.1 / math.sqrt(0.99) / 2 / math.pi, rel=1e-9)
-    assert held_up_to(loop, 1.1) == math.inf
+    assert held_frequency_hz(loop, 0.1) == pytest.approx(50 * 0.1 / math.sqrt(0.99) / 2 / math.pi, rel=1e-9)
+    assert held_frequency_hz(loop, 1.1) == math.inf
     lag = continuous_loop(Transfer.from_zpk([], [], 4.0), Transfer.from_factors(1, [], [[1, 1]]))
-    assert held_up_to(lag, 0.1) == 0.0
+    assert held_frequency_hz(lag, 0.1) == 0.0
 
 
 def test_the_sensors_lag_is_in_the_loop_that_runs() -> None:
-    seen = SensorOptions(bandwidth_hz=1000.0).seen_through(PAPER_D)
+    seen = SensorOptions(bandwidth_hz=1000.0).add_sensor_lag(PAPER_D)
     assert seen.order == PAPER_D.order + 1
     assert abs(seen.response([2000j * math.pi])[0] / PAPER_D.response([2000j * math.pi])[0]) == pytest.approx(
         math.sqrt(0.5)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rtloop.analysis.closed_loop import continuous_loop
-from rtloop.analysis.margins import delay_tolerated
+from rtloop.analysis.margins import delay_margin
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.doctor.examine import Examination, Latency, conditions
@@ -140,7 +140,7 @@ def test_tolerated_delay_of_three_equal_poles(gain):
     """L = k/(s+1)³: |L| = 1 at ω = √(k^⅔ − 1), where the phase is −3 arctan ω."""
     w = math.sqrt(gain ** (2 / 3) - 1)
     loop = continuous_loop(Transfer.from_zpk([], [], gain), Transfer.from_zpk([], [-1.0] * 3, 1.0))
-    delay_s, hz = delay_tolerated(loop)
+    delay_s, hz = delay_margin(loop)
     assert delay_s == pytest.approx((math.pi - 3 * math.atan(w)) / w, rel=1e-6)
     assert hz == pytest.approx(w / (2 * math.pi), rel=1e-6)
 
@@ -154,7 +154,7 @@ def test_tolerated_delay_at_the_tightest_of_several_crossovers():
     response = k / (1j * w) * w0**2 / (w0**2 - w**2 + 2j * zeta * w0 * w)
     at = np.flatnonzero(np.diff(np.sign(np.abs(response) - 1)))
     left = (np.degrees(np.angle(response[at])) % 360 - 180) % 360
-    delay_s, hz = delay_tolerated(loop)
+    delay_s, hz = delay_margin(loop)
     assert len(at) == 3
     assert delay_s == pytest.approx(np.min(np.radians(left) / w[at]), rel=1e-3)
     assert hz == pytest.approx(w[at][np.argmin(np.radians(left) / w[at])] / (2 * math.pi), rel=1e-3)
@@ -162,4 +162,4 @@ def test_tolerated_delay_at_the_tightest_of_several_crossovers():
 
 def test_no_crossover_bears_any_delay():
     loop = continuous_loop(Transfer.from_zpk([], [], 0.5), Transfer.from_zpk([], [-1.0], 1.0))
-    assert delay_tolerated(loop)[0] == math.inf
+    assert delay_margin(loop)[0] == math.inf

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from rtloop.cli import main
 from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.prepare import prepare
-from rtloop.errors import ConfigError, HostRefused
+from rtloop.errors import ConfigError, HostRefusal
 from rtloop.supervision import host_delay
 from rtloop.supervision.host_delay import measured_delay, note_host_delay, require_margins, spent_margin
 from tests.recording.real_loop import ROOT, changed
@@ -82,7 +82,7 @@ def test_nobody_elses_file_is_believed(folder: Path) -> None:
     os.chmod(folder / "host-delay-test.host.json", 0o666)
     assert measured_delay(configuration) is None
     os.chmod(folder, 0o777)
-    with pytest.raises(HostRefused, match="others may write there"):
+    with pytest.raises(HostRefusal, match="others may write there"):
         note_host_delay(configuration, lateness_us=1.0)
 
 

@@ -120,7 +120,7 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     ages_us = rtloop.load(summary["recording"])["sample_age_us"]
     with capsys.disabled():
         print(f"\nboard at 50 kHz: samples {np.median(ages_us):.1f} µs old, the oldest {ages_us.max():.0f} µs; "
-              f"its own clock at most {int(memory.words[board.LONGEST_LATE_NS]) / 1e3:.0f} µs late")  # fmt: skip
+              f"its own clock at most {int(memory.words[board.LARGEST_LATENESS_NS]) / 1e3:.0f} µs late")  # fmt: skip
     assert replay(rtloop.load(summary["recording"])).identical
 
 

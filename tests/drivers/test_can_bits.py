@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtloop.drivers.can.bits import FD_LENGTHS, classic_frame_bits, fd_frame_bits
-from rtloop.drivers.can.frames import DBC, exchange, load_frames
+from rtloop.drivers.can.frames import DBC, choose_exchange, load_frames
 from rtloop.drivers.can.options import BusOptions
 from tests.drivers import can_oracle as oracle
 
@@ -81,7 +81,7 @@ def fd_s(length: int, data_bitrate: float) -> float:
     ],
 )
 def test_the_highest_rate(options, channels, rate_hz):
-    pair = exchange(load_frames(options), channels, options)
+    pair = choose_exchange(load_frames(options), channels, options)
     assert pair.max_rate_hz(options) == pytest.approx(rate_hz, rel=1e-12)
 
 

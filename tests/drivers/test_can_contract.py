@@ -19,7 +19,7 @@ import pytest
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.can.driver import CanDriver
 from rtloop.drivers.can.node import serve
-from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
 from tests.drivers.can_bench import ENVIRONMENT, free_port, options_on
 from tests.faults.evidence import wait_for
@@ -100,7 +100,7 @@ class TestNode(DriverContract):
 
 def test_a_silent_controller_gets_the_outputs_parked(node):
     driver = node.driver()
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     before = node.seen[2]
     assert calls.write([4.0]) == 0
     wait_for(lambda: node.seen[1] == pytest.approx(4.0, abs=2e-4), "the drive")
@@ -110,7 +110,7 @@ def test_a_silent_controller_gets_the_outputs_parked(node):
 
 def test_a_stopped_node_shows_in_status_and_age(node):
     driver = node.driver(hold_ticks=3)
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert calls.read()[0] == 0
     node.process.send_signal(signal.SIGSTOP)
     found = []
@@ -128,7 +128,7 @@ def test_a_stopped_node_shows_in_status_and_age(node):
 
 def test_a_second_controller_is_refused(node):
     driver, ending = node.driver(), threading.Event()
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
 
     def drive() -> None:
         while not ending.wait(0.005):
@@ -147,7 +147,7 @@ def test_a_second_controller_is_refused(node):
 
 def test_an_intruder_fails_the_driver(node):
     driver = node.driver()
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert (calls.read()[0], calls.write([0.0])) == (0, 0)
     with can.Bus(ignore_config=True, **options_on(node.port).keywords) as bus:
         bus.send(can.Message(arbitration_id=0x100, data=bytes([9, 0, 0, 16]), is_extended_id=False))

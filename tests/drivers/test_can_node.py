@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rtloop.drivers.can import node as node_module
-from rtloop.drivers.can.frames import exchange, load_frames
+from rtloop.drivers.can.frames import choose_exchange, load_frames
 from rtloop.drivers.can.node import RigNode
 from tests.drivers.can_bench import options_on
 
@@ -40,7 +40,7 @@ class Bench:
         self.now_s, self.sequence = 0.0, 0
         monkeypatch.setattr(node_module, "time", SimpleNamespace(monotonic=lambda: self.now_s))
         self.options = options_on(1, watchdog_ms=WATCHDOG_MS, park_slew_v_per_s=SLEW_V_PER_S)
-        self.drive = exchange(load_frames(self.options), 1, self.options).drive
+        self.drive = choose_exchange(load_frames(self.options), 1, self.options).drive
         self.wire = Wire()
         self.node = RigNode(self.wire, self.options, ["x"])
         self._hear(0, 0.0)

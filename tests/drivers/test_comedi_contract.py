@@ -11,7 +11,7 @@ import pytest
 
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.comedi import ComediDriver, ComediOptions
-from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError, MissingLibrary
 from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
 
@@ -74,7 +74,7 @@ class TestUnipolarOutput(TestOneAxis):
 def test_codes_are_the_nearest_and_come_back(tmp_path, volts):
     device = new_board(tmp_path / "comedi0")
     driver = comedi(device, {"x": Wiring("ai2", "ao2")})
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert calls.write([volts]) == 0
     assert output_v(device, 2) == pytest.approx(volts, abs=LSB_V / 2 * 1.0001)
     status, (read_v, age_us) = calls.read()
@@ -99,7 +99,7 @@ def test_an_output_stays_where_it_is_known_to_be(tmp_path, mute, share, told_v):
 def test_channels_are_not_mixed_up(tmp_path):
     device = new_board(tmp_path / "comedi0")
     driver = comedi(device, CROSSED, more_inputs=["ai7"])
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert [channel.name for channel in driver.facts.inputs] == ["ai1", "ai3", "ai7"]
     calls.write([3.0, -4.0])  # ao3, ao1
     assert calls.read()[1] == pytest.approx([-4.0, 3.0, 0.0, 0.0], abs=LSB_V)
@@ -109,7 +109,7 @@ def test_channels_are_not_mixed_up(tmp_path):
 def test_what_is_no_number_moves_no_output(tmp_path):
     device = new_board(tmp_path / "comedi0")
     driver = comedi(device, CROSSED)
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     calls.write([1.0, 2.0])
     before = hardware(device)["code"].tolist()
     assert calls.write([5.0, math.nan]) < 0
@@ -120,7 +120,7 @@ def test_what_is_no_number_moves_no_output(tmp_path):
 def test_a_failing_board_is_a_failed_driver_and_says_where(tmp_path):
     device = new_board(tmp_path / "comedi0")
     driver = comedi(device, CROSSED)
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert driver.error is None
     hardware(device)["fail_read"] = 1
     assert calls.read()[0] < 0

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rtloop.drivers import contract
-from rtloop.drivers.contract import Calls
+from rtloop.drivers.contract import DriverCalls
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.plan import require_facts
 from tests.drivers.bench_driver import LoopBack, LoopBackContract
@@ -75,7 +75,7 @@ def test_what_a_driver_raised_is_in_the_red_test(mutant):
 
 def test_an_exception_in_read_is_a_failed_driver_and_is_kept():
     driver = LoopBack()
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     driver.volts = ["not a number", 0.0]  # type: ignore[list-item]
     assert calls.read()[0] == -1
     assert isinstance(driver.error, TypeError)
@@ -84,7 +84,7 @@ def test_an_exception_in_read_is_a_failed_driver_and_is_kept():
 @pytest.mark.parametrize("volts", [[5.1, 2.0], [0.0, -0.1], [math.nan, 2.0], [0.0, math.inf]])
 def test_an_output_outside_its_range_is_refused_and_said(volts):
     driver = LoopBack()
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert calls.write([1.0, 3.0]) == 0
     assert calls.write(volts) == -1
     assert driver.volts == [1.0, 3.0]
@@ -93,7 +93,7 @@ def test_an_output_outside_its_range_is_refused_and_said(volts):
 
 def test_a_wrong_number_of_inputs_is_refused_and_said():
     driver = ForgetsAnInput()
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     assert calls.read()[0] == -1
     assert str(driver.error) == "driver 'loopback': read gave 3 numbers; its facts say 4"
 

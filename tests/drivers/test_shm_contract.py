@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rtloop.drivers.base import Driver, Wiring
-from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.hil.board import LSB_V, BoardMemory
@@ -95,7 +95,7 @@ def test_a_second_controller_is_refused_in_another_process(file):
 def test_a_paused_board_shows_in_the_sample_age(tmp_path):
     board = start_board(tmp_path / "board")
     driver = ShmDriver(ShmOptions(file=str(tmp_path / "board")), ONE, RATE_HZ)
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     board.send_signal(signal.SIGSTOP)
     time.sleep(0.05)
     first = calls.read()[1][1]

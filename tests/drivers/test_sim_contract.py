@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pytest
 
 from rtloop.drivers.base import Driver, Wiring
-from rtloop.drivers.contract import Calls, DriverContract
+from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.sim import SimDriver
 from rtloop.hil.options import RigOptions
 
@@ -44,7 +44,7 @@ def test_ranges_are_the_converters():
 def test_observed_signals_stand_beside_their_plant():
     """A plant's truth has the name of the axis that is wired to it, whatever the order of the axes."""
     driver = SimDriver(RigOptions(), THREE, 10_000.0)
-    calls = Calls(driver.open(), driver.facts)
+    calls = DriverCalls(driver.open(), driver.facts)
     for _ in range(200):
         calls.read()
         calls.write([1.0, 2.0, 3.0])

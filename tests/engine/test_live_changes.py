@@ -12,7 +12,7 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
-from rtloop.law.memory import view
+from rtloop.law.memory import slot_view
 from rtloop.law.reference import Generator
 from rtloop.laws.shipped.prandtl_ishlinskii import COEFFICIENTS
 from rtloop.signals import Mode
@@ -118,7 +118,7 @@ def test_a_count_beyond_its_record_is_a_trip_and_not_a_write(name: str, value: i
     bench.events()
     drive_v = float(bench.block["last_drive_v"][0])
     state = bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes()
-    controller, plays = (bench.law.of_law(0, slot, "coefficients") for slot in ("controller", "feedforward"))
+    controller, plays = (bench.law.slot_record(0, slot, "coefficients") for slot in ("controller", "feedforward"))
     controller.coupled = 1
     owner = next(record for record in (controller, plays, bench.law.coefficients[0]) if name in record.dtype.names)
     owner[name] = value
@@ -134,10 +134,10 @@ def test_a_law_whose_counts_do_not_fit_is_refused_and_the_old_one_goes_on():
     bench.run(100)
     bench.events()
     forged = bench.law.coefficients.copy()
-    view(forged[0], "feedforward", COEFFICIENTS).play_count = 68
+    slot_view(forged[0], "feedforward", COEFFICIENTS).play_count = 68
     bench.block["staged"][: forged.nbytes] = np.frombuffer(forged.tobytes(), np.uint8)
     bench.send(Kind.LOAD_LAW, 1.0, axis=0)
     bench.run(100)
     assert bench.outcome is Outcome.DONE
     assert [kind for _, kind, *_ in bench.events()] == [Kind.REFUSED]
-    assert bench.law.of_law(0, "feedforward", "coefficients").play_count == 16
+    assert bench.law.slot_record(0, "feedforward", "coefficients").play_count == 16

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rtloop.drivers.base import Facts, Wiring
-from rtloop.engine.ramp import found_v, ramp_to_safe
+from rtloop.engine.ramp import ramp_to_safe, starting_outputs_v
 from tests.drivers.bench_driver import WIRING, LoopBack
 
 SLEW_V_PER_S = 1000.0
@@ -55,5 +55,5 @@ def test_a_noted_drive_is_that_of_the_output_of_its_axis():
     """The axis has the second output: where the card cannot say it, that one is where it was noted, the other safe."""
     driver = FastLoopBack(1000.0)
     driver.wiring, driver.outputs_v = {"y": Wiring("ai1", "ao1")}, lambda: None
-    assert found_v(driver, [7.0]).tolist() == [0.0, 7.0]
-    assert found_v(driver, None).tolist() == [0.0, 2.0]
+    assert starting_outputs_v(driver, [7.0]).tolist() == [0.0, 7.0]
+    assert starting_outputs_v(driver, None).tolist() == [0.0, 2.0]

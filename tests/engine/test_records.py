@@ -34,9 +34,9 @@ def test_a_snapshot_a_second_each_at_the_state_before_its_tick():
     loop = bench()
     rows = loop.run(TICKS)
     snapshots = loop.drain("snapshots")
-    assert [loop.plan.layout.split(one, 1)[0] for one in snapshots] == [0, 10_000, 20_000]
+    assert [loop.plan.layout.split_snapshot(one, 1)[0] for one in snapshots] == [0, 10_000, 20_000]
     for one in snapshots:
-        tick, coefficients, axes, state = loop.plan.layout.split(one, 1)
+        tick, coefficients, axes, state = loop.plan.layout.split_snapshot(one, 1)
         law = LawBench(coefficients)
         law.axes[:], law.loops[:] = axes, state
         rest = rows[tick:]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rtloop.engine.messages import Kind
-from rtloop.recording.file.topics.events import event_of
+from rtloop.recording.file.topics.events import event_from_message
 from rtloop.signals import Flag
 from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, TUSTIN, LoopBench, text
@@ -67,7 +67,7 @@ def test_axis_value_and_limit(
     loop.run(200)
     trips = [message for message in loop.drain("events") if message["kind"] == Kind.TRIPPED]
     assert trips, cause
-    event = event_of(trips[0], ["x"], 0)
+    event = event_from_message(trips[0], ["x"], 0)
     flag = Flag[f"TRIP_{cause.upper()}"]
     assert (event["axis"], event["what"]["values"][3]) == ("x", float(flag))
     assert int(event["what"]["values"][0]) & flag
@@ -83,7 +83,7 @@ def test_a_trip_names_the_axis_that_is_to_blame() -> None:
     loop = LoopBench(text(channel, IDEAL, AXIS, second, driven, mode="raw"))
     loop.run(400)
     (trip,) = (message for message in loop.drain("events") if message["kind"] == Kind.TRIPPED)
-    event = event_of(trip, ["x", "y"], 0)
+    event = event_from_message(trip, ["x", "y"], 0)
     assert (event["axis"], event["what"]["values"][2]) == ("y", 5.0)
     assert event["what"]["values"][1] > 5.0
 
@@ -93,5 +93,5 @@ def test_a_trip_that_is_no_axis_fault_names_none() -> None:
     loop.driver.status = -5  # type: ignore[attr-defined]
     loop.run(3)
     (trip,) = (message for message in loop.drain("events") if message["kind"] == Kind.TRIPPED)
-    event = event_of(trip, ["x"], 0)
+    event = event_from_message(trip, ["x"], 0)
     assert (event["axis"], event["what"]["reason"], event["what"]["causes"]) == (None, None, ["driver"])

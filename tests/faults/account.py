@@ -10,7 +10,7 @@ import rtloop
 from rtloop.engine.assembly import SNAPSHOT_SECONDS
 from rtloop.engine.memory import SharedBlock
 from rtloop.recording.file.reader import Reader
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.replay.verdict import ReplayReport
 from rtloop.recording.views.summary import summarise
@@ -59,7 +59,7 @@ def account(folder: Path, blocks: list[SharedBlock]) -> Account:
         total = there + stated
         if number < len(blocks) and len(runs) == len(blocks) and total != int(blocks[number]["ticks_head"][0]):
             problems.append(f"{paths[0].name}: {total} ticks accounted, {blocks[number]['ticks_head'][0]} executed")
-        verdict = replay(recording, trust=Trust(recorded=True))  # a law of one's own is this suite's
+        verdict = replay(recording, trust=TrustedLaws(recorded=True))  # a law of one's own is this suite's
         left = unexplained(verdict, recording.header["rate_hz"])
         problems += [f"{paths[0].name}: replay: {problem}" for problem in left]
         if sum(gap["count"] for gap in verdict.gaps) > stated:

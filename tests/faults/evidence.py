@@ -101,7 +101,7 @@ class Evidence:
             record, unseen = np.memmap(self.folder / "card", plain_card.MEMORY, "r", shape=(1,))[0], 0
         else:
             memory = self.memory
-            record, unseen = memory.seen[0], int(memory.words[board.UNSEEN])
+            record, unseen = memory.evidence[0], int(memory.words[board.MISSED_WRITES])
         names = ("last_v", "lowest_v", "highest_v", "largest_step_v", "largest_window_v")
         return Seen(*(float(record[name]) for name in names), int(record["moved_ns"]), unseen)
 

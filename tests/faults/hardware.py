@@ -93,7 +93,7 @@ def unstable(bench: Bench) -> Measured:
     """The rig's resonance lies 5 % higher than the model's, from the beginning."""
     report = bench.await_state("tripped", "oscillation")
     wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
-    largest_um = float(bench.memory.seen[0]["largest_position_um"])
+    largest_um = float(bench.memory.evidence[0]["largest_position_um"])
     assert largest_um < 45.0, largest_um
     return Measured(note=f"|x| ≤ {largest_um:.1f} µm; {', '.join(report['trip'])}")
 

@@ -154,7 +154,7 @@ def parking_that_dies(bench: Bench) -> Measured:
     bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
     assert bench.service is not None
     bench.service.wait()
-    wait_for(lambda: bench.blocks[-1].driven_by() is None, "the loop's end")
+    wait_for(lambda: bench.blocks[-1].driver_pid() is None, "the loop's end")
     park(plan.driver(), slew_v_per_s, noted_v)
     halfway = 0
     for _ in range(DEATHS):

@@ -134,7 +134,7 @@ def main() -> int:
             except AssertionError as error:
                 said, verdict, failed = "?", f"FAILS: {error}", failed + 1
                 for name in ("largest_step_v", "largest_window_v"):
-                    bench.memory.seen[name] = 0.0
+                    bench.memory.evidence[name] = 0.0
             largest_v = max(largest_v, bench.seen().largest_window_v)
             print(f"{number + 1:4} {said}: {verdict}", flush=True)
         steps = f"at most {largest_v:.3f} V within 1 ms of {bench.bounds.window_v:.3f}"

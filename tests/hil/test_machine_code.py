@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rtloop.hil.native import cache, machine_code
-from rtloop.hil.native.c_function import CFunction, Entry, Outward
+from rtloop.hil.native.c_function import CFunction, Entry, ExportedKernel
 
 OUTWARD = ("rtloop.engine.assembly", *(f"rtloop.drivers.{name}" for name in ("sim", "shm", "comedi", "playback")))
 ROOT = Path(__file__).parents[2]
@@ -53,13 +53,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def compilations(kind: type[Entry | CFunction], monkeypatch) -> list[str]:
     """Names of the kernels that are compiled from here on."""
-    found, compiled = [], kind._compiled
+    found, compiled = [], kind._compile
 
     def noted(one):
         found.append(one.__name__)
         return compiled(one)
 
-    monkeypatch.setattr(kind, "_compiled", noted)
+    monkeypatch.setattr(kind, "_compile", noted)
     return found
 
 
@@ -74,11 +74,11 @@ def test_a_run_needs_no_compiler() -> None:
 def test_all_that_is_called_from_outside_is_kept() -> None:
     for module in OUTWARD:
         import_module(module)
-    found = [one for one in gc.get_objects() if isinstance(one, Outward) and one._name.startswith("rtloop.")]
+    found = [one for one in gc.get_objects() if isinstance(one, ExportedKernel) and one._name.startswith("rtloop.")]
     assert len(found) >= 15
     for one in found:
         assert one.address
-        assert machine_code.loaded(one._name), one._name
+        assert machine_code.load(one._name), one._name
 
 
 def test_it_is_compiled_once_and_does_the_same(folder, monkeypatch) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from rtloop.hil.options import BoucWenOptions, DynamicsOptions, HysteresisOptions
-from rtloop.hil.stages.hysteresis import play
+from rtloop.hil.stages.hysteresis import play_output
 
 # Eq (4): thresholds r_i [V] and weights p_i [µm/V].
 R = np.array([0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9])
@@ -123,33 +123,33 @@ def test_history_is_remembered(run, ideal):
 @given(volts, thresholds, volts)
 def test_play_is_the_definition(drive, threshold, held):
     """Krasnosel'skii & Pokrovskii 1989: max(u − r, min(u + r, y₋))."""
-    assert play(drive, threshold, held) == max(drive - threshold, min(drive + threshold, held))
+    assert play_output(drive, threshold, held) == max(drive - threshold, min(drive + threshold, held))
 
 
 @given(volts, thresholds, volts)
 def test_play_stays_within_its_threshold(drive, threshold, held):
-    assert abs(play(drive, threshold, held) - drive) <= threshold + 1e-14
+    assert abs(play_output(drive, threshold, held) - drive) <= threshold + 1e-14
 
 
 @given(volts, volts, thresholds, volts)
 def test_play_is_monotone(one, other, threshold, held):
     low, high = sorted((one, other))
-    assert play(low, threshold, held) <= play(high, threshold, held)
+    assert play_output(low, threshold, held) <= play_output(high, threshold, held)
 
 
 @given(volts, volts, thresholds, st.lists(st.floats(0, 1), max_size=8))
 def test_play_does_not_see_the_rate(start, end, threshold, stops):
     """On the way from one drive to another, any monotone stops in between change nothing."""
-    held = play(start, threshold, 0.0)
+    held = play_output(start, threshold, 0.0)
     walked = held
     for share in (*sorted(stops), 1.0):
-        walked = play(end if share == 1.0 else start + share * (end - start), threshold, walked)
-    assert walked == pytest.approx(play(end, threshold, held), abs=1e-13)
+        walked = play_output(end if share == 1.0 else start + share * (end - start), threshold, walked)
+    assert walked == pytest.approx(play_output(end, threshold, held), abs=1e-13)
 
 
 @given(thresholds, volts)
 def test_play_holds_on_nan(threshold, held):
-    assert play(float("nan"), threshold, held) == held
+    assert play_output(float("nan"), threshold, held) == held
 
 
 BOUC_WEN = {"um_per_v": 4.4, "rise_um_per_v": 0.9, "decay_per_v": 0.3, "lean_per_v": 0.1}

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from rtloop.hil.native.compiled import jit
 from rtloop.hil.options import ConverterOptions, DynamicsOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import build_rig
-from rtloop.hil.stages.converters import convert, span
-from rtloop.hil.stages.noise import draw, seed_word
+from rtloop.hil.stages.converters import lsb_and_range, quantise
+from rtloop.hil.stages.noise import draw_normal, seed_word
 
 RIGID = DynamicsOptions(form="zpk", gain=1.0)
 WORDS = 2**64
@@ -22,7 +22,7 @@ WORDS = 2**64
 @jit
 def _draws(word, out):
     for i in range(out.size):
-        out[i], word = draw(word)
+        out[i], word = draw_normal(word)
 
 
 def draws(seed: int, stream: str, count: int) -> np.ndarray:
@@ -107,27 +107,27 @@ def test_sensor_resolution_and_scale(run, ideal):
 )
 def test_converter_codes(value, code):
     """4 bits over ±10 V: an LSB of 1.25 V, codes −8 … 7, halves to the even code."""
-    assert convert(*span(10.0, 4), float(value)) == 1.25 * code
+    assert quantise(*lsb_and_range(10.0, 4), float(value)) == 1.25 * code
     if 2.5 > abs(value) > 0:
-        assert convert(*span(10.0, 4), float(value)) == 1.25 * round(Fraction(value) / Fraction(1.25))
+        assert quantise(*lsb_and_range(10.0, 4), float(value)) == 1.25 * round(Fraction(value) / Fraction(1.25))
 
 
 @given(st.floats(-9.9, 9.9), st.integers(8, 32))
 def test_converter_error_is_half_an_lsb_at_most(value, bits):
     lsb = 20 / 2**bits
-    out = convert(*span(10.0, bits), value)
+    out = quantise(*lsb_and_range(10.0, bits), value)
     assert abs(out - value) <= lsb / 2 * (1 + 1e-6)
     assert float(out / lsb).is_integer()
 
 
 @given(st.floats(-1e308, 1e308) | st.just(float("inf")) | st.just(float("-inf")))
 def test_ideal_converter_clips_only(value):
-    assert convert(*span(10.0, 0), value) == min(max(value, -10.0), 10.0)
+    assert quantise(*lsb_and_range(10.0, 0), value) == min(max(value, -10.0), 10.0)
 
 
 @pytest.mark.parametrize("bits", [0, 16])
 def test_nan_stays_visible_in_the_adc(bits):
-    assert np.isnan(convert(*span(10.0, bits), float("nan")))
+    assert np.isnan(quantise(*lsb_and_range(10.0, bits), float("nan")))
 
 
 @pytest.mark.parametrize("latency", [0, 1, 3, 16])

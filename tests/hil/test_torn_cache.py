@@ -67,7 +67,7 @@ def test_only_a_whole_file_is_read(
 ):
     path = tmp_path / "code.o"
     assert stored.read(path) is None
-    monkeypatch.setattr(stored, "_named", [])
+    monkeypatch.setattr(stored, "_quarantined", [])
     stored.write(path, b"machine code" * 100)
     assert stored.read(path) == b"machine code" * 100
     assert capfd.readouterr().err == ""
@@ -77,7 +77,7 @@ def test_only_a_whole_file_is_read(
     assert str(path) in capfd.readouterr().err
     assert not path.exists()
     assert stored.damaged_files(tmp_path) == []
-    assert stored.set_aside_files(tmp_path) == [Path(f"{path}{stored.DAMAGED}")]
+    assert stored.quarantined_files(tmp_path) == [Path(f"{path}{stored.DAMAGED}")]
 
 
 def test_a_writer_that_dies_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -108,11 +108,11 @@ def test_a_reader_of_stderr_that_stands_still_holds_nothing_up(tmp_path: Path, m
     reading, writing = os.pipe()
     fill(writing)
     monkeypatch.setattr(stored, "STDERR", writing)
-    monkeypatch.setattr(stored, "_named", [])
+    monkeypatch.setattr(stored, "_quarantined", [])
     (tmp_path / "code.o").write_bytes(b"")
     assert stored.read(tmp_path / "code.o") is None
     os.close(reading)
     (tmp_path / "code.o").write_bytes(b"")
-    monkeypatch.setattr(stored, "_named", [])
+    monkeypatch.setattr(stored, "_quarantined", [])
     assert stored.read(tmp_path / "code.o") is None
     os.close(writing)

@@ -8,8 +8,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtloop.hil.board import FIFO, LOOKED_NS, LSB_V, MAX_CHANNELS, TAKEN, UNSEEN, WORDS, WRITE, WRITTEN, see_writes
-from rtloop.hil.witness import LEVELS, PAST, SEEN
+from rtloop.hil.board import (
+    EXAMINED,
+    FIFO,
+    LOOKED_NS,
+    LSB_V,
+    MAX_CHANNELS,
+    MISSED_WRITES,
+    WORDS,
+    WRITE,
+    WRITTEN,
+    examine_writes,
+)
+from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS
 
 WINDOW_NS, BEGIN_NS = 1_000_000, 10**12
 
@@ -20,8 +31,8 @@ class Card:
     def __init__(self) -> None:
         self.words = np.zeros(WORDS, np.uint64)
         self.fifo = np.zeros(FIFO, WRITE).view(np.recarray)
-        self.seen = np.zeros(MAX_CHANNELS, SEEN).view(np.recarray)
-        self.past = np.zeros((MAX_CHANNELS, LEVELS), PAST).view(np.recarray)
+        self.seen = np.zeros(MAX_CHANNELS, EVIDENCE).view(np.recarray)
+        self.past = np.zeros((MAX_CHANNELS, MAX_LEVELS), LEVEL).view(np.recarray)
 
     def write(self, code: int, stated_ns: int) -> None:
         number = int(self.words[WRITTEN])
@@ -29,7 +40,7 @@ class Card:
         self.words[WRITTEN] += np.uint64(1)
 
     def look(self, now_ns: int) -> None:
-        see_writes(self.words, self.fifo, self.seen, self.past, 1, self.words[WRITTEN], now_ns, True)
+        examine_writes(self.words, self.fifo, self.seen, self.past, 1, self.words[WRITTEN], now_ns, True)
         self.words[LOOKED_NS] = now_ns
 
     def run(self, codes: np.ndarray, true_ns: np.ndarray, look_ns: np.ndarray, stated_ns: np.ndarray) -> None:
@@ -81,8 +92,8 @@ def test_steps_and_windows_are_right_however_rarely_the_board_looks(seed, look_p
     card = Card()
     card.run(codes, true_ns, look_ns, true_ns)
     assert card.evidence == by_all_pairs(codes * LSB_V, true_ns)
-    assert card.words[UNSEEN] == 0
-    assert card.words[TAKEN] == len(codes)
+    assert card.words[MISSED_WRITES] == 0
+    assert card.words[EXAMINED] == len(codes)
     assert card.seen[0].moved_ns == true_ns[np.flatnonzero(np.diff(codes))[-1] + 1]
 
 
@@ -108,10 +119,10 @@ def test_a_write_that_was_held_up_after_it_was_dated_is_no_steeper_for_it():
 
 def test_more_writes_within_a_window_than_are_remembered_are_said_to_be_unseen():
     card = Card()
-    for number in range(LEVELS + 10):
+    for number in range(MAX_LEVELS + 10):
         card.write(number % 2 + 1, BEGIN_NS + 2_000_000 + number)
     card.look(BEGIN_NS + 10_000_000)
-    assert card.words[UNSEEN] == 10
+    assert card.words[MISSED_WRITES] == 10
 
 
 def test_writes_that_the_card_could_not_keep_are_said_to_be_unseen():
@@ -119,12 +130,12 @@ def test_writes_that_the_card_could_not_keep_are_said_to_be_unseen():
     for number in range(FIFO + 5):
         card.write(number % 2, BEGIN_NS + number)
     card.look(BEGIN_NS + FIFO + 10)
-    assert card.words[UNSEEN] >= 5
+    assert card.words[MISSED_WRITES] >= 5
 
 
 def test_a_stuck_output_stays_while_its_writes_are_judged():
     card = Card()
     card.write(1000, BEGIN_NS + 5)
-    see_writes(card.words, card.fifo, card.seen, card.past, 1, card.words[WRITTEN], BEGIN_NS + 10, False)
+    examine_writes(card.words, card.fifo, card.seen, card.past, 1, card.words[WRITTEN], BEGIN_NS + 10, False)
     assert (card.seen[0].last_v, card.seen[0].moved_ns) == (0.0, 0)
     assert card.seen[0].largest_window_v == 1000 * LSB_V

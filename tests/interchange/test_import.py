@@ -10,7 +10,7 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from rtloop.interchange import aside
-from rtloop.interchange.reading import read_here
+from rtloop.interchange.reading import read_in_process
 from rtloop.interchange.sampling import grows_evenly
 from rtloop.recording.load import load
 from tests.asked import answer, run
@@ -26,7 +26,7 @@ VOLTS = np.sin(2 * np.pi * 50 * TIME)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the commands run; files are read in this process, to be quick."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("rtloop.commands.importing.read_table", read_here)
+    monkeypatch.setattr("rtloop.commands.importing.read_table", read_in_process)
     return tmp_path
 
 

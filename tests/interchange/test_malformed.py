@@ -15,7 +15,7 @@ from scipy.io import savemat
 from rtloop.interchange import aside
 from rtloop.interchange.formats import from_mat
 from rtloop.interchange.formats.table import UnreadableData
-from rtloop.interchange.reading import read_here
+from rtloop.interchange.reading import read_in_process
 
 HUGE = 2 << 30
 MEMORY_MIB = 400
@@ -83,11 +83,11 @@ def test_each_is_refused_in_a_line_and_in_bounded_memory(bad: dict[str, str], tm
 def test_what_expands_beyond_the_bound_is_not_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     savemat(tmp_path / "scan.mat", {"x": np.zeros(1 << 20)}, do_compression=True)
     assert (tmp_path / "scan.mat").stat().st_size < 1 << 16
-    assert read_here(tmp_path / "scan.mat").columns["x"].size == 1 << 20
-    monkeypatch.setattr(from_mat, "BYTES_AT_MOST", 1 << 22)
+    assert read_in_process(tmp_path / "scan.mat").columns["x"].size == 1 << 20
+    monkeypatch.setattr(from_mat, "MAX_BYTES", 1 << 22)
     monkeypatch.setattr(scipy.io, "loadmat", lambda *_, **__: pytest.fail("it is not to be read"))
     with pytest.raises(UnreadableData, match="holds more than"):
-        read_here(tmp_path / "scan.mat")
+        read_in_process(tmp_path / "scan.mat")
 
 
 def test_a_library_that_crashes_is_an_error_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -100,7 +100,7 @@ def test_a_library_that_crashes_is_an_error_of_the_file(tmp_path: Path, monkeypa
 def test_a_process_aside_reads_the_same(tmp_path: Path):
     numbers = np.random.default_rng(3).normal(size=100_000)
     savemat(tmp_path / "scan.mat", {"t": np.arange(100_000.0), "u": numbers})
-    table, expected = aside.read_table(tmp_path / "scan.mat"), read_here(tmp_path / "scan.mat")
+    table, expected = aside.read_table(tmp_path / "scan.mat"), read_in_process(tmp_path / "scan.mat")
     assert {name: values.tobytes() for name, values in table.columns.items()} == {
         name: values.tobytes() for name, values in expected.columns.items()
     }
@@ -113,7 +113,7 @@ def main() -> None:
     """Say what is wrong with each file, and then the memory that this process had at most, in MiB."""
     for name in sys.argv[1:]:
         try:
-            read_here(Path(name))
+            read_in_process(Path(name))
         except UnreadableData as fault:
             print(str(fault).replace("\n", "⏎"))
     status = Path(

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from rtloop.cli.interchange import import_command
 from rtloop.interchange.formats.table import UnreadableData
-from rtloop.interchange.reading import read_here
+from rtloop.interchange.reading import read_in_process
 from rtloop.recording.load import load
 
 ROWS = 50
@@ -96,7 +96,7 @@ def made(path: Path, canary: Path, *pointers: Pointer) -> Path:
 @pytest.mark.parametrize("ending", ["h5", "mat"])
 @pytest.mark.parametrize("pointer", [*POINTERS, reference])
 def test_what_lies_in_another_file_is_left_out_and_named(tmp_path: Path, canary: Path, ending: str, pointer: Pointer):
-    table = read_here(made(tmp_path / f"scan.{ending}", canary, pointer), "scan")
+    table = read_in_process(made(tmp_path / f"scan.{ending}", canary, pointer), "scan")
     columns = {name.rpartition("/")[2]: values for name, values in table.columns.items()}
     assert (columns["time"].tobytes(), columns["drive"].tobytes()) == (TIME.tobytes(), DRIVE.tobytes())
     assert not any(np.any(values == CANARY) for values in table.columns.values())
@@ -111,7 +111,7 @@ def test_links_within_a_file_are_followed(tmp_path: Path):
         inner["drive"] = h5py.SoftLink("raw")
         file["a"] = h5py.SoftLink("/b/inner")
         inner["lost"], inner["round"] = h5py.SoftLink("/b/none"), h5py.SoftLink("round")
-    table = read_here(tmp_path / "scan.h5")
+    table = read_in_process(tmp_path / "scan.h5")
     assert {name: values.tobytes() for name, values in table.columns.items()} == {
         "time": TIME.tobytes(), "drive": DRIVE.tobytes()
     }  # fmt: skip
@@ -125,7 +125,7 @@ def test_a_file_of_pointers_alone_holds_nothing(tmp_path: Path, canary: Path):
         for pointer in POINTERS:
             pointer(file, pointer.__name__, canary)
     with pytest.raises(UnreadableData, match="holds no column of numbers; in other files, and left out: external_link"):
-        read_here(path)
+        read_in_process(path)
 
 
 @pytest.mark.parametrize("ending", ["h5", "mat"])

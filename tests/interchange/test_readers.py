@@ -12,7 +12,7 @@ import pytest
 from scipy.io import savemat
 
 from rtloop.interchange.formats.table import Table, UnreadableData
-from rtloop.interchange.reading import read_here
+from rtloop.interchange.reading import read_in_process
 from tests.interchange.controldesk import write_controldesk
 
 TIME = np.arange(500) * 1e-4
@@ -39,7 +39,7 @@ def structures(fields: tuple[str, ...], *rows: tuple[Any, ...]) -> np.ndarray[An
 def test_controldesk(tmp_path: Path):
     path = tmp_path / "scan.mat"
     write_controldesk(path, TIME, {"Model Root/Piezo/Out1": (DRIVE, "mV"), "Model Root/Sensor/In1": (PLACE, "")})
-    table = read_here(path)
+    table = read_in_process(path)
     assert same(table, **{"Time": TIME, "Model Root__Piezo__Out1": DRIVE, "Model Root__Sensor__In1": PLACE})
     assert (table.time, table.units["Model Root/Piezo/Out1"]) == ("Time", "mV")
     assert table.about["description"] == "scan of 12 April"
@@ -49,41 +49,41 @@ def test_rasters_are_told_and_chosen(tmp_path: Path):
     x = structures(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", TIME[None, ::10], "slow"))
     y = structures(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None, ::10], 2.0))
     savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})
-    table = read_here(tmp_path / "scan.mat")
+    table = read_in_process(tmp_path / "scan.mat")
     assert same(table, Time=TIME, u=DRIVE)
     assert (table.about["group"], table.about["other groups"]) == ("fast", "'slow' (50 rows, 2 columns)")
-    assert same(read_here(tmp_path / "scan.mat", "slow"), Time=TIME[::10], T=PLACE[::10])
+    assert same(read_in_process(tmp_path / "scan.mat", "slow"), Time=TIME[::10], T=PLACE[::10])
     with pytest.raises(UnreadableData, match="no group 'middle'; there are 'fast', 'slow'"):
-        read_here(tmp_path / "scan.mat", "middle")
+        read_in_process(tmp_path / "scan.mat", "middle")
 
 
 def test_rasters_of_one_length_keep_apart(tmp_path: Path):
     x = structures(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", 10 * TIME[None], "slow"))
     y = structures(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None], 2.0))
     savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})
-    assert same(read_here(tmp_path / "scan.mat", "fast"), Time=TIME, u=DRIVE)
-    assert same(read_here(tmp_path / "scan.mat", "slow"), Time=10 * TIME, T=PLACE)
+    assert same(read_in_process(tmp_path / "scan.mat", "fast"), Time=TIME, u=DRIVE)
+    assert same(read_in_process(tmp_path / "scan.mat", "slow"), Time=10 * TIME, T=PLACE)
 
 
 def test_simulink(tmp_path: Path):
     both = np.column_stack([PLACE, 2 * PLACE])
     signals = structures(("values", "label"), (DRIVE[:, None], "drive"), (both, "place"))
     savemat(tmp_path / "a.mat", {"simout": {"time": TIME[:, None], "signals": signals, "blockName": "m/Scope"}})
-    table = read_here(tmp_path / "a.mat")
+    table = read_in_process(tmp_path / "a.mat")
     assert same(table, time=TIME, drive=DRIVE, place_1=PLACE, place_2=2 * PLACE)
     assert table.time == "time"
     savemat(tmp_path / "b.mat", {"ts": {"Time": TIME, "Data": DRIVE, "Name": "drive", "DataInfo": {"Units": "V"}}})
-    table = read_here(tmp_path / "b.mat")
+    table = read_in_process(tmp_path / "b.mat")
     assert same(table, Time=TIME, drive=DRIVE)
     assert (table.time, table.units) == ("Time", {"drive": "V"})
     savemat(tmp_path / "c.mat", {"ans": np.vstack([TIME, DRIVE, PLACE])})
-    assert same(read_here(tmp_path / "c.mat"), ans_1=TIME, ans_2=DRIVE, ans_3=PLACE)
+    assert same(read_in_process(tmp_path / "c.mat"), ans_1=TIME, ans_2=DRIVE, ans_3=PLACE)
 
 
 @pytest.mark.parametrize("version", ["5", "4"])
 def test_plain_arrays(version: str, tmp_path: Path):
     savemat(tmp_path / "a.mat", {"t": TIME, "u": DRIVE, "slow": np.arange(7.0), "fs": 1e4}, format=version)
-    table = read_here(tmp_path / "a.mat")
+    table = read_in_process(tmp_path / "a.mat")
     assert same(table, t=TIME, u=DRIVE)
     assert table.about["other groups"] == "'7 rows' (7 rows, 1 column)"
 
@@ -103,7 +103,7 @@ def test_matlab_73(tmp_path: Path):
                 places[k, 0] = cells[f"{field}{k}"].ref
     with (tmp_path / "a.mat").open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    table = read_here(tmp_path / "a.mat")
+    table = read_in_process(tmp_path / "a.mat")
     assert table.columns.keys() == {"t", "both_1", "both_2", "s/1/values", "s/2/values"}
     assert table.columns["both_2"].tobytes() == table.columns["s/2/values"].tobytes() == PLACE.tobytes()
     assert table.time == "t"
@@ -116,7 +116,7 @@ def test_a_reference_to_itself_ends(tmp_path: Path):
     with (tmp_path / "a.mat").open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     with pytest.raises(UnreadableData, match="leads back to itself"):
-        read_here(tmp_path / "a.mat")
+        read_in_process(tmp_path / "a.mat")
 
 
 def test_hdf5_in_groups_with_links_that_lead_back(tmp_path: Path):
@@ -126,14 +126,14 @@ def test_hdf5_in_groups_with_links_that_lead_back(tmp_path: Path):
         file["run/2/time"], file["run/2/u"] = TIME, PLACE
         file["loop"], file["run/back"], file["self"] = file["/"], h5py.SoftLink("/run"), h5py.SoftLink("/self")
         file["text"], file["steps"] = "words", np.zeros(9, "i2")
-    table = read_here(tmp_path / "a.h5")
+    table = read_in_process(tmp_path / "a.h5")
     assert same(table, time=TIME, u=DRIVE)
     assert table.units == {"u": "V"}
     assert table.about["left out"] == (
         "loop (a link back to what is there already), run/back (a link back to what is there already), "
         "self (a link that leads nowhere)"
     )
-    assert same(read_here(tmp_path / "a.h5", "run/2"), time=TIME, u=PLACE)
+    assert same(read_in_process(tmp_path / "a.h5", "run/2"), time=TIME, u=PLACE)
 
 
 def test_hdf5_of_nothing_but_a_loop(tmp_path: Path):
@@ -141,19 +141,19 @@ def test_hdf5_of_nothing_but_a_loop(tmp_path: Path):
         file["a/b"] = file.create_group("c")
         file["c/d"] = file["a"]
     with pytest.raises(UnreadableData, match="holds no column of numbers"):
-        read_here(tmp_path / "a.h5")
+        read_in_process(tmp_path / "a.h5")
 
 
 def test_numpy_and_pandas(tmp_path: Path):
     records = np.zeros(500, [("t", "f8"), ("n", "i4")])
     records["t"], records["n"] = TIME, np.arange(500)
     np.savez(tmp_path / "a.npz", log=records, pickled=np.array([{}], object))
-    table = read_here(tmp_path / "a.npz")
+    table = read_in_process(tmp_path / "a.npz")
     assert same(table, t=TIME, n=np.arange(500))
     assert table.about["left out"] == "pickled (pickled objects)"
     times = pandas.date_range("2024-03-01", periods=500, freq="100us", name="when")
     pandas.DataFrame({"u": DRIVE, "note": "a"}, index=times).to_parquet(tmp_path / "a.parquet")
-    table = read_here(tmp_path / "a.parquet")
+    table = read_in_process(tmp_path / "a.parquet")
     assert (table.time, table.about["left out"].split()[0]) == ("when", "note")
     assert np.allclose(table.columns["when"], TIME, atol=1e-12)
     assert table.columns["u"].tobytes() == DRIVE.tobytes()

@@ -12,10 +12,10 @@ from scipy.io import loadmat
 
 from rtloop.errors import RtloopError
 from rtloop.interchange import to_mat
-from rtloop.interchange.export import FORMATS, export
+from rtloop.interchange.export import EXPORT_SUFFIXES, export
 from rtloop.interchange.importing import import_data
-from rtloop.interchange.reading import read_here
-from rtloop.interchange.wanted import Wanted
+from rtloop.interchange.reading import read_in_process
+from rtloop.interchange.wanted import ColumnSelection
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.selection import Selection
 from rtloop.recording.views.summary import summarise
@@ -36,15 +36,17 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def exported(recording: Recording, to: str, folder: Path, selection: Selection | None = None) -> Path:
-    return Path(export(recording.paths[0], to, folder / f"back{FORMATS[to]}", None, selection or Selection())["output"])
+    return Path(
+        export(recording.paths[0], to, folder / f"back{EXPORT_SUFFIXES[to]}", None, selection or Selection())["output"]
+    )
 
 
 def imported(path: Path) -> Recording:
-    report = import_data(path, Wanted(), path.with_suffix(".mcap"), table=read_here(path))
+    report = import_data(path, ColumnSelection(), path.with_suffix(".mcap"), table=read_in_process(path))
     return load(report["output"])
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", EXPORT_SUFFIXES)
 def test_import_of_export_is_the_recording(to: str, recording: Recording, tmp_path: Path):
     back = imported(exported(recording, to, tmp_path))
     assert set(back) == set(recording)
@@ -97,10 +99,10 @@ def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):
         assert json.loads(file["events_json"][()]) == recording.events
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", EXPORT_SUFFIXES)
 def test_a_stretch_some_signals_and_every_so_many(to: str, recording: Recording, tmp_path: Path):
     selection = Selection(("x_*_v", "mode"), 0.1, 0.3, 7)
-    table = read_here(exported(recording, to, tmp_path, selection))
+    table = read_in_process(exported(recording, to, tmp_path, selection))
     kept = slice(1000, 3001, 7)
     expected = ["tick", "deadline_ns", "mode", "x_adc_v", "x_demand_v", "x_drive_v"]
     assert sorted(set(table.columns) - {"Time"}) == sorted(expected)
@@ -110,7 +112,7 @@ def test_a_stretch_some_signals_and_every_so_many(to: str, recording: Recording,
 def test_what_cannot_be_selected_leaves_no_file(recording: Recording, tmp_path: Path):
     with pytest.raises(RtloopError, match=r"no signal 'y_\*'; there are tick, deadline_ns, "):
         exported(recording, "csv", tmp_path, Selection(("y_*",)))
-    for to in FORMATS:
+    for to in EXPORT_SUFFIXES:
         with pytest.raises(RtloopError, match="holds no tick from 7 s on until 8 s"):
             exported(recording, to, tmp_path, Selection((), 7.0, 8.0))
     assert list(tmp_path.iterdir()) == []

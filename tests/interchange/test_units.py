@@ -10,9 +10,9 @@ import pytest
 
 from rtloop.errors import ConfigError
 from rtloop.interchange.formats.table import Table, UnreadableData
-from rtloop.interchange.mapping import axes_of, column_of, own_name, signal_name
+from rtloop.interchange.mapping import axis_names, default_signal_name, map_column, signal_name
 from rtloop.interchange.units import UnknownUnit, factor_between, is_unit
-from rtloop.interchange.wanted import Wanted, mapping_beside, read_mapping, wanted_by
+from rtloop.interchange.wanted import ColumnSelection, extend_selection, find_mapping, read_mapping
 
 HERE = Path("scan.csv")
 NAMES = ('"Model Root"/Piezo/Out1', "Sensor (nm)", "Piezo Out", "raw", "pos_nm", "b/raw2")
@@ -70,17 +70,17 @@ def test_what_is_a_unit_and_what_is_not():
     ],
 )
 def test_a_mapping_converts(signal: str, source: str, expected: list[float]):
-    assert column_of(TABLE, HERE, signal, source).values(TABLE).tolist() == expected
+    assert map_column(TABLE, HERE, signal, source).values(TABLE).tolist() == expected
 
 
 def test_what_is_assumed_of_a_unit_is_said():
     assert "no unit is known of 'raw'; it is taken for µm" in str(
-        column_of(TABLE, HERE, "x_position_um", "raw").assumed
+        map_column(TABLE, HERE, "x_position_um", "raw").assumption
     )
     assert "says that 'Piezo Out' is in mV; it is taken for V" in str(
-        column_of(TABLE, HERE, "x_drive_v", "Piezo Out [V]").assumed
+        map_column(TABLE, HERE, "x_drive_v", "Piezo Out [V]").assumption
     )
-    assert column_of(TABLE, HERE, "x_drive_v", "Piezo Out [mV]").assumed is None
+    assert map_column(TABLE, HERE, "x_drive_v", "Piezo Out [mV]").assumption is None
 
 
 @pytest.mark.parametrize(
@@ -94,35 +94,37 @@ def test_what_is_assumed_of_a_unit_is_said():
 )
 def test_a_mapping_that_cannot_be_says_why(source: str, message: str):
     with pytest.raises(UnreadableData, match=message):
-        column_of(TABLE, HERE, "x_position_um", source)
+        map_column(TABLE, HERE, "x_position_um", source)
 
 
 def test_a_name_that_fits_several_columns_is_refused():
     table = Table({"a/Out1": np.zeros(2), "b/Out1": np.zeros(2)})
     with pytest.raises(UnreadableData, match="several are called so: 'a/Out1', 'b/Out1'"):
-        column_of(table, HERE, "x_drive_v", "Out1")
+        map_column(table, HERE, "x_drive_v", "Out1")
 
 
 def test_names():
     assert signal_name("drive_v") == "x_drive_v"
     assert signal_name("y_drive_v") == "y_drive_v"
-    assert [own_name(name) for name in ("Größe (µm)", "1", "tick", '"Model Root"/A')] == [
+    assert [default_signal_name(name) for name in ("Größe (µm)", "1", "tick", '"Model Root"/A')] == [
         "Grosse", "column_1", "file_tick", "Model_Root_A"
     ]  # fmt: skip
-    assert axes_of(["x_drive_v", "long_name_position_um", "temperature"]) == ["x", "long_name"]
-    assert axes_of(["x_drive_v", "x_true_position_um", "x_2_drive_v"]) == ["x", "x_2"]
+    assert axis_names(["x_drive_v", "long_name_position_um", "temperature"]) == ["x", "long_name"]
+    assert axis_names(["x_drive_v", "x_true_position_um", "x_2_drive_v"]) == ["x", "x_2"]
 
 
 def test_the_mapping_beside_the_data(tmp_path: Path):
     data = tmp_path / "scan.mat"
-    assert mapping_beside(data) is None
+    assert find_mapping(data) is None
     (tmp_path / "map.toml").write_text('rate_hz = 100.0\nkeep = ["T"]\n[signals]\nx_drive_v = "U [V]"\n')
-    assert mapping_beside(data) == tmp_path / "map.toml"
+    assert find_mapping(data) == tmp_path / "map.toml"
     found = read_mapping(tmp_path / "map.toml")
-    assert found == Wanted({"x_drive_v": "U [V]"}, ("T",), rate_hz=100.0)
+    assert found == ColumnSelection({"x_drive_v": "U [V]"}, ("T",), rate_hz=100.0)
     (tmp_path / "scan.map.toml").write_text("all = true\n")
-    assert mapping_beside(data) == tmp_path / "scan.map.toml"
-    assert wanted_by(["x_drive_v=a=b", "A = 1", "T"], Wanted()) == Wanted({"x_drive_v": "a=b", "A": "1"}, ("T",))
+    assert find_mapping(data) == tmp_path / "scan.map.toml"
+    assert extend_selection(["x_drive_v=a=b", "A = 1", "T"], ColumnSelection()) == ColumnSelection(
+        {"x_drive_v": "a=b", "A": "1"}, ("T",)
+    )
 
 
 @pytest.mark.parametrize(

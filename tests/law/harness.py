@@ -12,12 +12,12 @@ from rtloop.configuration.coefficients import axis_coefficients, controller_of
 from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.drivers.base import Channel
 from rtloop.hil.native.compiled import jit
-from rtloop.law.access import loop_of, state_of
+from rtloop.law.access import axis_state, loop_state
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS, Records
-from rtloop.law.memory import LawMemory, records
-from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import layout_of
+from rtloop.law.memory import LawMemory, new_records
+from rtloop.laws.binding import bind_functions
+from rtloop.laws.registry import law_layout
 from rtloop.signals import Mode
 
 PERIOD_S = 1e-4
@@ -63,7 +63,7 @@ def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
         adc[0], reference[0], feed[0] = adc_v[k], references[k], feeds_um[k]
         evaluate(law, adc, reference, feed, conditions[k])
         update(law)
-        state, loop = state_of(law, 0), loop_of(law)
+        state, loop = axis_state(law, 0), loop_state(law)
         out[0, k], out[1, k], out[2, k] = state.drive_v, state.demand_v, state.command_um
         out[3, k], out[4, k] = state.applied_command_um, state.error_um
         out[5, k], out[6, k] = float(loop.tick_flags), float(loop.mode)
@@ -80,7 +80,7 @@ class LawBench:
     """A law at rest in `mode`, and its memory from one call to the next."""
 
     def __init__(self, coefficients: Records, mode: Mode = Mode.OFF) -> None:
-        self.law = LawMemory.at_rest(layout_of(LAWS), functions_of(LAWS), coefficients)
+        self.law = LawMemory.create_at_rest(law_layout(LAWS), bind_functions(LAWS), coefficients)
         set_mode(self.law.law, int(mode), True)
 
     @property
@@ -122,7 +122,7 @@ class LawBench:
         if reset:
             forgiven[0] = 1
         out = np.empty((len(Signals._fields), wanted.size))
-        conditions = records(CONDITIONS, wanted.size)
+        conditions = new_records(CONDITIONS, wanted.size)
         conditions["driver_status"], conditions["sample_age_us"] = status, age_us
         conditions["heartbeat_lost"], conditions["lateness_us"], conditions["enable_v"] = lost, late_us, enable_v
         adc = _spread(adc_v, wanted, float)
@@ -134,8 +134,8 @@ class LawBench:
         own = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
         memory = {name: self.axes[name].tobytes() for name in own}
         for name in ("inverse_plays_um", "model_plays_v", "dead_band_direction"):
-            memory[name] = np.asarray(self.law.of_law(0, "feedforward", "state")[name]).tobytes()
-        return {**memory, "controller": self.law.of_law(0, "controller", "state").controller.tobytes()}
+            memory[name] = np.asarray(self.law.slot_record(0, "feedforward", "state")[name]).tobytes()
+        return {**memory, "controller": self.law.slot_record(0, "controller", "state").controller.tobytes()}
 
     def is_finite(self) -> bool:
         """Whether all numbers that it remembers are."""

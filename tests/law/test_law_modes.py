@@ -9,7 +9,7 @@ import pytest
 from scipy import signal
 
 from rtloop.drivers.base import Channel
-from rtloop.law.memory import view
+from rtloop.law.memory import slot_view
 from rtloop.laws.shipped.transfer import COEFFICIENTS
 from rtloop.signals import Flag, Mode
 from tests.law.harness import EQ_4, EQ_20, EXACT, PERIOD_S, LawBench, coefficients_of
@@ -97,7 +97,7 @@ def test_off_ramps_to_the_safe_value_and_stays():
 def test_tick_zero_starts_from_zero_state():
     """Without a past there is nothing to continue: the first output is C(∞) e and not a bump's compensation."""
     signals = LawBench(PLAIN, Mode.CLOSED_LOOP).run([20.0])
-    assert signals.command_um[0] == pytest.approx(view(PLAIN[0], "controller", COEFFICIENTS).d * 20.0)
+    assert signals.command_um[0] == pytest.approx(slot_view(PLAIN[0], "controller", COEFFICIENTS).d * 20.0)
     assert LawBench(PLAIN, Mode.FEEDFORWARD).run([20.0]).command_um[0] == 20.0
     assert LawBench(PLAIN, Mode.RAW).run([7.0]).drive_v[0] == 7.0
 

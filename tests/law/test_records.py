@@ -7,7 +7,7 @@ import pytest
 
 from rtloop.engine.messages import MESSAGE
 from rtloop.law.layout import COEFFICIENTS, CONTROL, LOOP_STATE, STATE
-from rtloop.law.memory import records
+from rtloop.law.memory import new_records
 from rtloop.law.reference import GENERATOR, Generator
 from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
@@ -34,6 +34,6 @@ def test_kinds_of_generators_are_numbered_as_they_are_recorded():
 
 def test_records_begin_at_a_cache_line():
     """64 bytes: the kernels' loads of a record touch no line more than they must, wherever numpy found the memory."""
-    held = [records(CONTROL, count) for count in range(1, 40)]
+    held = [new_records(CONTROL, count) for count in range(1, 40)]
     assert {array.ctypes.data % 64 for array in held} == {0}
     assert [array.size for array in held] == list(range(1, 40))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from rtloop.hil.native.compiled import jit
-from rtloop.law.access import coefficients_of as of_axis
-from rtloop.law.access import loop_of, state_of
+from rtloop.law.access import axis_state, loop_state
+from rtloop.law.access import coefficients_record as of_axis
 from rtloop.law.law import evaluate, reset_trip, set_mode, update
 from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import records
+from rtloop.law.memory import new_records
 from rtloop.signals import Mode
 from tests.law.harness import EQ_20, EXACT, PERIOD_S, LawBench, coefficients_of
 
@@ -35,7 +35,7 @@ WILD = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 9.99e8, -9.99e8, 1e-310
 def soak(law, conditions, wild, seed, ticks):
     """Worst |drive|, worst move above the running slew, worst above the trip's, ticks in a running mode, trips."""
     np.random.seed(seed)
-    coefficients, state, loop = of_axis(law, 0), state_of(law, 0), loop_of(law)
+    coefficients, state, loop = of_axis(law, 0), axis_state(law, 0), loop_state(law)
     adc, reference, feed = np.zeros(1), np.zeros(1), np.zeros(1)
     largest_v, above_slew_v, above_trip_v, running, trips = 0.0, -np.inf, -np.inf, 0, 0
     level, amplitude, hz = 0.0, 0.0, 0.0
@@ -91,7 +91,7 @@ def test_soak(law):
     bench = LawBench(LAWS[law], Mode.CLOSED_LOOP)
     seed = sorted(LAWS).index(law)
     largest_v, above_slew_v, above_trip_v, running, trips = soak(
-        bench.law.law, records(CONDITIONS, 1)[0], WILD, seed, TICKS_EACH
+        bench.law.law, new_records(CONDITIONS, 1)[0], WILD, seed, TICKS_EACH
     )
     assert largest_v == 9.5
     assert above_slew_v <= 8 * np.spacing(9.5)

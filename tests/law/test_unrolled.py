@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from rtloop.law.layout import CONTROL
-from rtloop.law.memory import records
+from rtloop.law.memory import new_records
 from rtloop.laws.shipped.lanes import BLOCK, LANES
 from rtloop.laws.shipped.play_model import MAX_PLAYS
-from rtloop.laws.shipped.prandtl_ishlinskii import moved_plays_sum, plays_sum
+from rtloop.laws.shipped.prandtl_ishlinskii import move_and_sum_plays, plays_sum
 from rtloop.laws.shipped.transfer import COEFFICIENTS, MAX_ORDER, STATE, command
 
 RNG = np.random.default_rng(4)
@@ -29,7 +29,7 @@ def summed(terms: list[float], lanes: int = LANES) -> float:
 
 
 @pytest.mark.parametrize("count", range(0, MAX_PLAYS + 1, LANES))
-@pytest.mark.parametrize("kernel", [plays_sum, moved_plays_sum])
+@pytest.mark.parametrize("kernel", [plays_sum, move_and_sum_plays])
 def test_sums_of_plays(kernel, count):
     thresholds, weights = np.sort(RNG.uniform(0, 8, MAX_PLAYS)), RNG.normal(0, 3, MAX_PLAYS)
     for _ in range(20):
@@ -37,14 +37,14 @@ def test_sums_of_plays(kernel, count):
         expected = [play(value, float(thresholds[i]), float(plays[i])) for i in range(count)]
         found, before = kernel(value, thresholds, weights, plays, count, np.zeros(LANES)), plays.copy()
         assert found == summed([float(weights[i]) * expected[i] for i in range(count)])
-        if kernel is moved_plays_sum:
+        if kernel is move_and_sum_plays:
             before[:count] = expected
         assert plays.tobytes() == before.tobytes()
 
 
 @pytest.mark.parametrize("order", range(0, MAX_ORDER + 1, BLOCK))
 def test_the_controllers_output(order):
-    coefficients, state, told = records(COEFFICIENTS, 1), records(STATE, 1), records(CONTROL, 1)
+    coefficients, state, told = new_records(COEFFICIENTS, 1), new_records(STATE, 1), new_records(CONTROL, 1)
     for _ in range(20):
         c, x, error, direct = RNG.normal(size=MAX_ORDER), RNG.normal(size=MAX_ORDER), *RNG.normal(size=2)
         coefficients[0].c, coefficients[0].d, coefficients[0].order = c, direct, order

@@ -171,10 +171,10 @@ class RaisesWhatItMade(Good):
         s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um
 
 
-FINITE, WHOLE = "test_it_builds_numbers_that_can_be_computed_with", "test_whole_numbers_are_bounded"
+FINITE, WHOLE = "test_build_gives_finite_numbers", "test_whole_numbers_are_bounded"
 BITS, RECORD = "test_compiled_and_uncompiled_give_the_same_bits", "test_its_state_is_in_its_record"
 READ_ONLY, STAYS = "test_its_coefficients_are_read_only", "test_it_stays_finite"
-POISON, ENTERS = "test_no_number_that_is_none_outlives_an_entry", "test_it_goes_on_where_it_is_told_to"
+POISON, ENTERS = "test_no_number_that_is_none_outlives_an_entry", "test_enter_continues_from_the_command"
 WINDUP = "test_a_limited_command_does_not_wind_it_up"
 FOREIGN = "test_it_calls_nothing_that_waits_or_differs"
 BROKEN = {

@@ -22,10 +22,10 @@ from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind, message
 from rtloop.errors import ConfigError
 from rtloop.laws.conformance import Bench
-from rtloop.laws.linearise import linearised
+from rtloop.laws.linearise import linearise_at_rest
 from rtloop.recording.capture.session import Session
-from rtloop.recording.file.topics.events import event_of
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.file.topics.events import event_from_message
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing import live
 from rtloop.signals import Mode
@@ -96,7 +96,7 @@ def test_it_computes_what_its_matrices_say():
         bench, linear = Bench(law), law.linear()
         random, axes = np.random.default_rng(1), law.count
         errors_um = random.normal(size=(300, axes))
-        told, found = bench._told[0], []
+        told, found = bench._control[0], []
         for error_um in errors_um:
             told.error_um = error_um
             found.append(bench._commands(told))
@@ -105,7 +105,9 @@ def test_it_computes_what_its_matrices_say():
         _, expected, _ = signal.dlsim((*linear.system, PERIOD_S), errors_um)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 50) * PERIOD_S)
-        np.testing.assert_allclose(linearised(law).system.response(z), linear.system.response(z), rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(
+            linearise_at_rest(law).system.response(z), linear.system.response(z), rtol=1e-5, atol=1e-9
+        )
 
 
 def test_without_decoupling_it_is_its_loops_one_beside_the_other():
@@ -124,7 +126,7 @@ def test_a_limited_command_does_not_wind_it_up():
     for law in (example(EXAMPLES["coupled"]), state_space()):
         bench, (a, b, c, d) = Bench(law), law.linear().system
         bench.coefficients["share"] = 1.0
-        random, told, axes = np.random.default_rng(2), bench._told[0], law.count
+        random, told, axes = np.random.default_rng(2), bench._control[0], law.count
         for _ in range(50):
             told.error_um = random.normal(size=axes)
             bench._commands(told)
@@ -146,7 +148,7 @@ def test_what_it_remembers_does_not_matter_to_an_entry():
         first = bench.enter(*asked_um)
         state = bench.state["x"].copy()
         list(bench.run(20))
-        told = bench._told[0]
+        told = bench._control[0]
         told.position_um, told.error_um, told.command_um = asked_um
         told.applied_um = told.command_um
         bench._call("enter", told)
@@ -306,7 +308,7 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     for axis, aimed_um in (("x", 8.0), ("y", -6.0)):
         assert np.max(np.abs(np.diff(recording[f"{axis}_drive_v"][2000:]))) < 0.05
         assert abs(recording[f"{axis}_position_um"][-400:].mean() - aimed_um) < 0.1
-    report = replay(recording, trust=Trust(recorded=True))
+    report = replay(recording, trust=TrustedLaws(recorded=True))
     assert report.identical
     assert report.ticks == 3000 + 7 * 500
 
@@ -329,7 +331,7 @@ def test_a_mistake_trips_both_axes(tmp_path, line, said):
     rows = bench.run(300)
     trips = [event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED]
     assert len(trips) == 1
-    found = event_of(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
+    found = event_from_message(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
     assert said in found["reason"]
     assert "law 'mine'" in found["reason"]
     for axis in plan.axes:

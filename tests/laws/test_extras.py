@@ -14,8 +14,8 @@ from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.law.extras import ExtraOutput
 from rtloop.recording.capture.session import Session
-from rtloop.recording.file.topics.events import event_of
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.file.topics.events import event_from_message
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
 from tests.engine.harness import LoopBench
@@ -131,7 +131,7 @@ def test_an_output_that_is_no_number_trips(folder):
     rows = bench.run(50)
     assert set(bench.column(rows, "mode")[1:]) == {float(Mode.OFF)}
     assert set(bench.column(rows, "count_v")) == {0.0}
-    said = event_of(
+    said = event_from_message(
         next(event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED), ("x",), 0, ["", "", "mine"]
     )
     assert "law 'mine' returned inf from output of the controller" in said["what"]["reason"]
@@ -149,7 +149,7 @@ def test_a_replay_comes_to_the_same(folder):
     session.finish("finished")
     recording = rtloop.load(folder / "extras.mcap")
     assert recording["count_v"].max() == 0.75
-    report = replay(recording, trust=Trust(recorded=True))
+    report = replay(recording, trust=TrustedLaws(recorded=True))
     assert report.identical
     assert report.ticks == 6000
 

@@ -13,8 +13,8 @@ from rtloop.configuration.prepare import prepare
 from rtloop.engine.loop import Outcome
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
-from rtloop.recording.file.topics.events import event_of
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.file.topics.events import event_from_message
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
 from tests.engine.harness import AXIS, LoopBench, text
@@ -43,7 +43,7 @@ def test_it_trips_and_the_outputs_come_down(name, tmp_path):
     trips = [event for event in bench.drain("events") if event["kind"] == Kind.TRIPPED]
     assert bench.outcome is Outcome.DONE
     assert [int(event["tick"]) for event in trips] == [tick]
-    found = event_of(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
+    found = event_from_message(trips[0], plan.axes, 0, [law.kind for law in plan.laws])["what"]
     assert found["causes"] == ["law"]
     assert found["reason"].startswith("x: law 'mine' ")
     assert said in found["reason"]
@@ -60,7 +60,7 @@ def test_no_memory_but_its_own_is_written(name, tmp_path):
     """Bytes behind and before the law's records stay as they are, and so do its coefficients."""
     bench = LoopBench(plan_of(tmp_path, FAILING[name][0]))
     law = bench.law.layout.laws[-1]
-    room = bench.law.layout.room("controller")[1]
+    room = bench.law.layout.slot_bytes("controller")[1]
     behind = bench.law.axes["controller"][0, law.state.itemsize : room]
     behind[:] = CANARY
     before = bench.law.coefficients.tobytes(), bench.law.axes["feedforward"].tobytes()
@@ -102,7 +102,7 @@ def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
     assert code == 1
     assert "stood still and was killed; its outputs were parked" in said
     assert (summary["ticks_logged"], summary["ticks_lost"]) == (2000, 0)
-    report = replay(rtloop.load(summary["recording"]), trust=Trust(recorded=True))
+    report = replay(rtloop.load(summary["recording"]), trust=TrustedLaws(recorded=True))
     assert (report.ticks, report.first_difference) == (2000, None)
 
 

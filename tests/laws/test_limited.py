@@ -13,8 +13,8 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
 from rtloop.laws.limited import first
-from rtloop.laws.limited.process import MOST_PRINTED, PROCESS, LimitedProcess
-from rtloop.laws.registry import from_text
+from rtloop.laws.limited.process import MAX_OUTPUT_BYTES, PROCESS, LimitedProcess
+from rtloop.laws.registry import law_from_text
 from rtloop.service.service import Service
 from tests.faults.evidence import wait_for
 from tests.laws.failing import text as law_text
@@ -34,7 +34,7 @@ AT_IMPORT = {
     "raises what has no words": (NASTY, "raised OSError: no words, in line 3"),
     "ends its process": ("import os\nos._exit(0)\n", "ended its process (exit code 0)"),
     "reads where nothing is": ("import ctypes\nctypes.string_at(0)\n", "ended its process (SIGSEGV)"),
-    "prints for ever": ("while True:\n    print('x' * 1000)\n", f"printed more than {MOST_PRINTED >> 10} KiB"),
+    "prints for ever": ("while True:\n    print('x' * 1000)\n", f"printed more than {MAX_OUTPUT_BYTES >> 10} KiB"),
     "closes stdout": ("import sys\nsys.stdout.close()\n", "closed stdout"),
     "closes the file of stdout": ("import os\nos.close(1)\n", "closed stdout"),
     "replaces stdout": ("import io, sys\nsys.stdout = io.StringIO()\n", "replaced stdout"),
@@ -82,7 +82,7 @@ def test_a_file_that_does_as_it_is_read(name: str):
     text, sentence = AT_IMPORT[name]
     PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
     with pytest.raises(ConfigError) as refusal:
-        first.try_first("lab.toml", from_text, text + law_text(), "mine.py", "mine")
+        first.try_limited("lab.toml", law_from_text, text + law_text(), "mine.py", "mine")
     assert refusal.value.faults == [f"law 'mine' (mine.py): {sentence}"]
     assert refusal.value.exit_code == 78
 

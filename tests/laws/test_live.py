@@ -10,7 +10,7 @@ import rtloop
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.recording.capture.session import Options
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from tests.laws.changing import AT_CHANGE_V, CONTROLLERS, MORE, change_at_random, configuration, steps_of
 from tests.laws.failing import text as law_text
@@ -45,7 +45,7 @@ def test_any_law_follows_any_other(folder: Path, tmp_path: Path):
     assert together.at_change_v <= AT_CHANGE_V
     assert together.largest_v <= MORE * alone.largest_v
     assert together.limited == 0
-    report = replay(recording, trust=Trust(recorded=True))
+    report = replay(recording, trust=TrustedLaws(recorded=True))
     assert report.identical
     assert report.ticks == len(recording) > 100 * CHANGES
     assert report.snapshots > CHANGES // 2

@@ -18,7 +18,7 @@ from rtloop.law.memory import LawRecords
 from rtloop.laws.registry import LawReference, laws_in
 from rtloop.recording.capture.session import Session
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from tests.laws.failing import text as law_text
 from tests.recording.real_loop import Options, RealLoop
@@ -182,7 +182,7 @@ def tampered(header: dict) -> None:
 def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
     path = recorded(tmp_path, law_text(), tampered)
     with pytest.raises(RecordingError, match="its recorded text is not the one that ran"):
-        replay(rtloop.load(path), trust=Trust(recorded=True))
+        replay(rtloop.load(path), trust=TrustedLaws(recorded=True))
 
 
 def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
@@ -190,8 +190,8 @@ def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
     path = recorded(tmp_path, law_text())
     other = laws_in(law_text().replace("100.0", "99.0"), "other.py")
     with pytest.raises(RecordingError, match="not installed here"):
-        replay(rtloop.load(path), trust=Trust(other))
-    assert replay(rtloop.load(path), trust=Trust(laws_in(law_text(), "x.py"))).identical
+        replay(rtloop.load(path), trust=TrustedLaws(other))
+    assert replay(rtloop.load(path), trust=TrustedLaws(laws_in(law_text(), "x.py"))).identical
 
 
 def test_a_loop_knows_the_laws_alone_that_it_has_loaded(tmp_path: Path):
@@ -206,8 +206,8 @@ def test_a_loop_knows_the_laws_alone_that_it_has_loaded(tmp_path: Path):
 
 def test_records_are_made_of_whole_lines():
     law = laws_in(law_text(), "law.py")[0]
-    from rtloop.laws.registry import layout_of
+    from rtloop.laws.registry import law_layout
 
-    records: LawRecords = layout_of([law]).laws[0]
+    records: LawRecords = law_layout([law]).laws[0]
     assert records.coefficients.itemsize % 64 == records.state.itemsize % 64 == 0
     assert np.dtype(records.state).names is not None

@@ -113,11 +113,11 @@ def test_its_linear_part_is_that_of_its_equation(kind):
 
 
 def test_the_linear_part_of_c_of_z_is_found_by_running_it():
-    from rtloop.laws.linearise import linearised
+    from rtloop.laws.linearise import linearise_at_rest
 
     law = example(DEPLOY / "paper.toml")
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 200) * PERIOD_S)
-    np.testing.assert_allclose(linearised(law).system.response(z), law.discrete.system.response(z), rtol=1e-6)
+    np.testing.assert_allclose(linearise_at_rest(law).system.response(z), law.discrete.system.response(z), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("lead_ticks", "smooth_ticks"), [(0, 0), (2, 3)])
@@ -131,7 +131,7 @@ def test_the_repetitive_controller_follows_its_formula(lead_ticks, smooth_ticks)
         ki_per_s=ki_per_s, repeat_s=repeat * PERIOD_S, gain=gain, lead_ticks=lead_ticks, smooth_ticks=smooth_ticks
     )
     bench = Bench(Repetitive(options, PERIOD_S, None), compiled=False)
-    told, commands_um = bench._told[0], []
+    told, commands_um = bench._control[0], []
     errors_um = np.random.default_rng(3).normal(size=5 * repeat)
     limited_um = np.where(np.arange(errors_um.size) % 10 == 9, 0.1, 0.0)
     for error_um, less_um in zip(errors_um, limited_um, strict=True):

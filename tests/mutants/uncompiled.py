@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 _NUMBERS = 1 << 20
-"""Addresses below are numbers that `address_of` has given."""
+"""Addresses below are numbers that `register_function` has given."""
 _FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 
 
@@ -80,6 +80,6 @@ def install() -> None:
     np.seterr(over="ignore")  # compiled integers wrap around without a warning
     intrinsic = compiled.intrinsic
     uncompiled.carray = lambda pointer, shape, dtype=np.float64: array(pointer, shape, dtype)  # of C doubles, if unsaid
-    uncompiled.call, compiled.external = call, external
-    compiled.cfunc = compiled.entry = c_function_of
+    uncompiled.call, compiled.c_library_function = call, external
+    compiled.cfunc = compiled.python_entry = c_function_of
     compiled.intrinsic = lambda function, written=None: _ORDERED.get(function.__name__) or intrinsic(function, written)

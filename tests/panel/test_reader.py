@@ -15,7 +15,7 @@ import pytest
 from rtloop import load
 from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.engine.ring import claim, publish
-from rtloop.errors import HostRefused, UnavailableError
+from rtloop.errors import HostRefusal, UnavailableError
 from rtloop.panel.mapping import open_mapping
 from rtloop.panel.reader import MOST_TICKS, Reader
 from rtloop.panel.stretch import Stretch
@@ -130,7 +130,7 @@ def test_names_that_do_not_fit_and_a_block_that_others_may_change(
     with pytest.raises(UnavailableError, match="records of 3 signals, and 2 names"):
         Reader(tmp_path / "lab.block", lambda: COLUMNS[:2]).read()
     (tmp_path / "lab.block").chmod(0o666)
-    with pytest.raises(HostRefused, match="others may write"):
+    with pytest.raises(HostRefusal, match="others may write"):
         reader.read()
 
 
@@ -148,7 +148,7 @@ def test_what_is_read_is_what_is_recorded(tmp_path: Path):
             return parts[-1].end
 
         wait_for(lambda: read_on() > parts[0].end + 4000, "a second more")
-        assert bench.blocks[-1].driven_by() == bench.pid("rt")
+        assert bench.blocks[-1].driver_pid() == bench.pid("rt")
         bench.stop()
         while (stretch := reader.read()) is not None:
             parts.append(stretch)

@@ -17,7 +17,7 @@ from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
 from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
-from rtloop.law.memory import view
+from rtloop.law.memory import slot_view
 from rtloop.laws.shipped import transfer
 from rtloop.recording.capture import session as session_module
 from rtloop.recording.capture.session import Options, Session
@@ -112,7 +112,7 @@ def _recorded(path: Path, text: str) -> Path:
         while loop.tick < TICKS:
             if loop.tick == SWAP_TICK:
                 other = loop.prepared.plan.coefficients.copy()
-                view(other[0], "controller", transfer.COEFFICIENTS).d *= 0.9
+                slot_view(other[0], "controller", transfer.COEFFICIENTS).d *= 0.9
                 loop.block["staged"][: other.nbytes] = np.frombuffer(other.tobytes(), np.uint8)
                 send(loop.block, message(Kind.LOAD_LAW, axis=0, values=[1.0]))
             loop.run(CHUNK_TICKS)

@@ -18,9 +18,9 @@ from rtloop.configuration.laws import DEFAULT_LAWS
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.ring import claim, publish
-from rtloop.laws.registry import layout_of
+from rtloop.laws.registry import law_layout
 from rtloop.recording.file.topics.contents import Message
-from rtloop.recording.file.topics.events import event_of, recorder_event
+from rtloop.recording.file.topics.events import event_from_message, recorder_event
 from rtloop.recording.file.topics.format import EVENTS, LAW, chunk_rows
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import (
@@ -31,13 +31,13 @@ from rtloop.signals import (
     Flag,
     Mode,
     axis_column,
-    columns,
+    column_names,
 )
 
 RATE_HZ = 10_000.0
 AXES = ["x"]
 OBSERVED = ["x_true_position_um", "x_hysteresis_um"]
-COLUMNS = columns(AXES, OBSERVED)
+COLUMNS = column_names(AXES, OBSERVED)
 SNAPSHOT_BYTES = 200
 START_UNIX_NS = 1_763_680_000_000_000_000
 TIMEOUT_S = 60.0
@@ -78,7 +78,7 @@ def make_header(**changes: Any) -> dict[str, Any]:
         "paced": True,
         "ticks_expected": None,
         "configuration": "[loop]\nrate_hz = 10000.0\n# µ\n",
-        "law": json.loads(json.dumps(layout_of(DEFAULT_LAWS).description())),
+        "law": json.loads(json.dumps(law_layout(DEFAULT_LAWS).description())),
         "driver": {"kind": "sim"},
         "realtime": {"scheduler": "other", "priority": 0, "mlock": False, "affinity": [0], "kernel": "test"},
         "versions": {},
@@ -105,7 +105,7 @@ def write_recording(path: Path, rows: np.ndarray[Any, Any], **header: Any) -> Pa
         tick, time_ns = int(block[0, 0]), int(block[0, 1])
         data = snapshot(tick).tobytes()
         record = message(Kind.SET_MODE, tick=tick, values=[Mode.CLOSED_LOOP])[0]
-        event = json.dumps(event_of(record, AXES, time_ns)).encode()
+        event = json.dumps(event_from_message(record, AXES, time_ns)).encode()
         log_time = START_UNIX_NS + time_ns
         writer.write_messages(
             [Message(LAW, log_time, hashlib.sha256(data).digest() + data), Message(EVENTS, log_time, event)]

@@ -11,13 +11,13 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from rtloop.engine.memory import Word
-from rtloop.recording.capture.conditions import Conditions, comparison_of, unknown_signal
+from rtloop.recording.capture.conditions import Conditions, parse_comparison, signal_problem
 from rtloop.recording.capture.decimation import Decimation
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import layout
 from rtloop.recording.file.recover import recover
-from rtloop.recording.file.topics.overview import uncovered
+from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.load import Recording, load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.bands import read_bands
@@ -116,7 +116,7 @@ def test_every_stretch_replays_identical(selected: Path, expected: list[int]):
 
 def test_every_stretch_is_cut_out_and_replays_by_itself(selected: Path, tmp_path: Path):
     recording = load(selected)
-    for number, (first, count) in enumerate(uncovered(0, TICKS, recording.skipped)):
+    for number, (first, count) in enumerate(uncovered_ranges(0, TICKS, recording.skipped)):
         made = cut(selected, first + 5, first + count, tmp_path / f"{number}.mcap")
         report = replay(load(made["output"]))
         assert (made["complete"], report.identical, report.ticks, report.stretches) == (True, True, count, 1)
@@ -266,17 +266,17 @@ def test_conditions_hold_where_they_say():
     for text, expected in cases.items():
         if expected is None:
             with pytest.raises(ValueError, match="no condition"):
-                comparison_of(text)
+                parse_comparison(text)
             continue
-        (hit,) = Conditions([text], columns).find(rows, events)
+        (hit,) = Conditions([text], columns).find_hits(rows, events)
         assert ((hit.first, hit.last), hit.condition) == (expected, text)
-    assert Conditions(["v > 100", "v != 1e300"], columns).find(rows[7:8], []) == []  # NaN is nowhere
-    assert unknown_signal("vv > 1", columns) == "'vv > 1': no signal 'vv'; did you mean v?; there are " + ", ".join(
+    assert Conditions(["v > 100", "v != 1e300"], columns).find_hits(rows[7:8], []) == []  # NaN is nowhere
+    assert signal_problem("vv > 1", columns) == "'vv > 1': no signal 'vv'; did you mean v?; there are " + ", ".join(
         columns
     )
     for wrong in ("", "v", "v >", "abs(v > 1", "v > 1 > 2", "trips", "v > nan"):
         with pytest.raises(ValueError, match="no condition"):
-            comparison_of(wrong)
+            parse_comparison(wrong)
 
 
 def test_a_replacement_keeps_what_follows_as_long_as_after_an_event(tmp_path: Path):
@@ -298,7 +298,7 @@ def test_the_mean_over_an_interval_is_that_of_the_numbers_in_it():
     rows[:, 1] = [4.0, np.nan, 8.0, np.nan, np.nan, np.nan]
     rows[:, 2] = [1.0, 2.0, 6.0, 5.0, np.nan, 7.0]
     decimation = Decimation(columns=3, every=3)
-    decimation.add(rows)
-    first, second = decimation.close()
+    decimation.add_rows(rows)
+    first, second = decimation.take_intervals()
     np.testing.assert_array_equal(first, [[0.0, 2.0, 1.0], [4.0, 8.0, 6.0], [1.0, 6.0, 3.0]])
     np.testing.assert_array_equal(second, [[3.0, 5.0, 4.0], [np.nan] * 3, [5.0, 7.0, 6.0]])

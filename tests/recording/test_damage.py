@@ -180,7 +180,7 @@ def _other_columns(path: Path) -> None:
     """A header whose columns are not those of the schema."""
     header = make_header()
     writer = Writer(path, header, 1)
-    writer._file.drop_last()
+    writer._file.drop_last_chunk()
     header["columns"] = [*header["columns"][:-1], "another_um"]
     repeated = [*format.schemas(make_header()["columns"]), *format.channels()]
     writer._write_header(header, 1, repeated)

@@ -22,7 +22,7 @@ from rtloop.errors import OutputError
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.format import TICKS, chunk_rows, tick_dtype, tick_schema
 from rtloop.recording.file.writer import Writer
-from rtloop.signals import DRIVER_STATUS, FLAGS, MODE, PERIODS_MISSED, columns
+from rtloop.signals import DRIVER_STATUS, FLAGS, MODE, PERIODS_MISSED, column_names
 from tests.recording.hand_made_loop import (
     COLUMNS,
     START_UNIX_NS,
@@ -141,7 +141,7 @@ def test_chunks_are_small_and_without_padding(path: Path):
 def test_the_schema_is_what_protobuf_itself_would_write():
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 
-    names = columns([f"axis{n}" for n in range(30)], ["a_um", "b_v"])
+    names = column_names([f"axis{n}" for n in range(30)], ["a_um", "b_v"])
     expected = FileDescriptorSet()
     file = expected.file.add(name="rtloop/tick.proto", package="rtloop", syntax="proto2")
     message = file.message_type.add(name="Tick")
@@ -157,7 +157,7 @@ def test_the_schema_is_what_protobuf_itself_would_write():
 
 def test_many_axes(tmp_path: Path):
     axes = [f"a{n}" for n in range(12)]
-    names = columns(axes, [])
+    names = column_names(axes, [])
     rows = np.random.default_rng(3).normal(size=(50, len(names)))
     rows[:, 0], rows[:, 1] = np.arange(50), np.arange(50) * 1e5
     path = write_recording(tmp_path / "run.mcap", rows, axes=axes, observed=[], columns=list(names))

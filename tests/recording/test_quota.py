@@ -18,10 +18,10 @@ import pytest
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
-from rtloop.recording.capture.names import Names
+from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.topics.contents import Message
-from rtloop.recording.file.topics.events import event_of
+from rtloop.recording.file.topics.events import event_from_message
 from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import Flag
@@ -45,7 +45,9 @@ def write(
     writer = Writer(folder / f"{stem}.mcap", said, START_UNIX_NS)
     if trip is not None:
         record = message(kind, tick=trip, axis=0, values=[Flag.TRIP_POSITION])[0]
-        writer.write_messages([Message(EVENTS, START_UNIX_NS, json.dumps(event_of(record, AXES, 0)).encode())])
+        writer.write_messages(
+            [Message(EVENTS, START_UNIX_NS, json.dumps(event_from_message(record, AXES, 0)).encode())]
+        )
     writer.write_ticks(make_rows(1_000, first=first))
     writer.finish(lambda logged: final_message(first + PART, logged))
     return writer.path
@@ -179,7 +181,7 @@ def test_the_recorder_is_told_what_went_and_a_failure_is_said_once(tmp_path: Pat
     files = run_of(folder, "20260101T000001", 3)
     loop.block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
     options = RecordingOptions(keep_gib=1e-9)
-    keeper = RecorderKeeper(child, loop.block, Names.create(), folder / "test-now.mcap", options)  # pyright: ignore
+    keeper = RecorderKeeper(child, loop.block, RequesterNames.create(), folder / "test-now.mcap", options)  # pyright: ignore
     keeper.start({"name": "test"})
     assert set(json.loads(child.heard.get(timeout=60))) == {"path", "header", "options"}
     lines = b""

@@ -20,7 +20,7 @@ from rtloop.recording.capture import recorder as module
 from rtloop.recording.capture.recorder import Recorder
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
-from rtloop.recording.file.topics.events import message_of
+from rtloop.recording.file.topics.events import message_from_event
 from rtloop.recording.load import load
 from rtloop.signals import Mode
 from tests.recording.hand_made_loop import (
@@ -77,7 +77,7 @@ def test_events_keep_their_values_and_say_what_they_mean(loop, recorder, tmp_pat
     mode, failure, trip, _ = load(tmp_path / "run.mcap").events
     assert (mode["kind"], mode["who"], mode["what"]["mode"]) == ("set_mode", "schedule", "feedforward")
     assert (trip["axis"], trip["what"]["causes"], trip["time_ns"]) == ("x", ["position", "stale"], 1_500_000)
-    assert message_of(failure, AXES).tobytes() == record.tobytes()
+    assert message_from_event(failure, AXES).tobytes() == record.tobytes()
 
 
 def test_snapshots_and_commands_stand_in_front_of_the_ticks_they_precede(loop, recorder, tmp_path):

@@ -17,7 +17,7 @@ from rtloop.errors import OutputError
 from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.chunkfile import ChunkFile
-from rtloop.recording.file.recover import leftovers, recover
+from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.load import load
 from rtloop.recording.views.summary import summarise
@@ -100,7 +100,7 @@ def test_a_lock_that_cannot_be_asked_for_leaves_a_file_alone(part: Path, monkeyp
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(RecordingError, match="cannot be locked"):
         recover(part)
-    assert leftovers(part.parent) == []
+    assert find_leftovers(part.parent) == []
 
 
 @pytest.mark.parametrize("kind", [recover, cut], ids=["recover", "cut"])

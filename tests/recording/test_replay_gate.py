@@ -138,7 +138,7 @@ def test_differences_of_state_are_named():
     data = bytes(loop.block["snapshots_slots"][0])[8:]
     other = bytearray(data)
     law = loop.law.layout
-    within = COEFFICIENTS.itemsize + law.room("feedforward")[0] + transfer.COEFFICIENTS.fields["b"][1]  # type: ignore[index]
+    within = COEFFICIENTS.itemsize + law.slot_bytes("feedforward")[0] + transfer.COEFFICIENTS.fields["b"][1]  # type: ignore[index]
     place = law.coefficients.itemsize + within + 8
     other[place] ^= 1
     name, recorded, replayed_value = first_difference(data, bytes(other), ["x", "y"], loop.law)

@@ -20,16 +20,16 @@ import scipy.io  # noqa: F401
 
 from rtloop.commands.law import new_law
 from rtloop.commands.output import write_over
-from rtloop.design.identification.identified import write_new
-from rtloop.design.identification.plots import save
+from rtloop.design.identification.identified import write_new_file
+from rtloop.design.identification.plots import save_figure
 from rtloop.errors import OutputError, RtloopError
 from rtloop.interchange.export import export
 from rtloop.interchange.formats.table import Table
 from rtloop.interchange.importing import import_data
-from rtloop.interchange.wanted import Wanted
+from rtloop.interchange.wanted import ColumnSelection
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.recover import leftovers, recover
+from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.recording.file.writer import Writer
 from rtloop.recording.load import load
 from rtloop.recording.views.page import write_page
@@ -106,7 +106,7 @@ def unfinished(path: Path) -> Callable[[], None]:
 
 def imported(folder: Path) -> Any:
     table = Table({"time": np.arange(100) * 1e-3, "drive": np.arange(100.0)}, {"time": "s", "drive": "V"}, "time")
-    return import_data(folder / "scan.csv", Wanted(everything=True), table=table)
+    return import_data(folder / "scan.csv", ColumnSelection(everything=True), table=table)
 
 
 FIGURE = SimpleNamespace(savefig=lambda file, **_: file.write(b"png"))
@@ -121,9 +121,9 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
         for part in ("", ".part")
     },
     "old.html": lambda folder: write_page(folder / "old.mcap"),
-    "fit.png": lambda folder: save(FIGURE, folder / "fit.png"),
+    "fit.png": lambda folder: save_figure(FIGURE, folder / "fit.png"),
     "design.toml": lambda folder: write_over(folder / "design.toml", b"new"),
-    "found.toml": lambda folder: write_new(folder / "found.toml", "new"),
+    "found.toml": lambda folder: write_new_file(folder / "found.toml", "new"),
     "lead.py": lambda folder: new_law("lead", folder),
 }
 """How each file comes to be written, in a folder that holds old.mcap and scan.csv."""
@@ -246,7 +246,7 @@ def test_a_pipe_among_unfinished_recordings_stops_nobody(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.mcap.part")
     os.mkfifo(tmp_path / "pipe.mcap")
     unfinished(tmp_path / "run.mcap")()
-    assert leftovers(tmp_path) == [tmp_path / "run.mcap.part"]
+    assert find_leftovers(tmp_path) == [tmp_path / "run.mcap.part"]
     for name in ("pipe.mcap.part", "pipe.mcap"):
         with pytest.raises(RecordingError, match=r"pipe\.mcap.*: not a regular file"):
             recover(tmp_path / name)
@@ -263,7 +263,7 @@ def test_unfinished_recordings_of_others_are_not_completed_in_our_name(shared: P
     member(VICTIM, unfinished(shared / "own.mcap"))
     member(ATTACKER, unfinished(shared / "theirs.mcap"))
     member(ATTACKER, lambda: (shared / "laid.mcap.part").symlink_to(private / "secret.mcap.part"))
-    assert member(VICTIM, lambda: [path.name for path in leftovers(shared)]) == ["own.mcap.part"]
+    assert member(VICTIM, lambda: [path.name for path in find_leftovers(shared)]) == ["own.mcap.part"]
     assert member(VICTIM, lambda: recover(shared / "theirs.mcap.part")["ticks"]) == 1_000  # named, it is recovered
 
 
@@ -276,7 +276,7 @@ def test_a_recording_goes_on_in_its_own_file_alone(shared: Path, precious: Path)
         writer.write_ticks(make_rows(1_000))
         writer.part.rename(shared / "away")
         writer.part.symlink_to(precious)
-        lost = not writer.is_there()
+        lost = not writer.is_in_place()
         with pytest.raises(OutputError, match="was removed"):
             writer.write_ticks(make_rows(1_000, first=1_000))
         with pytest.raises(OutputError, match="was removed"):

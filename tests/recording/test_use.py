@@ -13,9 +13,9 @@ from PIL import Image
 from rtloop.errors import MissingExtra, OutputError
 from rtloop.interchange.export import export
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.load import load, unit_of
+from rtloop.recording.load import load, signal_unit
 from rtloop.recording.views.bands import read_bands
-from rtloop.recording.views.histogram import Histogram
+from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.recording.views.plot import plot
 from rtloop.recording.views.summary import AxisSummary, summarise
 from rtloop.signals import Flag, Mode
@@ -92,7 +92,7 @@ def test_summary_of_an_empty_run(tmp_path: Path):
 
 
 def test_large_times_keep_their_leading_digits():
-    histogram = Histogram()
+    histogram = TimeHistogram()
     values = np.geomspace(1.0, 1e7, 5_000)
     histogram.add(values)
     exact = np.quantile(values, [0.1, 0.5, 0.999], method="inverted_cdf")
@@ -106,7 +106,7 @@ def test_load_gives_signals_by_name(path: Path, rows: np.ndarray):
     assert recording.time_s == pytest.approx(np.arange(COUNT) / 10_000.0)
     assert (len(recording), list(recording), "tick" in recording) == (COUNT, list(COLUMNS), True)
     assert recording.units["x_drive_v"] == "V"
-    assert unit_of("x_true_position_um") == "µm"
+    assert signal_unit("x_true_position_um") == "µm"
     assert recording.configuration.startswith("[loop]")
     assert recording.events[0]["kind"] == "set_mode"
     assert [one.tick for one in recording.snapshots()][1] == 1_000
@@ -192,6 +192,6 @@ def test_decimation_keeps_every_peak(tmp_path: Path):
 
 
 def test_times_are_counted_to_the_nearest_nanosecond():
-    histogram = Histogram()
+    histogram = TimeHistogram()
     histogram.add(np.array([0.0006, 0.0014, 0.0016, 7.0004999]))
     assert histogram.quantiles_us(0.25, 0.5, 0.75, 1.0) == [0.001, 0.001, 0.002, 7.0]

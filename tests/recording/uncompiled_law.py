@@ -17,28 +17,28 @@ from rtloop.hil.native import uncompiled
 from rtloop.law import memory
 from rtloop.law.law import evaluate, update
 from rtloop.law.layout import CONDITIONS
-from rtloop.law.memory import LawMemory, records
-from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import layout_of
+from rtloop.law.memory import LawMemory, new_records
+from rtloop.laws.binding import bind_functions
+from rtloop.laws.registry import law_layout
 from rtloop.signals import Mode
 from tests.recording.law_fields import COUNTS, fields_of
 
 TICKS, SEED, TRIES = 2, 3, 400
-LAYOUT, FUNCTIONS = layout_of(DEFAULT_LAWS), functions_of(DEFAULT_LAWS)
+LAYOUT, FUNCTIONS = law_layout(DEFAULT_LAWS), bind_functions(DEFAULT_LAWS)
 
 
 def reaches_beyond(data: bytes, axes: int) -> bool:
     """Whether the law, run from a snapshot whatever it says, leaves its arrays."""
     unchecked = {"require_owners": DEFAULT, "require_allowed": DEFAULT}
-    with patch.object(memory.Layout, "require"), patch.multiple(memory, **unchecked):
-        _, *arrays = LAYOUT.split(data, axes)
+    with patch.object(memory.Layout, "require_allowed_axis"), patch.multiple(memory, **unchecked):
+        _, *arrays = LAYOUT.split_snapshot(data, axes)
     numbers = arrays[0][["feedforward_law", "controller_law", "controller_axes"]].tolist()
     if numbers != [(0, 1, 1)] * axes:
         return True  # a function that is not there, or one of the other kind
     law = LawMemory(LAYOUT, FUNCTIONS, *arrays)
-    uncompiled.raised.clear()
+    uncompiled.raised_exceptions.clear()
     law.state.mode = Mode.CLOSED_LOOP
-    conditions = records(CONDITIONS, 1)[0]
+    conditions = new_records(CONDITIONS, 1)[0]
     try:
         with np.errstate(all="ignore"):
             for _ in range(TICKS):
@@ -46,13 +46,13 @@ def reaches_beyond(data: bytes, axes: int) -> bool:
                 update(law.law)
     except IndexError:
         return True
-    return any(isinstance(error, IndexError) for error in uncompiled.raised)
+    return any(isinstance(error, IndexError) for error in uncompiled.raised_exceptions)
 
 
 def accepted(data: bytes, axes: int) -> bool:
     """Whether a snapshot is let through."""
     try:
-        LAYOUT.split(data, axes)
+        LAYOUT.split_snapshot(data, axes)
     except ValueError:
         return False
     return True

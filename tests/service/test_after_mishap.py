@@ -14,7 +14,7 @@ import pytest
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.errors import LoopFault
-from rtloop.recording.capture.names import Names
+from rtloop.recording.capture.names import RequesterNames
 from rtloop.service import service as service_module
 from rtloop.service.service import Service
 from rtloop.supervision import parking, recorder_keeper
@@ -52,7 +52,7 @@ def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monk
     """From either end of the range: 10 V at 2 V/s after a heartbeat of 1 s; only then is it killed."""
     clock, killed_s = Clock(), list[float]()
     monkeypatch.setattr(parking, "time", clock)
-    monkeypatch.setattr(SharedBlock, "driven_by", lambda _: None if killed_s else 4711)
+    monkeypatch.setattr(SharedBlock, "driver_pid", lambda _: None if killed_s else 4711)
     monkeypatch.setattr(SharedBlock, "kill_driver", lambda _: killed_s.append(clock.now_s))
     block["last_drive_v"][:] = drive_v
     parking._await_end(block, 1.0, 2.0)
@@ -106,7 +106,7 @@ class Recorder:
 
 def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
     options = RecordingOptions()
-    keeper = RecorderKeeper(Recorder(), block, Names.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
+    keeper = RecorderKeeper(Recorder(), block, RequesterNames.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
     keeper._ordered = True
     return keeper
 

@@ -45,7 +45,7 @@ def test_what_is_built_beside_is_what_is_built_here(beside: LimitedProcess):
 
 
 def test_one_that_is_expected_waits_before_the_first_change(beside: LimitedProcess):
-    beside.expect(prepare)
+    beside.prepare_ahead(prepare)
     pid = beside.pid
     assert pid is not None
     assert beside.run(prepare, configuration()).plan.axes == ("x",)

@@ -14,8 +14,8 @@ import pytest
 from rtloop.configuration.file import load
 from rtloop.engine.messages import Kind, Origin, message
 from rtloop.errors import ConfigError
-from rtloop.recording.capture.names import Names
-from rtloop.recording.file.topics.events import OPERATOR, event_of, message_of, name_fault
+from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.file.topics.events import OPERATOR, event_from_message, message_from_event, name_problem
 from rtloop.service.api.application import application
 from rtloop.service.desk import Desk, Refused
 from rtloop.service.lock import Lock
@@ -130,21 +130,21 @@ def test_the_configuration_has_a_digest_and_no_key(tmp_path: Path, key: str):
 
 
 def test_names_are_found_by_the_recorder_until_others_take_their_place():
-    names = Names.create()
-    recorder = Names(names.fd)
-    names.note(17, "ada")
-    names.note(18, "é李" * 20)
-    assert [recorder.of(identity) for identity in (0, 16, 17, 18)] == [None, None, "ada", "é李" * 20]
-    names.note(17 + 4096, "bob")  # as many as the ring of events holds
-    assert [recorder.of(identity) for identity in (17, 17 + 4096)] == [None, "bob"]
+    names = RequesterNames.create()
+    recorder = RequesterNames(names.fd)
+    names.store(17, "ada")
+    names.store(18, "é李" * 20)
+    assert [recorder.requester(identity) for identity in (0, 16, 17, 18)] == [None, None, "ada", "é李" * 20]
+    names.store(17 + 4096, "bob")  # as many as the ring of events holds
+    assert [recorder.requester(identity) for identity in (17, 17 + 4096)] == [None, "bob"]
     names.close()
 
 
 def test_an_event_by_a_name_is_the_command_of_an_operator():
     command = message(Kind.SET_MODE, tick=5, values=[3.0])
-    event = event_of(command[0], ["x"], 0, name="ada")
-    assert (event["who"], event_of(command[0], ["x"], 0)["who"]) == ("ada", OPERATOR)
-    again = message_of(event, ["x"])
+    event = event_from_message(command[0], ["x"], 0, name="ada")
+    assert (event["who"], event_from_message(command[0], ["x"], 0)["who"]) == ("ada", OPERATOR)
+    again = message_from_event(event, ["x"])
     assert again is not None
     assert again.tobytes() == command.tobytes()
-    assert [name_fault(origin.name.lower()) is None for origin in Origin] == [o is Origin.OPERATOR for o in Origin]
+    assert [name_problem(origin.name.lower()) is None for origin in Origin] == [o is Origin.OPERATOR for o in Origin]

@@ -18,7 +18,7 @@ from rtloop.drivers.base import Wiring
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.hil import board
-from rtloop.hil.native.cache import _owned_folder
+from rtloop.hil.native.cache import _make_private_folder
 from rtloop.hil.options import BoardOptions
 from rtloop.service.client import Client
 from rtloop.service.daemon import _bind
@@ -250,8 +250,12 @@ def test_compiled_code_is_loaded_from_a_folder_that_is_ours_up_to_the_root(place
         place.mkdir()
         (place / "open").mkdir()
         (place / "open").chmod(0o777)
-        return [_owned_folder(place / "cache"), _owned_folder(place / "open" / "cache"), _owned_folder(place / "open")]
+        return [
+            _make_private_folder(place / "cache"),
+            _make_private_folder(place / "open" / "cache"),
+            _make_private_folder(place / "open"),
+        ]
 
     assert as_user(VICTIM, made) == [True, False, False]
     as_user(ATTACKER, lambda: (place / "open" / "more").mkdir())
-    assert as_user(VICTIM, lambda: _owned_folder(place / "open" / "more")) is False
+    assert as_user(VICTIM, lambda: _make_private_folder(place / "open" / "more")) is False

@@ -20,7 +20,7 @@ from rtloop.drivers.base import Channel, Facts
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.python import PythonDriver
 from rtloop.engine.memory import SharedBlock, Sizes, Word
-from rtloop.errors import ConfigError, HostRefused, RtloopError, UnavailableError
+from rtloop.errors import ConfigError, HostRefusal, RtloopError, UnavailableError
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware as Noted
 from rtloop.supervision.hardware import UnusableNote, keep, noted
@@ -313,7 +313,7 @@ def test_a_note_that_is_not_whole_is_none(parked, tmp_path, damage):
         path.chmod(0o666)
         with pytest.raises(RtloopError, match="others may write") as raised:
             park()
-        assert raised.value.exit_code == HostRefused.exit_code
+        assert raised.value.exit_code == HostRefusal.exit_code
         assert board.volts == 0.0  # the configuration's
         return
     if damage == "whole":

@@ -18,7 +18,7 @@ from rtloop.drivers.sim import SimDriver, sim_read, sim_write
 from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.hil.native import machine_code
 from rtloop.hil.native.c_function import CFunction
-from rtloop.hil.native.uncompiled import as_written
+from rtloop.hil.native.uncompiled import allow_uncompiled
 from rtloop.hil.options import RigOptions
 from rtloop.supervision.parking import park
 from tests.drivers.comedi_board import new_board, output_v, stub_library
@@ -85,9 +85,9 @@ def test_the_writes_are_the_same_with_machine_code_and_without(tmp_path: Path, m
     for board, name in zip(boards, ("compiled", "written"), strict=True):
         if name == "written":
             monkeypatch.setattr(shm_write, "_machine_code", None)
-            monkeypatch.setattr(machine_code, "loaded", lambda name: None)
+            monkeypatch.setattr(machine_code, "load", lambda name: None)
         driver = ShmDriver(ShmOptions(file=str(tmp_path / name)), {"x": Wiring("adc0", "dac0")}, 4000.0)
-        with as_written():
+        with allow_uncompiled():
             assert (shm_write.address == shm_write._written[1]) == (name == "written")
             pointers = driver.open()
         write = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)(pointers.write)
@@ -106,9 +106,9 @@ def test_a_kernel_that_raises_as_it_is_written_fails(monkeypatch: pytest.MonkeyP
     def broken(context, values):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(machine_code, "loaded", lambda name: None)
+    monkeypatch.setattr(machine_code, "load", lambda name: None)
     function = CFunction(broken, "int32(voidptr, CPointer(float64))")
-    with as_written():
+    with allow_uncompiled():
         assert function(0, 0) < 0
 
 
@@ -118,10 +118,10 @@ def test_a_process_that_has_parked_compiles_as_ever(monkeypatch: pytest.MonkeyPa
     def doubled(number):
         return number * 2
 
-    monkeypatch.setattr(machine_code, "loaded", lambda name: None)
-    monkeypatch.setattr(CFunction, "_compiled", lambda self: 4711)
+    monkeypatch.setattr(machine_code, "load", lambda name: None)
+    monkeypatch.setattr(CFunction, "_compile", lambda self: 4711)
     function = CFunction(doubled, "int64(int64)")
-    with as_written():
+    with allow_uncompiled():
         assert function(21) == 42
         assert function.address != 4711
     assert function.address == 4711
@@ -130,8 +130,8 @@ def test_a_process_that_has_parked_compiles_as_ever(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("make", ["comedi", "sim"])
 def test_other_drivers_park_as_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: str):
     """A board that keeps its outputs at 7 V, and the rig."""
-    monkeypatch.setattr(machine_code, "loaded", lambda name: None)
-    monkeypatch.setattr(CFunction, "_compiled", lambda self: pytest.fail("compiled"))
+    monkeypatch.setattr(machine_code, "load", lambda name: None)
+    monkeypatch.setattr(CFunction, "_compile", lambda self: pytest.fail("compiled"))
     for function in (comedi_read, comedi_write, sim_read, sim_write):
         monkeypatch.setattr(function, "_machine_code", None)
     wiring = {"x": ComediDriver.example if make == "comedi" else SimDriver.example}

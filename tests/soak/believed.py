@@ -21,8 +21,8 @@ from rtloop.commands.design.verify import verified
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.simulated import KEPT, REST_S, RESTS, SETTLES_S, simulate
-from rtloop.recording.views.steps import every_step
+from rtloop.design.verification.simulated import REST_PLACES, REST_S, SETTLING_S, STEP_QUANTILE, simulate
+from rtloop.recording.views.steps import measure_steps
 from tests.recording.real_loop import ROOT, record
 
 DEPLOY = ROOT / "deploy"
@@ -99,14 +99,14 @@ def seen(stage: Stage, height_um: float, seed: int, folder: Path) -> list[float]
     """The same of recordings."""
     text = stage.text([0.0, *CYCLES * (height_um, 0.0, -height_um, 0.0)], DWELL_S, seed)
     taken = recorded(folder / "steps.mcap", text, (1 + 4 * CYCLES) * DWELL_S)
-    table = every_step(taken["x_reference_um"], taken["x_true_position_um"], 1e4)
+    table = measure_steps(taken["x_reference_um"], taken["x_true_position_um"], 1e4)
     assert table is not None
-    overshoot_percent, settling_ms, _ = np.quantile(table, KEPT, axis=0)
+    overshoot_percent, settling_ms, _ = np.quantile(table, STEP_QUANTILE, axis=0)
     squares = []
-    for number, part in enumerate(RESTS):
-        text = stage.text([part * stage.reach_um], SETTLES_S + REST_S, seed + 10_000 * number)
-        rest = recorded(folder / f"rest{number}.mcap", text, SETTLES_S + REST_S)
-        last = round(SETTLES_S * 1e4)
+    for number, part in enumerate(REST_PLACES):
+        text = stage.text([part * stage.reach_um], SETTLING_S + REST_S, seed + 10_000 * number)
+        rest = recorded(folder / f"rest{number}.mcap", text, SETTLING_S + REST_S)
+        last = round(SETTLING_S * 1e4)
         squares.append([rest[name][last:].var() for name in ("x_true_position_um", "x_command_um")])
     return [overshoot_percent, settling_ms, *(1e3 * np.sqrt(np.mean(squares, axis=0)))]
 

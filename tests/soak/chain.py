@@ -23,9 +23,9 @@ from rtloop.commands.design.auto import write_design
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.design.chain import Chain
-from rtloop.design.verification.judgement import limits, specified
+from rtloop.design.verification.judgement import required_limits, specified_quantities
 from rtloop.errors import RtloopError
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, modal_rig
 from tests.recording.real_loop import record
@@ -77,15 +77,15 @@ def designed_for(rig: ModalRig, folder: Path, order: int | None = None) -> tuple
 def verdict(chain: Chain) -> str:
     """ "meets it", or what is missed: achieved against required, as it runs."""
     output = chain.design.controller
-    controller = discretise(chain.synthesis.controller, 1 / output.rate_hz, output.method, output.prewarp_hz)
+    controller = discretise_controller(chain.synthesis.controller, 1 / output.rate_hz, output.method, output.prewarp_hz)
     assert chain.design.plant is not None
     loop = discrete_loop(controller, chain.design.plant.transfer(), chain.design.plant.delay_ticks)
     asked = chain.design.specification
-    values, required = specified(loop, asked), limits(asked)
+    values, required = specified_quantities(loop, asked), required_limits(asked)
     missed = [
         f"{name} {values[name]:.4g} for {limit.value:g}"
         for name, limit in required.items()
-        if not limit.met(values[name])
+        if not limit.is_met_by(values[name])
     ]
     return "misses " + ", ".join(missed) if missed else "meets it"
 

@@ -33,12 +33,12 @@ import numpy as np
 
 from rtloop.commands.identify import dynamics_report
 from rtloop.design.identification.dynamics.dynamics_fit import Mode
-from rtloop.design.identification.dynamics.identify_delay import delayed
+from rtloop.design.identification.dynamics.identify_delay import delay_input
 from rtloop.design.identification.dynamics.identify_in_loop import identify_in_loop
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.markov import with_residues
+from rtloop.design.identification.dynamics.markov import fit_residues
 from rtloop.design.identification.dynamics.outside import LoopExcitation
-from rtloop.design.identification.dynamics.prediction_error import Excitation, descended, refined
+from rtloop.design.identification.dynamics.prediction_error import Excitation, minimise_errors, refine
 from rtloop.design.identification.measured import UnsuitableData
 from tests.design.coloured_loops import MOTIONS, PERIOD_S, TrueLoop, coloured, drawn_loop, motion
 from tests.design.loop_bound import bounds_percent
@@ -90,9 +90,9 @@ def judged(loop: TrueLoop, bounds: np.ndarray, modes: tuple[Mode, ...], order: i
 def naive(loop: TrueLoop, bounds: np.ndarray, run: Excitation, method: str) -> Found | None:
     """As if the loop were open, from the true modes downhill, as nobody could begin: what is left is bias and noise."""
     rates = np.array([2 * np.pi * hz * (-z + 1j * np.sqrt(1 - z * z)) for hz, z, _ in loop.modes])
-    run = delayed(run, loop.delay_ticks)
-    start = with_residues(Innovations(PERIOD_S, rates, 0 * rates, 0 * rates), run.input, run.position_um)
-    found = refined(start, run) if method == "direct" else descended(start, run, noise=False)
+    run = delay_input(run, loop.delay_ticks)
+    start = fit_residues(Innovations(PERIOD_S, rates, 0 * rates, 0 * rates), run.input, run.position_um)
+    found = refine(start, run) if method == "direct" else minimise_errors(start, run, noise=False)
     if found is None:
         return None
     modes = tuple(Mode(abs(s) / 2 / np.pi, np.nan, -s.real / abs(s), np.nan, 0) for s in found.rates)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.recording.file.topics.overview import uncovered
+from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.load import load
 from tests.recording.real_loop import PAPER, ROOT
 
@@ -98,7 +98,7 @@ def require_events(files: Path | list[Path], planned: list[Event], ticks: int, r
     """Every tick around every event is there; how many stretches there are."""
     recording = load(files)
     assert recording.problems == [], recording.problems
-    kept = uncovered(0, ticks, recording.skipped)
+    kept = uncovered_ranges(0, ticks, recording.skipped)
     for event in planned:
         first, last = event.tick - BEFORE_S * rate_hz, min(event.tick + AFTER_S * rate_hz, ticks - 1)
         assert any(begin <= first and last < begin + count for begin, count in kept), event

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import rtloop
-from rtloop.recording.views.steps import every_step
+from rtloop.recording.views.steps import measure_steps
 from tests.soak.chain import with_steps
 from tests.soak.delay_coverage import coverage
 from tests.soak.lagged_rig import DEPLOY, NOISE_UM, RIGS, Rig, with_value
@@ -77,7 +77,7 @@ def run_steps(config: Path) -> Steps:
     running = config.with_name(f"{config.stem}-steps.toml")
     running.write_text(with_steps(text, levels, DWELL_S), encoding="utf-8")
     run = rtloop.load(recorded(running, len(levels) * DWELL_S))
-    table = every_step(run["x_reference_um"], run["x_true_position_um"], 1e4)
+    table = measure_steps(run["x_reference_um"], run["x_true_position_um"], 1e4)
     return Steps(*(np.median(table, axis=0) if table is not None else [np.nan] * 3))
 
 

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.design.chain import identified
+from rtloop.design.chain import identify_stage
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import measured
+from rtloop.design.identification.measured import read_axis_recording
 from tests.recording.real_loop import record
 from tests.soak.lagged_rig import DAMPING, HZ, Rig
 
@@ -56,7 +56,7 @@ def with_known_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
         f"thresholds_v = [0.0]\nweights_um_per_v = [{KNOWN_UM_PER_V}]",
         text,
     )
-    run = measured(record(folder / f"known-{seed}.mcap", text, 10_000)[0], None)
+    run = read_axis_recording(record(folder / f"known-{seed}.mcap", text, 10_000)[0], None)
     return identify_dynamics(Excitation(run.name, run.drive_v, run.position_um, run.period_s))
 
 
@@ -64,7 +64,7 @@ def with_identified_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
     """Identify both from a slow sine and a step up and down, as `design auto` does."""
     sine = record(folder / f"sine-{seed}.mcap", rig.text("own-stage-sine", seed), 25_000)[0]
     steps = record(folder / f"steps-{seed}.mcap", rig.text("own-stage", seed), 10_000)[0]
-    return identified(measured(sine, None), measured(steps, None)).dynamics
+    return identify_stage(read_axis_recording(sine, None), read_axis_recording(steps, None)).dynamics
 
 
 def coverage(rig: Rig, draws: int) -> bool:
@@ -80,7 +80,7 @@ def coverage(rig: Rig, draws: int) -> bool:
                 fits.append(identify(rig, seed, Path(folder)))
         rows = [row for fit in fits for row in estimates(fit, rig, gain)]
         delays = sum(fit.delay_ticks == rig.delay_ticks for fit in fits)
-        white = sum(fit.tests.white for fit in fits)
+        white = sum(fit.tests.is_white for fit in fits)
         print(f"{name}: {draws} draws, delay right in {delays}, residuals white in {white}")
         for parameter in dict.fromkeys(row.parameter for row in rows):
             of_it = [row for row in rows if row.parameter == parameter]

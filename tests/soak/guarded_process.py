@@ -43,11 +43,11 @@ def broken() -> int:
 @contextmanager
 def guarding() -> Iterator[None]:
     """Records that are made meanwhile have canaries, and are kept for ever."""
-    memory.records, usual = guarded_records, memory.records
+    memory.new_records, usual = guarded_records, memory.new_records
     try:
         yield
     finally:
-        memory.records = usual
+        memory.new_records = usual
 
 
 def main() -> int:

@@ -16,7 +16,7 @@ from random import Random
 import rtloop
 from rtloop.recording.capture.session import Options
 from rtloop.recording.file.recover import recover
-from rtloop.recording.replay.laws import Trust
+from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from tests.laws.changing import (
     AT_CHANGE_V,
@@ -69,7 +69,7 @@ def soak(first: str, seed: int, alone: Steps) -> None:
         steps = steps_of(recording)
         trips = [event["what"] for event in recording.events if event["kind"] == "tripped"]
         kinds = {"whole": whole, "recovered": cut_off(whole, Random(seed)), f"{len(parts)} files": parts}
-        trust = Trust(recorded=True)
+        trust = TrustedLaws(recorded=True)
         verdicts = {kind: replay(rtloop.load(files), trust=trust) for kind, files in kinds.items()}
     said = ", ".join(
         f"{kind} {'identical' if verdict.identical else verdict.first_difference or verdict.not_verified} "

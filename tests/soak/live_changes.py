@@ -23,7 +23,7 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
-from rtloop.recording.capture.names import Names
+from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.replay.replay import replay
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
@@ -46,7 +46,7 @@ class GuardedProcesses(Processes):
     def __init__(self) -> None:
         self.fd = SharedBlock.reserve()
         self.loop = Child("tests.soak.guarded_process", self.fd)
-        self.names = Names.create()
+        self.names = RequesterNames.create()
         self.recorder = Child("rtloop.recording.capture.recorder", self.fd, names=self.names.fd)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
-from rtloop.design.identification.measured import Measured, UnsuitableData
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData
 from rtloop.hil.stages.hysteresis import NOMINAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 
 SAMPLES, DURATION_S = 3000, 30.0
@@ -35,13 +35,13 @@ class Rig:
     positions_um: list[Array]
     noise_um: float
 
-    def runs(self) -> list[Measured]:
+    def runs(self) -> list[AxisRecording]:
         """Recordings: a tick's position was measured before its drive was written."""
         period_s = DURATION_S / SAMPLES
         pairs = [
             (np.append(u, u[-1]), np.append(x[0], x)) for u, x in zip(self.drives_v, self.positions_um, strict=True)
         ]
-        return [Measured(f"part {i}", period_s, u, x, x, True, "", "") for i, (u, x) in enumerate(pairs)]
+        return [AxisRecording(f"part {i}", period_s, u, x, x, True, "", "") for i, (u, x) in enumerate(pairs)]
 
 
 def main() -> None:
@@ -99,7 +99,7 @@ def drawn(seed: int) -> Rig:
 def both(rig: Rig) -> tuple[PartsFit, PartsFit]:
     """With the memory unknown; and known, with the same plays and as dense ones up to the largest that may move."""
     found = identify_from_parts(rig.runs())
-    thresholds, half_v = found.shape.model.thresholds, 0.5 * found.stroke_v
+    thresholds, half_v = found.hysteresis.model.thresholds, 0.5 * found.stroke_v
     largest_v = max(float(np.abs(np.append(*one)).max()) for one in zip(rig.past_v, rig.drives_v, strict=True))
     count = min(MOST_PLAYS, round(thresholds.size * largest_v / half_v)) - thresholds.size
     more = np.linspace(half_v, largest_v, max(0, count), endpoint=False)
@@ -109,7 +109,7 @@ def both(rig: Rig) -> tuple[PartsFit, PartsFit]:
 def reported_um(fit: PartsFit, found: PartsFit) -> float:
     """rms of a fit's held-out errors, in those samples that were judged without knowing the memory."""
     pairs = zip(fit.judgements, found.judgements, strict=True)
-    squares = [one.error_um[np.isfinite(judged.error_um)] ** 2 for one, judged in pairs if judged.judged_part]
+    squares = [one.error_um[np.isfinite(judged.error_um)] ** 2 for one, judged in pairs if judged.judged_share]
     return float(np.sqrt(np.mean([one.mean() for one in squares])))
 
 
@@ -119,7 +119,7 @@ def true_um(found: PartsFit, rig: Rig, stroke_v: float) -> float:
     sizes = np.interp(np.arange(1200), [0, 600, 1200], [1, 1, 0.3])
     loops = middle + 0.5 * stroke_v * sizes * np.sin(2 * np.pi * np.arange(1200) / 300)
     truth = stepped(loops, PLAYS_V, middle - PLAYS_V) @ rig.weights
-    model = found.shape.model
+    model = found.hysteresis.model
     error = (stepped(loops, model.thresholds, middle - model.thresholds) @ model.weights - truth)[300:]
     return float(np.std(error))
 

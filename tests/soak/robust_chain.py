@@ -26,7 +26,7 @@ from rtloop.commands.design.auto import write_design, write_robust_design
 from rtloop.commands.design.verify import verified
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from rtloop.design.verification.bench import Bench, Stand
+from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.errors import RtloopError
 from rtloop.hil.options import RigOptions
 from rtloop.signals import trip_causes
@@ -142,7 +142,7 @@ def both(written: Path) -> Iterator[tuple[Steps, Steps]]:
     configuration = load(written)
     found, design = verified(configuration, prepare(configuration).checks[0], None)
     (axis,) = configuration.axes
-    stand = Stand(axis.model, design.sensor.noise_um, design.sensor.resolution_um, None, 0.0)
+    stand = HardwareModel(axis.model, design.sensor.noise_um, design.sensor.resolution_um, None, 0.0)
     bench = Bench(replace(configuration, driver_kind="hardware", driver_options=None), {axis.name: stand})
     dwell_s = min(max(12 * found.slowest_s, 0.1), 1.0)
     for height_um in (height for height in HEIGHTS_UM if height <= design.specification.command.reference_um):

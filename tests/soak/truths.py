@@ -14,7 +14,7 @@ import sys
 import numpy as np
 
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
-from rtloop.design.identification.hysteresis.judgement import together
+from rtloop.design.identification.hysteresis.judgement import combine_errors
 from tests.design.other_truths import bouc_wen, preisach
 from tests.design.test_error_as_written import recorded, true_um
 
@@ -37,10 +37,12 @@ def main() -> None:
             first = 10_000 * number
             runs = [recorded(truth, first + i) for i in range(given.recordings)]
             others = [recorded(truth, first + 1000 + i) for i in range(given.recordings)]
-            found = identify_from_parts(runs, 8, "chebyshev-from-0", others=others)
-            true = true_um(truth, found.shape.model, range(first + 2000, first + 2000 + TRUE_DRIVES))
-            written = together([one.as_written_rms_um for one in found.judgements])
-            error, later = (together([one.rms_um for one in group]) for group in (found.judgements, found.others))
+            found = identify_from_parts(runs, 8, "chebyshev-from-0", other_runs=others)
+            true = true_um(truth, found.hysteresis.model, range(first + 2000, first + 2000 + TRUE_DRIVES))
+            written = combine_errors([one.written_rms_um for one in found.judgements])
+            error, later = (
+                combine_errors([one.rms_um for one in group]) for group in (found.judgements, found.other_judgements)
+            )
             print(
                 f"{truth.__name__:9}{number:4}{written.rms_um:9.3f} ± {written.std_um:.3f}{true:11.3f}"
                 f"{written.rms_um / true:7.2f}{error.rms_um:9.3f} ± {error.std_um:.3f}{later.rms_um:10.3f}"

@@ -12,9 +12,9 @@ from typing import Any, cast
 
 from rtloop.engine.messages import Kind, message
 from rtloop.recording.cutting.cut import cut, cut_path
-from rtloop.recording.file.recover import leftovers
+from rtloop.recording.file.recover import find_leftovers
 from rtloop.recording.file.topics.contents import Message
-from rtloop.recording.file.topics.events import event_of
+from rtloop.recording.file.topics.events import event_from_message
 from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import Flag
@@ -51,7 +51,7 @@ class Recovering(Case):
     def judge(self, outcome: Outcome) -> list[str]:
         problems = [] if outcome.killed or self._is_recovered() or self.part.exists() else ["nothing is left"]
         problems += problems_of(self._finished(), set(), whole=self.flushed)
-        for part in leftovers(self.folder):
+        for part in find_leftovers(self.folder):
             self._once_more(part)
         problems += problems_of(self._finished(), self.flushed, whole=self.flushed)
         strange = {path.name for path in self.folder.iterdir()} - {NAME, f"{NAME}.part"}
@@ -115,7 +115,9 @@ def _write_part(path: Path, run: int, number: int) -> None:
     writer = Writer(path, make_header(**facts, created_unix_ns=START_UNIX_NS + run * 10**9), START_UNIX_NS)
     if (run, number) == (2, 2):
         record = message(Kind.TRIPPED, tick=first + 1, axis=0, values=[Flag.TRIP_POSITION])[0]
-        writer.write_messages([Message(EVENTS, START_UNIX_NS, json.dumps(event_of(record, AXES, 0)).encode())])
+        writer.write_messages(
+            [Message(EVENTS, START_UNIX_NS, json.dumps(event_from_message(record, AXES, 0)).encode())]
+        )
     writer.write_ticks(make_rows(200, first=first))
     writer.finish(lambda logged: final_message(first + PART_TICKS, logged))
 

@@ -11,8 +11,8 @@ from typing import Any, cast
 from rtloop.configuration.file import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.recording.capture import recorder, session
-from rtloop.recording.capture.names import Names
-from rtloop.recording.capture.recorder import Orders, Recorder
+from rtloop.recording.capture.names import RequesterNames
+from rtloop.recording.capture.recorder import Recorder, SupervisorOrders
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.supervision.child import Child
@@ -36,7 +36,7 @@ class Recording(Case):
         self.block.store(Word.LOOP_STATE, ProcessState.FINISHED)
         self.path = folder / "run.mcap"
         options = RecordingOptions(min_free_mib=0.0)
-        self.keeper = RecorderKeeper(cast(Child, None), self.block, cast(Names, None), self.path, options)
+        self.keeper = RecorderKeeper(cast(Child, None), self.block, cast(RequesterNames, None), self.path, options)
         self.output = folder / "said"
 
     def prepare_child(self) -> None:
@@ -50,7 +50,7 @@ class Recording(Case):
         recorder.POLL_S = session.FLUSH_S = 0.0
 
     def work(self) -> None:
-        recorder.run(self.block.fd)
+        recorder.record_run(self.block.fd)
 
     def warm_up(self) -> None:
         self._record(1)
@@ -94,6 +94,6 @@ class Recording(Case):
         following = Recorder(self.block)
         options = Options(**{**OPTIONS, "sequence": sequence})
         begun = Session(self.block, self.path, header(), options)
-        orders = Orders()
+        orders = SupervisorOrders()
         orders.next = lambda wait_s=0.0: None  # type: ignore[method-assign]  # it gets none
         begun.finish(following.record(begun, orders, 0.0))

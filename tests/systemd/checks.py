@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.file import load
-from rtloop.hil.board import LSB_V, UNSEEN, BoardMemory
+from rtloop.hil.board import LSB_V, MISSED_WRITES, BoardMemory
 from rtloop.hil.witness import WINDOW_NS
 
 UNIT, BOARD, PANEL = "rtloop@board.service", "rtloop-board@board.service", "rtloop-panel@board.service"
@@ -100,7 +100,7 @@ class Board:
         options: Any = load(CONFIG).driver_options
         fd = os.open(options.file, os.O_RDWR)
         self.memory = BoardMemory(fd)
-        self.seen = self.memory.seen
+        self.seen = self.memory.evidence
         os.close(fd)
 
     @property
@@ -407,7 +407,7 @@ def outputs_seen() -> str:
     """Every write of the session, whoever made it: `limited_slew` lets the running loop move no faster than a ramp."""
     board, configuration = Board(), load(CONFIG)
     seen, rate_hz = board.seen[0], configuration.loop.rate_hz
-    unseen = int(board.memory.words[UNSEEN])
+    unseen = int(board.memory.words[MISSED_WRITES])
     require(unseen == 0, f"{unseen} writes that the board came too late to see")
     require(seen.lowest_v >= -10.0 and seen.highest_v <= 10.0, f"{seen.lowest_v} … {seen.highest_v} V")
     step_v = configuration.axes[0].limits.trip_slew_v_per_s / rate_hz

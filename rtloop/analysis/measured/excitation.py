@@ -9,59 +9,69 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.analysis.measured.multisine import Grid, flattened
-from rtloop.analysis.measured.response import Signals
+from rtloop.analysis.measured.multisine import LineGrid, low_crest_amplitudes
+from rtloop.analysis.measured.response import PeriodSignals
 from rtloop.hil.modal import Complex, Real
 
-FIRST_PART = 0.2
+FIRST_AMPLITUDE_RATIO = 0.2
 """Of the stated amplitude: the peak of the first reference, so that a loop may amplify it fivefold."""
-AIMS = (0.35, 0.75)
+AMPLITUDE_RATIOS = (0.35, 0.75)
 """Parts of the stated amplitude that those behind it are to reach in turn."""
 LARGEST_COMMAND, LARGEST_REFERENCE = 3.0, 10.0
 """Peaks over the stated amplitude that they may ask of the command, and that they may have themselves."""
-COMPROMISE = 0.5
+SHAPING_EXPONENT = 0.5
 """Between references that are equal at all lines (0) and motions that are (1): most is wanted where |L| is near 1."""
-CERTAIN = 3.0
+CERTAIN_DEVIATIONS = 3.0
 """A line's response counts as no smaller than so many of its standard deviations."""
 
 
-def first(grid: Grid, amplitude_um: float) -> Real:
+def first_period(grid: LineGrid, amplitude_um: float) -> Real:
     """A period (samples,) of equal lines, small."""
-    wave = grid.waveform(flattened(grid, np.ones(grid.excited.size)))
-    return wave * (FIRST_PART * amplitude_um / np.abs(wave).max())
+    wave = grid.waveform(low_crest_amplitudes(grid, np.ones(grid.excited.size)))
+    return wave * (FIRST_AMPLITUDE_RATIO * amplitude_um / np.abs(wave).max())
 
 
-def shaped(grid: Grid, played: Real, seen: Signals, amplitude_um: float, aim: float) -> Real:
+def shape_period(
+    grid: LineGrid, previous_period: Real, signals: PeriodSignals, amplitude_um: float, aim: float
+) -> Real:
     """A period (samples,) for an added motion of `aim` times `amplitude_um`, by what the one `played` before showed."""
-    reference = grid.amplitudes(played)
-    position_response, min_response = _answer(grid, seen.position, reference)
-    command_response, _ = _answer(grid, seen.command, reference)
-    return fitting(grid, position_response, command_response, amplitude_um, aim, min_response)
+    reference = grid.amplitudes(previous_period)
+    position_response, min_response = _signal_response(grid, signals.position, reference)
+    command_response, _ = _signal_response(grid, signals.command, reference)
+    return fit_period(grid, position_response, command_response, amplitude_um, aim, min_response)
 
 
-def fitting(
-    grid: Grid, moved: Complex, asked: Complex, amplitude_um: float, aim: float = AIMS[-1], least: float | Real = 1e-9
+def fit_period(
+    grid: LineGrid,
+    position_response: Complex,
+    command_response: Complex,
+    amplitude_um: float,
+    aim: float = AMPLITUDE_RATIOS[-1],
+    min_response: float | Real = 1e-9,
 ) -> Real:
     """A period (samples,) for an added motion of `aim` times `amplitude_um`, where a reference gives `moved` of
     position and `asked` of command at the lines (excited,), and less than `least` of position is not to be told."""
-    sizes = np.maximum(np.abs(moved), least) ** -COMPROMISE
-    sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(asked), 1e-12))
+    sizes = np.maximum(np.abs(position_response), min_response) ** -SHAPING_EXPONENT
+    sizes = np.minimum(sizes, LARGEST_COMMAND / np.maximum(np.abs(command_response), 1e-12))
     sizes = np.minimum(sizes, LARGEST_REFERENCE * np.median(sizes))
-    flat = flattened(grid, sizes * np.maximum(np.abs(moved), 1e-12))
-    lines = sizes * np.exp(1j * (np.angle(flat) - np.angle(moved)))
-    peaks = [_peak(grid, lines * response) for response in (moved, asked, np.ones_like(moved))]
+    flat = low_crest_amplitudes(grid, sizes * np.maximum(np.abs(position_response), 1e-12))
+    lines = sizes * np.exp(1j * (np.angle(flat) - np.angle(position_response)))
+    peaks = [
+        _peak_value(grid, lines * response)
+        for response in (position_response, command_response, np.ones_like(position_response))
+    ]
     peak_ratios = (aim, LARGEST_COMMAND, LARGEST_REFERENCE)
     return grid.waveform(lines) * min(
         amplitude_um * peak_ratio / peak for peak_ratio, peak in zip(peak_ratios, peaks, strict=True)
     )
 
 
-def _answer(grid: Grid, signal: Real, reference: Complex) -> tuple[Complex, Real]:
+def _signal_response(grid: LineGrid, signal: Real, reference: Complex) -> tuple[Complex, Real]:
     """Of a signal (periods, samples) per reference, and the least that stands out of noise, (excited,)."""
     period = signal.mean(axis=0)
     noise = np.sqrt(np.mean(np.abs(np.fft.rfft(period)[grid.silent] * 2 / grid.samples) ** 2))
-    return grid.amplitudes(period) / reference, CERTAIN * noise / np.abs(reference)
+    return grid.amplitudes(period) / reference, CERTAIN_DEVIATIONS * noise / np.abs(reference)
 
 
-def _peak(grid: Grid, lines: Complex) -> float:
+def _peak_value(grid: LineGrid, lines: Complex) -> float:
     return float(np.abs(grid.waveform(lines)).max())

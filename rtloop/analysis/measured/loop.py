@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.analysis.measured.mode import LightMode
-from rtloop.analysis.measured.response import Response
+from rtloop.analysis.measured.response import MeasuredResponse
 from rtloop.hil.modal import Complex, Real
 
 HALF_WIDTHS = (2, 4, 8, 16)
 """Of the windows in which neighbouring lines are put together, in lines."""
-CHANCE = 3.0
+RESIDUAL_DEVIATIONS = 3.0
 """Standard deviations by which a window's residuals may exceed what the uncertainty explains."""
 POINTS = 8
 """Between two measured lines."""
@@ -48,18 +48,18 @@ class MeasuredLoop:
     @property
     def loop(self) -> Complex:
         """L at the lines (k,)."""
-        return self.lifted / _lift(self.hz, self.rate_hz, self.image)
+        return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:
         """L."""
         at = np.atleast_1d(np.asarray(hz, dtype=float))
-        return np.asarray(self._spline(np.log(at)), dtype=complex) / _lift(at, self.rate_hz, self.image)
+        return np.asarray(self._spline(np.log(at)), dtype=complex) / _pole_distance(at, self.rate_hz, self.image)
 
     def sensitivity(self, hz: npt.ArrayLike) -> Real:
         """|S|."""
         return 1 / np.abs(1 + self.open(hz))
 
-    def moved(self, part: complex) -> MeasuredLoop:
+    def perturbed(self, part: complex) -> MeasuredLoop:
         """With L larger everywhere by `part` of its standard deviation."""
         lifted = self.lifted * (1 + part * self.spread)
         return MeasuredLoop(self.hz, lifted, self.spread, self.rate_hz, self.image)
@@ -71,19 +71,19 @@ class MeasuredLoop:
         return CubicSpline(np.log(self.hz), self.lifted)
 
 
-def measured_loop(found: Response, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
+def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
     """Of a measured response."""
     image = None if mode is None else mode.image(rate_hz)
-    raw = found.plant * found.controller * _lift(found.hz, rate_hz, image)
-    lifted, std = put_together(np.log(found.hz), raw, found.spread * np.abs(raw))
-    return MeasuredLoop(found.hz, lifted, std / np.abs(lifted), rate_hz, image)
+    raw = measured_response.plant * measured_response.controller * _pole_distance(measured_response.hz, rate_hz, image)
+    lifted, std = smooth_lines(np.log(measured_response.hz), raw, measured_response.spread * np.abs(raw))
+    return MeasuredLoop(measured_response.hz, lifted, std / np.abs(lifted), rate_hz, image)
 
 
-def _lift(hz: Real, rate_hz: float, image: complex | None) -> Complex:
+def _pole_distance(hz: Real, rate_hz: float, image: complex | None) -> Complex:
     return np.ones(hz.shape, complex) if image is None else np.exp(2j * np.pi * hz / rate_hz) - image
 
 
-def put_together(place: Real, values: Complex, std: Real) -> tuple[Complex, Real]:
+def smooth_lines(place: Real, values: Complex, std: Real) -> tuple[Complex, Real]:
     """Values (k,) with their neighbours' help, and what is left of their standard deviation.
 
     About each one a parabola over the widest of HALF_WIDTHS whose residuals are no larger than `std` explains; the
@@ -101,7 +101,7 @@ def put_together(place: Real, values: Complex, std: Real) -> tuple[Complex, Real
             inverse = np.linalg.pinv(rows)
             solution = inverse @ scaled
             freedom = x.size - 3
-            if np.sum(np.abs(scaled - rows @ solution) ** 2) / freedom > 1 + CHANCE / np.sqrt(freedom):
+            if np.sum(np.abs(scaled - rows @ solution) ** 2) / freedom > 1 + RESIDUAL_DEVIATIONS / np.sqrt(freedom):
                 break
             smoothed[i], smoothed_std[i] = solution[0], float(np.linalg.norm(inverse[0]))
     return smoothed, smoothed_std

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from rtloop.analysis.margins import Margins, margins
+from rtloop.analysis.margins import Margins, loop_margins
 from rtloop.analysis.measured.loop import MeasuredLoop
 
 
-class Uncertain(NamedTuple):
+class UncertainValue(NamedTuple):
     """A value with its standard deviation; NaN: not in the measured band."""
 
     value: float
@@ -27,28 +27,28 @@ class Uncertain(NamedTuple):
 class MeasuredMargins:
     """Frequencies in Hz, phase in degrees, gain as a factor, the modulus margin min |1 + L|."""
 
-    crossover_hz: Uncertain
-    phase_margin_deg: Uncertain
-    gain_margin: Uncertain
-    gain_margin_hz: Uncertain
-    modulus_margin: Uncertain
-    max_sensitivity: Uncertain
-    max_sensitivity_hz: Uncertain
+    crossover_hz: UncertainValue
+    phase_margin_deg: UncertainValue
+    gain_margin: UncertainValue
+    gain_margin_hz: UncertainValue
+    modulus_margin: UncertainValue
+    max_sensitivity: UncertainValue
+    max_sensitivity_hz: UncertainValue
 
 
-def measured_margins(loop: MeasuredLoop, with_moved_mode: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
+def measured_margins(loop: MeasuredLoop, perturbed_loops: Sequence[MeasuredLoop] = ()) -> MeasuredMargins:
     """Of a measured loop, and of what it would be with each figure of its light mode off by a standard deviation."""
     half = math.sqrt(0.5)  # of each part of a complex number
-    nominal, *perturbed = map(margins, (loop, loop.moved(half), loop.moved(1j * half), *with_moved_mode))
+    nominal, *perturbed = map(loop_margins, (loop, loop.perturbed(half), loop.perturbed(1j * half), *perturbed_loops))
 
-    def uncertain(name: str) -> Uncertain:
+    def uncertain(name: str) -> UncertainValue:
         value = getattr(nominal, name)
         if not math.isfinite(value):
-            return Uncertain(math.nan, math.nan)
-        return Uncertain(
+            return UncertainValue(math.nan, math.nan)
+        return UncertainValue(
             value, math.hypot(*(getattr(perturbed_margins, name) - value for perturbed_margins in perturbed))
         )
 
     fields = {name: uncertain(name) for name in Margins._fields}
     peak = fields["max_sensitivity"]
-    return MeasuredMargins(modulus_margin=Uncertain(1 / peak.value, peak.std / peak.value**2), **fields)
+    return MeasuredMargins(modulus_margin=UncertainValue(1 / peak.value, peak.std / peak.value**2), **fields)

@@ -10,31 +10,31 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.measured.gain import StaticGain
 from rtloop.analysis.measured.loop import MeasuredLoop, measured_loop
 from rtloop.analysis.measured.margins import MeasuredMargins, measured_margins
-from rtloop.analysis.measured.mode import BAND, LEAST_LINES, LightMode, light_mode
-from rtloop.analysis.measured.recorded import periodic_part
-from rtloop.analysis.measured.response import Response, Signals, response
+from rtloop.analysis.measured.mode import BAND, MIN_LINES, LightMode, fit_light_mode
+from rtloop.analysis.measured.recorded import find_periodic_part
+from rtloop.analysis.measured.response import MeasuredResponse, PeriodSignals, measure_response
 from rtloop.hil.modal import Real
-from rtloop.values import fields_of, plain
+from rtloop.values import dataclass_fields, to_jsonable
 
-CERTAIN = 0.1
+MAX_LINE_SPREAD = 0.1
 """Relative uncertainty up to which a line is compared with the model's."""
 SIGNALS: tuple[str, ...] = ("reference_um", "error_um", "command_um", "position_um")
 """Of an axis, that a measurement is made of."""
-IN_STEP = "sim"
+TICK_DRIVEN = "sim"
 """The driver whose rig moves by ticks, so that a missed period disturbs nothing."""
 
 
 @dataclass(frozen=True)
-class Measurement:
+class LoopMeasurement:
     """A response with its margins, the light mode where one stands out, the loop that the model promises, and the gain
     at rest where it was measured.
     """
 
-    response: Response
+    response: MeasuredResponse
     loop: MeasuredLoop
     margins: MeasuredMargins
     mode: LightMode | None
@@ -44,7 +44,7 @@ class Measurement:
     def figures(self) -> dict[str, Any]:
         """What status and metrics tell: no curves."""
         measured = self.response
-        return plain(
+        return to_jsonable(
             {
                 "periods": measured.periods,
                 "lines": measured.hz.size,
@@ -61,30 +61,30 @@ class Measurement:
     def for_json(self) -> dict[str, Any]:
         """Figures, and every line."""
         measured, loop = self.response, self.loop.loop
-        curves = fields_of(measured) | {"loop": loop, "loop_spread": self.loop.spread}
+        curves = dataclass_fields(measured) | {"loop": loop, "loop_spread": self.loop.spread}
         curves |= {"sensitivity": 1 / (1 + loop), "tracking": loop / (1 + loop)}
         curves["sensitivity_spread"] = np.abs(curves["tracking"]) * self.loop.spread
         if self.model is not None:
             curves["model_loop"] = self.model.open(measured.hz)
             curves["model_sensitivity"] = 1 / (1 + curves["model_loop"])
-        return plain(self.figures() | {"response": curves})
+        return to_jsonable(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:
         """Margins that the model has, and how much larger the measured loop's gain is, in the median."""
         if self.model is None:
             return None
-        is_certain = self.loop.spread < CERTAIN
+        is_certain = self.loop.spread < MAX_LINE_SPREAD
         ratio = np.abs(self.loop.loop / self.model.open(self.loop.hz))[is_certain]
-        return {"margins": margins(self.model), "gain_ratio": np.median(ratio) if ratio.size else math.nan}
+        return {"margins": loop_margins(self.model), "gain_ratio": np.median(ratio) if ratio.size else math.nan}
 
 
-def measurement(
+def measure_loop(
     signals: Mapping[str, Real],
     rate_hz: float,
     near_hz: float | None = None,
     model: Loop | None = None,
     command_taps: Sequence[float] = (),
-) -> Measurement:
+) -> LoopMeasurement:
     """Of recorded `reference_um`, `error_um`, `command_um` and `position_um`, each (ticks,).
 
     What reaches the command past the controller is `feed_um`, where that is given, and the reference by `command_taps`.
@@ -94,28 +94,30 @@ def measurement(
     multisine, and where fewer than two periods of it are whole.
     """
     reference = signals["reference_um"]
-    part = periodic_part(reference)
+    part = find_periodic_part(reference)
     if part is None:
         raise ValueError("reference: no part of it repeats itself twice after settling; a multisine is needed")
     grid = part.grid(reference, rate_hz)
-    is_complete = ~part.folded(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
+    is_complete = (
+        ~part.reshape_periods(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)
+    )
     error, command, position = (
-        part.folded(signals[name])[is_complete] for name in ("error_um", "command_um", "position_um")
+        part.reshape_periods(signals[name])[is_complete] for name in ("error_um", "command_um", "position_um")
     )
     direct_um = np.convolve(command_taps or (0.0,), reference)[: reference.size] + signals.get("feed_um", 0.0)
-    measured = response(grid, Signals(error, command, position, part.folded(direct_um)[0]))
-    mode = _mode(measured, rate_hz, near_hz)
+    measured = measure_response(grid, PeriodSignals(error, command, position, part.reshape_periods(direct_um)[0]))
+    mode = _find_mode(measured, rate_hz, near_hz)
     loop = measured_loop(measured, rate_hz, mode)
     perturbed_loops = (
-        [measured_loop(measured, rate_hz, perturbed_mode) for perturbed_mode in mode.moved()] if mode else []
+        [measured_loop(measured, rate_hz, perturbed_mode) for perturbed_mode in mode.perturbed_modes()] if mode else []
     )
-    return Measurement(measured, loop, measured_margins(loop, perturbed_loops), mode, model)
+    return LoopMeasurement(measured, loop, measured_margins(loop, perturbed_loops), mode, model)
 
 
-def _mode(found: Response, rate_hz: float, near_hz: float | None) -> LightMode | None:
+def _find_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float | None) -> LightMode | None:
     if near_hz is None:
-        certain_gains = np.where(found.spread < CERTAIN, np.abs(found.plant), 0.0)
-        near_hz = float(found.hz[np.argmax(certain_gains)])
-    if np.count_nonzero(np.abs(found.hz / near_hz - 1) <= BAND) < LEAST_LINES:
+        certain_gains = np.where(measured.spread < MAX_LINE_SPREAD, np.abs(measured.plant), 0.0)
+        near_hz = float(measured.hz[np.argmax(certain_gains)])
+    if np.count_nonzero(np.abs(measured.hz / near_hz - 1) <= BAND) < MIN_LINES:
         return None
-    return light_mode(found, rate_hz, near_hz)
+    return fit_light_mode(measured, rate_hz, near_hz)

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rtloop.analysis.measured.response import Response
+from rtloop.analysis.measured.response import MeasuredResponse
 from rtloop.hil.modal import Complex, Real
 
 BAND = 0.2
 """Part of the frequency, to both sides of the mode, that is fitted."""
 BACKGROUND = 3
-LEAST_LINES = 12
+MIN_LINES = 12
 DAMPINGS = (0.002, 0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
 LEAST_DAMPING, LARGEST_DAMPING = 1e-5, 0.3
-CLEAR = 25.0
+MIN_IMPROVEMENT = 25.0
 """A mode without which the weighted squares, over their mean, grow by less than this is none."""
 
 
@@ -43,25 +43,27 @@ class LightMode:
 
     def image(self, rate_hz: float) -> complex:
         """λ, of positive imaginary part."""
-        return _image(self.hz, self.damping, rate_hz)
+        return _mode_image(self.hz, self.damping, rate_hz)
 
-    def moved(self) -> tuple[LightMode, LightMode]:
+    def perturbed_modes(self) -> tuple[LightMode, LightMode]:
         """With a frequency that is larger by its standard deviation, and with a damping that is."""
         return replace(self, hz=self.hz + self.hz_std), replace(self, damping=self.damping + self.damping_std)
 
 
-def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
+def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
     """The mode within `band` of `near_hz`; None where none stands out. Raises ValueError for too few lines there."""
     from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
 
-    in_band = np.abs(found.hz / near_hz - 1) <= band
-    if (lines := int(in_band.sum())) < LEAST_LINES:
-        raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; {LEAST_LINES} are needed")
-    hz, plant = found.hz[in_band], found.plant[in_band]
-    fit = _Fit(hz, plant, np.abs(plant) * found.spread[in_band], rate_hz)
-    start = min(((f, z) for f in hz[1:-1:2] for z in DAMPINGS), key=lambda guess: _squares(fit.left(*guess)))
+    in_band = np.abs(measured.hz / near_hz - 1) <= band
+    if (lines := int(in_band.sum())) < MIN_LINES:
+        raise ValueError(f"{lines} lines within {100 * band:g} % of {near_hz:g} Hz; {MIN_LINES} are needed")
+    hz, plant = measured.hz[in_band], measured.plant[in_band]
+    fit = _ModeFit(hz, plant, np.abs(plant) * measured.spread[in_band], rate_hz)
+    start = min(
+        ((f, z) for f in hz[1:-1:2] for z in DAMPINGS), key=lambda guess: _sum_of_squares(fit.mode_residuals(*guess))
+    )
     solution = least_squares(
-        lambda values: _parts(fit.left(*values)),
+        lambda values: _real_and_imaginary(fit.mode_residuals(*values)),
         start,
         bounds=([hz[0], LEAST_DAMPING], [hz[-1], LARGEST_DAMPING]),
         x_scale=start,
@@ -71,7 +73,7 @@ def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BA
     squares = 2 * solution.cost
     freedom = 2 * lines - 2 * (BACKGROUND + 1) - 2
     scale = max(squares / freedom, 1e-300)
-    if (_squares(fit.smooth_left()) - squares) / scale < CLEAR:
+    if (_sum_of_squares(fit.smooth_residuals()) - squares) / scale < MIN_IMPROVEMENT:
         return None
     # a complex residual of standard deviation 1 has parts of variance ½
     std = np.sqrt(np.diag(np.linalg.inv(solution.jac.T @ solution.jac)) * max(0.5, scale))
@@ -81,7 +83,7 @@ def light_mode(found: Response, rate_hz: float, near_hz: float, band: float = BA
     )
 
 
-class _Fit:
+class _ModeFit:
     """Residuals of D at `hz` (k,), in standard deviations."""
 
     def __init__(self, hz: Real, plant: Complex, std: Real, rate_hz: float) -> None:
@@ -91,28 +93,28 @@ class _Fit:
         powers = np.vander((hz - hz[0]) / half - 1, BACKGROUND, increasing=True)
         self._smooth = np.asarray(powers / std[:, None], dtype=complex)
 
-    def left(self, hz: float, damping: float) -> Complex:
+    def mode_residuals(self, hz: float, damping: float) -> Complex:
         """With a mode."""
-        pole = _image(hz, damping, self._rate_hz)
+        pole = _mode_image(hz, damping, self._rate_hz)
         mode = (abs(1 - abs(pole)) / (self._points - pole) / self._std)[:, None]
-        return self._rest(np.hstack([mode, self._smooth]))
+        return self._residuals(np.hstack([mode, self._smooth]))
 
-    def smooth_left(self) -> Complex:
+    def smooth_residuals(self) -> Complex:
         """Without."""
-        return self._rest(self._smooth)
+        return self._residuals(self._smooth)
 
-    def _rest(self, rows: Complex) -> Complex:
+    def _residuals(self, rows: Complex) -> Complex:
         solution, *_ = np.linalg.lstsq(rows, self._scaled, rcond=None)
         return self._scaled - rows @ solution
 
 
-def _image(hz: float, damping: float, rate_hz: float) -> complex:
+def _mode_image(hz: float, damping: float, rate_hz: float) -> complex:
     return complex(np.exp(complex(-damping, np.sqrt(1 - damping**2)) * 2 * np.pi * hz / rate_hz))
 
 
-def _parts(values: Complex) -> Real:
+def _real_and_imaginary(values: Complex) -> Real:
     return np.concatenate([values.real, values.imag])
 
 
-def _squares(values: Complex) -> float:
+def _sum_of_squares(values: Complex) -> float:
     return float(np.sum(np.abs(values) ** 2))

@@ -19,19 +19,19 @@ from rtloop.hil.modal import Complex, Real
 
 Lines = npt.NDArray[np.int64]
 PER_DECADE = 100
-NEAR = 0.12
+DENSE_BAND = 0.12
 """Part of a resonance's frequency, to both sides, within which every odd line is a candidate."""
-SILENT_OF = 4
+SILENT_INTERVAL = 4
 """Of so many candidates in a row, one is left out."""
-FLATTENINGS, CLIPPED = 60, 0.85
-RISING = 0.5
+FLATTENINGS, CLIPPING_RATIO = 60, 0.85
+FADE_IN_PART = 0.5
 """Of the period to settle: so long the reference grows."""
 HIGHEST_PART = 0.45
 """Of the rate: the highest frequency that is excited."""
 
 
 @dataclass(frozen=True)
-class Grid:
+class LineGrid:
     """A period of `samples` at `rate_hz`; `excited` and `silent` are numbers of harmonics, each rising."""
 
     samples: int
@@ -55,9 +55,9 @@ class Grid:
         return np.fft.rfft(period)[..., self.excited] * (2 / self.samples)
 
 
-def grid(
+def make_grid(
     rate_hz: float, period_s: float, from_hz: float, to_hz: float, near_hz: float | None = None, seed: int = 0
-) -> Grid:
+) -> LineGrid:
     """Odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
 
     Raises ValueError where fewer than three lines lie there, or the band reaches beyond HIGHEST_PART of the rate.
@@ -76,21 +76,23 @@ def grid(
     candidates = np.unique(odd[np.abs(odd[:, None] - targets[None, :]).argmin(axis=0)])
     if near_hz is not None:
         line = near_hz * samples / rate_hz
-        candidates = np.union1d(candidates, odd[np.abs(odd - line) <= NEAR * line])
-    silent_candidates = _left_out(candidates, np.random.default_rng(seed))
+        candidates = np.union1d(candidates, odd[np.abs(odd - line) <= DENSE_BAND * line])
+    silent_candidates = _choose_silent(candidates, np.random.default_rng(seed))
     excited = np.setdiff1d(candidates, silent_candidates)
     silent = np.setdiff1d(np.arange(max(1, odd[0] - 1), odd[-1] + 2), excited)
-    return Grid(samples, rate_hz, excited, silent)
+    return LineGrid(samples, rate_hz, excited, silent)
 
 
-def _left_out(chosen: Lines, random: np.random.Generator) -> Lines:
+def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
     """One of each SILENT_OF neighbours that would leave no odd line silent between them; never an end."""
-    runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 2) + 1)
-    groups = [run[i : i + SILENT_OF] for run in runs for i in range(1, run.size - SILENT_OF, SILENT_OF)]
+    runs = np.split(candidates, np.flatnonzero(np.diff(candidates) > 2) + 1)
+    groups = [
+        run[i : i + SILENT_INTERVAL] for run in runs for i in range(1, run.size - SILENT_INTERVAL, SILENT_INTERVAL)
+    ]
     return np.array([random.choice(group) for group in groups], dtype=np.int64)
 
 
-def flattened(grid: Grid, sizes: Real, seed: int = 0) -> Complex:
+def low_crest_amplitudes(grid: LineGrid, sizes: Real, seed: int = 0) -> Complex:
     """Amplitudes of these `sizes` (excited,) with phases that keep the peak of the waveform low."""
     phases: Complex = np.exp(2j * np.pi * np.random.default_rng(seed).random(sizes.size))
     lowest_crest, lowest_peak = sizes * phases, np.inf
@@ -99,16 +101,16 @@ def flattened(grid: Grid, sizes: Real, seed: int = 0) -> Complex:
         peak = float(np.abs(wave).max())
         if peak < lowest_peak:
             lowest_crest, lowest_peak = sizes * phases, peak
-        clipped = grid.amplitudes(np.clip(wave, -CLIPPED * peak, CLIPPED * peak))
+        clipped = grid.amplitudes(np.clip(wave, -CLIPPING_RATIO * peak, CLIPPING_RATIO * peak))
         phases = np.exp(1j * np.angle(clipped))
     return lowest_crest
 
 
-def played(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
+def excitation_sequence(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
     """About `hold`: one period to settle that begins gently, `periods` of them, and back to `hold` within a fade.
 
     Whatever happens to whoever plays it, the last sample is `hold` and stays.
     """
-    rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / (RISING * period.size), 1.0))
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(period.size) / (FADE_IN_PART * period.size), 1.0))
     falling = (0.5 + 0.5 * np.cos(np.pi * np.arange(1, fade_ticks + 1) / fade_ticks)) * np.resize(period, fade_ticks)
     return hold + np.concatenate([rising * period, np.tile(period, periods), falling])

@@ -6,21 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.measured.multisine import Grid
+from rtloop.analysis.measured.multisine import LineGrid
 from rtloop.hil.modal import Real
 
-LEAST_SAMPLES, COMPARED = 64, 32
+LEAST_SAMPLES, COMPARED_SAMPLES = 64, 32
 """Of a period, and those by which a repetition is first looked for."""
-STILL = 8
+STILL_SAMPLES = 8
 """So many equal samples in a row end a stretch."""
 LEAST_LINES = 3
-SETTLING = 0.25
+SETTLING_PART = 0.25
 """Of a period: where less goes before what repeats itself, the first period is left to settle in."""
 EXCITED_PART = 1e-6
 """Of the largest line: above it a line is excited."""
 
 
-class Periodic(NamedTuple):
+class PeriodicPart(NamedTuple):
     """Whole periods of a reference after one to settle: ticks `start` … `start + periods·samples`."""
 
     start: int
@@ -28,15 +28,15 @@ class Periodic(NamedTuple):
     periods: int
 
     @property
-    def ticks(self) -> slice:
+    def tick_slice(self) -> slice:
         """All of them."""
         return slice(self.start, self.start + self.samples * self.periods)
 
-    def folded(self, signal: Real) -> Real:
+    def reshape_periods(self, signal: Real) -> Real:
         """Of a signal (ticks,): (periods, samples)."""
-        return signal[self.ticks].reshape(self.periods, self.samples)
+        return signal[self.tick_slice].reshape(self.periods, self.samples)
 
-    def grid(self, reference: Real, rate_hz: float) -> Grid:
+    def grid(self, reference: Real, rate_hz: float) -> LineGrid:
         """The lines that are excited, and the silent ones between them. Raises ValueError for fewer than three."""
         sizes = np.abs(np.fft.rfft(reference[self.start : self.start + self.samples]))
         sizes[0] = 0.0
@@ -46,36 +46,38 @@ class Periodic(NamedTuple):
         silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
         if not silent.size:
             raise ValueError("every line is excited; some must be silent, to tell noise and nonlinearity by")
-        return Grid(self.samples, rate_hz, excited, silent)
+        return LineGrid(self.samples, rate_hz, excited, silent)
 
 
-def periodic_part(reference: Real) -> Periodic | None:
+def find_periodic_part(reference: Real) -> PeriodicPart | None:
     """The longest part of a reference (ticks,) that repeats itself at least twice after settling; None without one.
 
     Of equally long ones it is the last.
     """
-    parts = [part for start, end in _stretches(reference) if (part := _repeating(reference, start, end))]
+    parts = [part for start, end in _moving_ranges(reference) if (part := _repeating_part(reference, start, end))]
     return max(reversed(parts), key=lambda part: part.samples * part.periods, default=None)
 
 
-def _stretches(reference: Real) -> list[tuple[int, int]]:
+def _moving_ranges(reference: Real) -> list[tuple[int, int]]:
     """Where it moves: first and last tick + 1 of each, standing still for less than STILL ticks in between."""
     moving = np.flatnonzero(np.diff(reference) != 0)
     if not moving.size:
         return []
-    gaps = np.flatnonzero(np.diff(moving) > STILL)
+    gaps = np.flatnonzero(np.diff(moving) > STILL_SAMPLES)
     starts, ends = moving[np.concatenate([[0], gaps + 1])], moving[np.concatenate([gaps, [moving.size - 1]])] + 2
     return [(int(a), int(b)) for a, b in zip(starts, ends, strict=True) if b - a >= 3 * LEAST_SAMPLES]
 
 
-def _repeating(reference: Real, start: int, end: int) -> Periodic | None:
+def _repeating_part(reference: Real, start: int, end: int) -> PeriodicPart | None:
     part = reference[start:end]
     middle = part.size // 2
     candidate_periods = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES
     for samples in candidate_periods.tolist():
-        if middle + samples + COMPARED > part.size:
+        if middle + samples + COMPARED_SAMPLES > part.size:
             return None
-        if np.array_equal(part[middle : middle + COMPARED], part[middle + samples : middle + samples + COMPARED]):
+        if np.array_equal(
+            part[middle : middle + COMPARED_SAMPLES], part[middle + samples : middle + samples + COMPARED_SAMPLES]
+        ):
             break
     else:
         return None
@@ -87,6 +89,6 @@ def _repeating(reference: Real, start: int, end: int) -> Periodic | None:
         else part.size - samples
     ) + samples
     periods = (last - first) // samples
-    if first < SETTLING * samples:
+    if first < SETTLING_PART * samples:
         periods -= 1
-    return Periodic(start + last - periods * samples, samples, periods) if periods >= 2 else None
+    return PeriodicPart(start + last - periods * samples, samples, periods) if periods >= 2 else None

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtloop.analysis.measured.multisine import Grid
+from rtloop.analysis.measured.multisine import LineGrid
 from rtloop.hil.modal import Complex, Real
 
 SILENT_NEARBY = 10
@@ -27,7 +27,7 @@ SILENT_NEARBY = 10
 
 
 @dataclass(frozen=True)
-class Signals:
+class PeriodSignals:
     """Whole periods at the same reference, each (periods, samples): error, command and position, µm.
 
     `direct` is the part of the command that comes from the reference past the controller, (samples,); None: nothing.
@@ -40,7 +40,7 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Response:
+class MeasuredResponse:
     """At `hz` (k,): plant D and controller C as measured, with their uncertainty.
 
     `spread` is the standard deviation of D̂, and of C D̂, relative to its magnitude, of noise and nonlinearity together;
@@ -58,7 +58,7 @@ class Response:
     moved_um: float
 
 
-def response(grid: Grid, signals: Signals) -> Response:
+def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse:
     """Of at least two periods. Raises ValueError for fewer, and for a loop that did not answer."""
     periods = len(signals.position)
     if periods < 2:
@@ -69,31 +69,31 @@ def response(grid: Grid, signals: Signals) -> Response:
     if not (np.all(mean_v) and np.all(mean_e) and np.all(mean_x)):
         raise ValueError("the loop does not answer: command, error or position stands still")
     variance = (np.abs(x - mean_x) ** 2).sum(axis=0) / (periods - 1)
-    noise = _smooth(variance / periods)
-    total = np.maximum(_at_silent_lines(grid, signals.position.mean(axis=0)), noise)
+    noise = _smooth_power(variance / periods)
+    total = np.maximum(_silent_line_power(grid, signals.position.mean(axis=0)), noise)
     plant, controller = mean_x / mean_v, (mean_v - direct) / mean_e
     factor = np.abs(1 + plant * controller) / np.abs(mean_x)
     power = np.abs(mean_x) ** 2
     deviation = signals.position - signals.position.mean()
-    return Response(
+    return MeasuredResponse(
         grid.hz,
         plant,
         controller,
         factor * np.sqrt(total),
         factor * np.sqrt(noise),
-        power / (power + _smooth(variance)),
+        power / (power + _smooth_power(variance)),
         periods,
         float(np.abs(deviation).max()),
     )
 
 
-def _smooth(power: Real) -> Real:
+def _smooth_power(power: Real) -> Real:
     """Mean over neighbouring lines: of few periods, that of one line says little."""
     kernel = np.ones(min(9, power.size))
     return np.convolve(power, kernel, "same") / np.convolve(np.ones_like(power), kernel, "same")
 
 
-def _at_silent_lines(grid: Grid, period: Real) -> Real:
+def _silent_line_power(grid: LineGrid, period: Real) -> Real:
     """Mean power of the silent lines that are nearest to each excited one, (excited,)."""
     power = np.abs(np.fft.rfft(period)[grid.silent] * (2 / grid.samples)) ** 2
     summed = np.concatenate([[0.0], np.cumsum(power)])

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rtloop.design.identification.identified import write_new
+from rtloop.design.identification.identified import write_new_file
 from rtloop.service.client import Client
 from rtloop.service.client.client import LONGEST_MEASUREMENT_S
 from rtloop.terminal.machine import echo_json
@@ -20,7 +20,7 @@ def learn(client: Client, body: Mapping[str, Any], out: Path | None, as_json: bo
     content = client.move("/learn", body, LONGEST_MEASUREMENT_S)
     if out is not None:
         rows = zip(content["reference_um"], content["command_um"], strict=True)
-        write_new(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))
+        write_new_file(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))
     if as_json:
         echo_json(content)
         return 0

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
-from rtloop.analysis.perturbation import resonance_hz, with_gain_changed, with_resonance_shifted
+from rtloop.analysis.perturbation import change_gain, resonance_hz, shift_resonance
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.file import Configuration, parse
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.section import taps_values
-from rtloop.design.robust.shape import EXCESS, PROOF_POINTS, Judged, Subject, judged_of, shaped
-from rtloop.design.robust.subject import subject_in
-from rtloop.design.toml_text import section
+from rtloop.design.robust.shape import ALLOWED_EXCESS, PROOF_POINTS, StepMeasures, Subject, design_taps, measure_step
+from rtloop.design.robust.subject import load_subject
+from rtloop.design.toml_text import write_section
 from rtloop.errors import ConfigError, LoopFault
 from rtloop.service.client import Client
 from rtloop.terminal.machine import echo_json
@@ -62,13 +62,13 @@ class Stage(NamedTuple):
 def retune(client: Client, asked: Asked, as_json: bool) -> int:
     """Measure, redesign, show, swap; 0 where the taps in force are the new ones. Raises RtloopError."""
     configuration = _running(client)
-    axis, subject, _ = subject_in(configuration, asked.axis, asked.spec)
+    axis, subject, _ = load_subject(configuration, asked.axis, asked.spec)
     stage = _measured(client, asked, subject)
-    shifted = with_gain_changed(with_resonance_shifted(subject.plant, stage.percent), stage.gain_percent or 0.0)
-    there = replace(subject.around(asked.within_percent), plant=shifted)
-    found, in_force = shaped(there, may_be_late=True), _taps_of(axis)
+    shifted = change_gain(shift_resonance(subject.plant, stage.percent), stage.gain_percent or 0.0)
+    there = replace(subject.restrict_resonance(asked.within_percent), plant=shifted)
+    found, in_force = design_taps(there, may_be_late=True), _taps_of(axis)
     nominal = there.family().nominal
-    before, after = judged_of(there, in_force, nominal), judged_of(there, found.taps, nominal)
+    before, after = measure_step(there, in_force, nominal), measure_step(there, found.taps, nominal)
     better, swapped = _is_better(there, before, after), False
     if not as_json:
         _show(stage, before, after, _with_gain_off(stage, there, found.taps))
@@ -120,7 +120,7 @@ def _require_near(measured: str, percent: float, bound_percent: float) -> None:
         )
 
 
-def _is_better(subject: Subject, before: Judged, after: Judged) -> bool:
+def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
     """Whether new taps settle sooner, by more than a point between ticks, or mend what the ones in force do not keep:
     the specification's overshoot, and the limits of v.
     """
@@ -128,7 +128,7 @@ def _is_better(subject: Subject, before: Judged, after: Judged) -> bool:
     return (
         round((before.settling_ms - after.settling_ms) / point_ms) > 1
         or before.overshoot > max(subject.overshoot, after.overshoot)
-        or before.excess > max(EXCESS, after.excess)
+        or before.excess > max(ALLOWED_EXCESS, after.excess)
     )
 
 
@@ -159,7 +159,7 @@ def swap(client: Client, name: str, proposal: str, as_json: bool) -> int:
 def _running(client: Client) -> Configuration:
     """The configuration as it runs."""
     running = client.get("/configuration")
-    text, folder = section("", running["values"]), Path(running["folder"])
+    text, folder = write_section("", running["values"]), Path(running["folder"])
     return parse(text, "running", folder, "the running configuration")
 
 
@@ -201,18 +201,18 @@ def _taps_of(axis: AxisOptions) -> Taps:
     return Taps(reference, command, 0.0)
 
 
-def _with_gain_off(stage: Stage, subject: Subject, taps: Taps) -> Judged | None:
+def _with_gain_off(stage: Stage, subject: Subject, taps: Taps) -> StepMeasures | None:
     """Judge the new taps with the gain off by its standard deviation, to the worse side in each figure; None where the
     gain is the model's.
     """
     if stage.gain is None or stage.gain_percent is None:
         return None
     off, nominal = 100 * stage.gain["std"] / stage.gain["value"], subject.family().nominal
-    ends = [judged_of(subject, taps, nominal._replace(gain=percent)) for percent in (-off, off)]
-    return Judged(*(max(values) for values in zip(*ends, strict=True)))
+    ends = [measure_step(subject, taps, nominal._replace(gain=percent)) for percent in (-off, off)]
+    return StepMeasures(*(max(values) for values in zip(*ends, strict=True)))
 
 
-def _show(stage: Stage, before: Judged, after: Judged, with_gain_off: Judged | None) -> None:
+def _show(stage: Stage, before: StepMeasures, after: StepMeasures, with_gain_off: StepMeasures | None) -> None:
     """Print what was measured, and a step with either taps."""
     mode, gain, percent = stage.mode, stage.gain, stage.gain_percent
     click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {stage.percent:+.2f} % from the model's")

@@ -10,10 +10,10 @@ import click
 from rtloop.commands.design.verify import verify_configuration
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
-from rtloop.design.chain import Chain, configuration_text, designed, identified
-from rtloop.design.identification.identified import write_new
-from rtloop.design.identification.measured import measured
-from rtloop.design.robust.chain import RobustChain, designed_robustly, require_enough
+from rtloop.design.chain import Chain, configuration_text, design_controller, identify_stage
+from rtloop.design.identification.identified import write_new_file
+from rtloop.design.identification.measured import read_axis_recording
+from rtloop.design.robust.chain import RobustChain, design_robust_loop, require_specified
 from rtloop.design.robust.search import Progress
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
@@ -30,7 +30,7 @@ def design_from_recordings(
         made = write_robust_design(hysteresis, step, specs, out, axis, order, lambda line: click.echo(line, err=True))
         print_shaped(made.taps, made.subject)
         click.echo(
-            f"{out}: {made.stage.described()}; bears resonances within ±{made.design.scenarios.resonance_percent:g} %, "
+            f"{out}: {made.stage.describe()}; bears resonances within ±{made.design.scenarios.resonance_percent:g} %, "
             f"{made.subject.options.taps} taps a row for ±{made.subject.options.scenarios.resonance_percent:g} %",
             err=True,
         )
@@ -38,7 +38,7 @@ def design_from_recordings(
     chain = write_design(hysteresis, step, specs, out, axis, order)
     found = chain.synthesis
     click.echo(
-        f"{out}: {chain.stage.described()}; γ {found.achieved:.4g}, controller of order {found.controller.order}",
+        f"{out}: {chain.stage.describe()}; γ {found.achieved:.4g}, controller of order {found.controller.order}",
         err=True,
     )
     return verify_configuration(out, None, None, as_json)
@@ -49,9 +49,9 @@ def write_design(
 ) -> Chain:
     """From two recordings and a specification to a configuration at `out` that `check` accepts. Raises RtloopError."""
     specification = load_specification(specs)
-    stage = identified(measured(hysteresis, axis), measured(step, axis), order)
+    stage = identify_stage(read_axis_recording(hysteresis, axis), read_axis_recording(step, axis), order)
     try:
-        chain = designed(stage, specification.design)
+        chain = design_controller(stage, specification.design)
     except NoController as error:
         raise NoDesign(f"{specs}: {error}") from None
     except ValueError as error:
@@ -66,11 +66,11 @@ def write_robust_design(
 ) -> RobustChain:  # fmt: skip
     """The same with a controller that damps the resonance, and taps. Raises RtloopError."""
     specification = load_specification(specs)
-    require_enough(specification.design, str(specs))
-    stage = identified(measured(hysteresis, axis), measured(step, axis), order)
-    progress(stage.described())
+    require_specified(specification.design, str(specs))
+    stage = identify_stage(read_axis_recording(hysteresis, axis), read_axis_recording(step, axis), order)
+    progress(stage.describe())
     try:
-        chain, text = designed_robustly(
+        chain, text = design_robust_loop(
             stage, specification.design, axis, out.resolve().parent, _beside(specs, out), specification.text, progress
         )
     except NoDesign as error:
@@ -86,4 +86,4 @@ def _beside(specs: Path, out: Path) -> str:
 def _write(text: str, out: Path) -> None:
     """Checked as `check` does, then written."""
     prepare(parse(text, out.stem, out.resolve().parent, str(out)))
-    write_new(out, text)
+    write_new_file(out, text)

@@ -11,10 +11,16 @@ import click
 from rtloop.commands.output import write_configuration, write_over
 from rtloop.configuration.file import load
 from rtloop.configuration.text_files import read_text
-from rtloop.design.robust.search import Robust, robust_controller
-from rtloop.design.robust.section import robust_configuration, robust_section, taps_section, with_controller, with_taps
-from rtloop.design.robust.shape import Shaped, shaped
-from rtloop.design.robust.subject import subject_in
+from rtloop.design.robust.search import RobustDesign, find_robust_controller
+from rtloop.design.robust.section import (
+    insert_controller,
+    insert_taps,
+    robust_configuration,
+    robust_section,
+    taps_section,
+)
+from rtloop.design.robust.shape import TapDesign, design_taps
+from rtloop.design.robust.subject import load_subject
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.errors import ConfigError, NoDesign
@@ -31,14 +37,14 @@ def search_specification(spec: Path, config: Path | None, out: Path | None, axis
     if config is not None:
         _require_axis(config, axis)
     try:
-        found = robust_controller(design, lambda line: click.echo(line, err=True))
+        found = find_robust_controller(design, lambda line: click.echo(line, err=True))
     except NoController as error:
         raise NoDesign(f"{spec}: {error}") from None
     except ValueError as error:
         raise ConfigError(str(spec), [str(error)]) from None
     whole = None
     if config is not None:
-        whole = with_controller(read_text(config), found, design, path.name, text, axis)
+        whole = insert_controller(read_text(config), found, design, path.name, text, axis)
     elif out is not None:
         beside = os.path.relpath(path.resolve(), out.resolve().parent)
         whole = robust_configuration(found, design, path.name, text, axis, beside)
@@ -63,20 +69,20 @@ def shape_configuration(
     Raises ConfigError, NoDesign, OutputError, MissingExtra.
     """
     configuration = load(config)
-    _, subject, spec = subject_in(configuration, axis, spec)
+    _, subject, spec = load_subject(configuration, axis, spec)
     try:
-        found = shaped(subject, curve=plot is not None, progress=lambda line: click.echo(line, err=True))
+        found = design_taps(subject, curve=plot is not None, progress=lambda line: click.echo(line, err=True))
     except NoDesign as error:
         raise NoDesign(f"{config}: {error}") from None
     files = []
     if out is not None:
         beside = os.path.relpath(spec.resolve(), out.resolve().parent)
-        write_configuration(out, with_taps(read_text(config), found, subject, config.name, axis, beside))
+        write_configuration(out, insert_taps(read_text(config), found, subject, config.name, axis, beside))
         files.append(out)
     if plot is not None:
-        from rtloop.design.robust.plots import picture
+        from rtloop.design.robust.plots import draw_taps
 
-        write_over(plot, picture(found, subject, f"{configuration.name}, axis {axis}"))
+        write_over(plot, draw_taps(found, subject, f"{configuration.name}, axis {axis}"))
         files.append(plot)
     if as_json:
         echo_json(_shaped_as_dict(found, files))
@@ -96,7 +102,7 @@ def _require_axis(config: Path, axis: str) -> None:
         raise ConfigError(str(config), [f"axis: {axis!r} is not there; the configuration has {', '.join(names)}"])
 
 
-def _robust_as_dict(found: Robust, out: Path | None) -> dict[str, Any]:
+def _robust_as_dict(found: RobustDesign, out: Path | None) -> dict[str, Any]:
     controller, proof = found.controller, found.certificate
     return {
         "gain": controller.gain,
@@ -111,7 +117,7 @@ def _robust_as_dict(found: Robust, out: Path | None) -> dict[str, Any]:
     }
 
 
-def _shaped_as_dict(found: Shaped, files: list[Path]) -> dict[str, Any]:
+def _shaped_as_dict(found: TapDesign, files: list[Path]) -> dict[str, Any]:
     return {
         "taps": found.taps.reference.tolist(),
         "command_taps": found.taps.command.tolist(),

@@ -10,7 +10,7 @@ import click
 
 from rtloop.commands.output import write_configuration
 from rtloop.design.synthesis.hinf.assumptions import NoController
-from rtloop.design.synthesis.hinf.augment import augmented
+from rtloop.design.synthesis.hinf.augment import augment
 from rtloop.design.synthesis.section import controller_configuration, controller_section
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
@@ -52,7 +52,7 @@ def _slicot(found: Synthesis, design: DesignOptions) -> float:
     from rtloop.design.synthesis.hinf.slicot import slicot_gamma
 
     assert design.plant is not None
-    return slicot_gamma(augmented(design.plant.transfer(), found.weights), 10 * found.hinf.gamma_opt)[0]
+    return slicot_gamma(augment(design.plant.transfer(), found.weights), 10 * found.hinf.gamma_opt)[0]
 
 
 def _as_dict(found: Synthesis, other: float | None, out: Path | None) -> dict[str, Any]:

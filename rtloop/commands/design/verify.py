@@ -16,12 +16,12 @@ from rtloop.configuration.file import Configuration, load
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
-from rtloop.design.verification.bench import Bench, Stand
+from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.design.verification.page import page
 from rtloop.design.verification.plain import as_dict
 from rtloop.design.verification.robustness import Plants
 from rtloop.design.verification.simulated import simulate
-from rtloop.design.verification.verify import Subject, Verification, verify
+from rtloop.design.verification.verify import Verification, VerifiedLoop, verify
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import measured_delay, spent_margin
@@ -40,7 +40,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     if not judged:
         raise ConfigError(str(config), ["axis: none has a controller; nothing can be verified"])
     judged = with_simulation(configuration, judged)
-    meets = all(found.meets for found, _ in judged.values())
+    meets = all(found.meets_specification for found, _ in judged.values())
     report: dict[str, Any] = {
         "name": configuration.name,
         "meets": meets,
@@ -62,7 +62,7 @@ def _scenarios(design: DesignOptions, plant: Transfer, delay_ticks: int, period_
     if "scenarios" not in design.model_fields_set:
         return ()
     family = Family(plant, delay_ticks, design.scenarios, period_s)
-    return [(str(one), family.plant(one), one.delay_ticks) for one in family.corners()]
+    return [(str(one), family.plant(one), one.delay_ticks) for one in family.corner_scenarios()]
 
 
 def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) -> tuple[Verification, DesignOptions]:
@@ -76,7 +76,7 @@ def verified(configuration: Configuration, check: AxisCheck, spec: Path | None) 
         raise ConfigError(configuration.source, [f"{where}.model: missing; there is no plant to verify against"])
     margins = None if check.together is None else check.together.margins
     try:
-        subject = Subject(check.loop, check.controller, check.discrete)
+        subject = VerifiedLoop(check.loop, check.controller, check.discrete)
         plant, delay = model.transfer(), max(model.delay_ticks, check.delay_ticks)
         plants = _scenarios(design, plant, delay, 1 / configuration.loop.rate_hz)
         found, host = verify(subject, plant, design, delay, margins, plants), measured_delay(configuration)
@@ -106,19 +106,20 @@ def with_simulation(configuration: Configuration, judged: Judged) -> Judged:
     }
 
 
-def _stand(axis: AxisOptions, design: DesignOptions) -> Stand:
+def _stand(axis: AxisOptions, design: DesignOptions) -> HardwareModel:
     """What is known of an axis's hardware."""
     sensor, residual_percent = design.sensor, design.simulation.residual_percent
     model = axis.model or design.plant
-    return Stand(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)
+    return HardwareModel(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)
 
 
 def _write_report(folder: Path, name: str, judged: Judged, report: dict[str, Any]) -> list[Path]:
     """verify.json, verify.html and the pictures of each axis."""
-    from rtloop.design.verification.plots import pictures
+    from rtloop.design.verification.plots import draw_pictures
 
     drawn = {
-        axis: pictures(found, design.specification, f"{name}, axis {axis}") for axis, (found, design) in judged.items()
+        axis: draw_pictures(found, design.specification, f"{name}, axis {axis}")
+        for axis, (found, design) in judged.items()
     }
     html = page(f"{name}: verification", [(axis, found, drawn[axis]) for axis, (found, _) in judged.items()])
     contents = {

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.signal import csd, welch
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.outside import LoopExcitation, from_outside, from_rest
+from rtloop.design.identification.dynamics.outside import LoopExcitation, driven_input, shift_to_zero
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.hil.modal import Complex, Real
@@ -36,7 +36,7 @@ class FrequencyResponse:
     coherence: Real
 
     @property
-    def trusted(self) -> npt.NDArray[np.bool_]:
+    def is_trusted(self) -> npt.NDArray[np.bool_]:
         """Where the coherence suffices, (k,) of bool."""
         return np.asarray(self.coherence >= LEAST_COHERENCE)
 
@@ -54,7 +54,7 @@ class Agreement:
     model_peak_hz: float
 
 
-def frequency_response(
+def estimate_response(
     u: Real, x: Real, period_s: float, segment_s: float = SEGMENT_S, instrument: Real | None = None
 ) -> FrequencyResponse:
     """Of input `u` and output `x`, each (samples,), by Welch's method with Hann windows that overlap by three quarters.
@@ -80,15 +80,15 @@ def frequency_response(
     return FrequencyResponse(hz[excited], np.asarray(cross[excited] / input_cross[excited], dtype=complex), coherence)
 
 
-def measured_response(run: Excitation) -> FrequencyResponse:
+def recording_response(run: Excitation) -> FrequencyResponse:
     """Of a recording, by what follows from outside where its loop was closed. Raises UnsuitableData."""
-    instrument = from_outside(from_rest(run)) if isinstance(run, LoopExcitation) else None
-    return frequency_response(run.input, run.position_um - run.position_um[0], run.period_s, instrument=instrument)
+    instrument = driven_input(shift_to_zero(run)) if isinstance(run, LoopExcitation) else None
+    return estimate_response(run.input, run.position_um - run.position_um[0], run.period_s, instrument=instrument)
 
 
-def agreement(model: Innovations, found: FrequencyResponse) -> Agreement:
+def compare_responses(model: Innovations, found: FrequencyResponse) -> Agreement:
     """The model as it is sampled, against `found`. Raises UnsuitableData where no frequency can be trusted."""
-    kept = found.trusted
+    kept = found.is_trusted
     if not np.any(kept):
         raise UnsuitableData(f"too little excitation: no frequency has a coherence of {LEAST_COHERENCE}")
     hz, there = found.hz[kept], found.response[kept]

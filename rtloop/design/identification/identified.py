@@ -15,8 +15,8 @@ from rtloop.configuration.file import describe
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
-from rtloop.design.identification.measured import Measured, UnsuitableData
-from rtloop.design.toml_text import roots, section
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData
+from rtloop.design.toml_text import root_pairs, write_section
 from rtloop.errors import ConfigError, OutputError
 from rtloop.hil.trusted import make_file
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
@@ -27,29 +27,34 @@ from rtloop.recording.errors import RecordingError
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
     """[axis.feedforward]. Raises UnsuitableData for weights that have no inverse."""
     try:
-        model.without_dead_band().inverse()
+        model.remove_dead_band().inverse()
     except ValueError as fault:
         raise UnsuitableData(f"{fault}; weights 'invertible' keep them so, fewer operators would help too") from None
     values = {"thresholds_v": model.thresholds.tolist(), "weights_um_per_v": model.weights.tolist()}
-    return section("axis.feedforward", values, comments)
+    return write_section("axis.feedforward", values, comments)
 
 
-def model_section(fit: DynamicsFit, comments: Sequence[str]) -> str:
+def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
     """[axis.model] as zeros, poles and gain."""
-    return section("axis.model", model_values(fit), comments)
+    return write_section("axis.model", model_values(fit), comment_lines)
 
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
     """The keys of [axis.model]."""
     transfer = fit.transfer
-    values = {"form": "zpk", "gain": transfer.gain, "zeros": roots(transfer.zeros), "poles": roots(transfer.poles)}
+    values = {
+        "form": "zpk",
+        "gain": transfer.gain,
+        "zeros": root_pairs(transfer.zeros),
+        "poles": root_pairs(transfer.poles),
+    }
     return {**values, "delay_ticks": fit.delay_ticks}
 
 
-def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[str]:
+def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> list[str]:
     """Where the hysteresis model comes from, a line each."""
     return [
-        f"Hysteresis, identified by rtloop {__version__} from {sources(runs)}",
+        f"Hysteresis, identified by rtloop {__version__} from {describe_sources(runs)}",
         f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
         f"drive up to {fit.drive_v:.6g} V",
         f"error {fit.rms_error_um:.3g} µm rms, at most {100 * fit.max_error_um / fit.range_um:.3g} % "
@@ -57,7 +62,7 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[Measured]) -> list[
     ]
 
 
-def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
+def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -> list[str]:
     """Where the dynamics come from, a line each."""
     modes = (
         f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
@@ -66,7 +71,7 @@ def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
         for mode in fit.modes
     )
     return [
-        f"Dynamics, identified by rtloop {__version__} from {sources([run])}, input: {how}",
+        f"Dynamics, identified by rtloop {__version__} from {describe_sources([run])}, input: {input_kind}",
         f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "
         f"{fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
         "modes: " + ", ".join(modes) + f"; behind {fit.delay_ticks} samples of delay",
@@ -74,12 +79,12 @@ def dynamics_provenance(fit: DynamicsFit, run: Measured, how: str) -> list[str]:
     ]
 
 
-def sources(runs: Sequence[Measured]) -> str:
+def describe_sources(runs: Sequence[AxisRecording]) -> str:
     """Names and digests of recordings."""
     return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
 
 
-def with_gain(model: PlayModel, gain: float) -> PlayModel:
+def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
     """The hysteresis with a gain put into it, so that D(0) can be 1."""
     return PlayModel(model.thresholds, gain * model.weights)
 
@@ -89,10 +94,10 @@ def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOp
 
     Raises RecordingError for a file that cannot be read, ConfigError for one that holds no such section.
     """
-    return feedforward_of(read_text(path, RecordingError), str(path), axis)
+    return parse_feedforward(read_text(path, RecordingError), str(path), axis)
 
 
-def feedforward_of(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
+def parse_feedforward(content: str, source: str, axis: str | None = None) -> PrandtlIshlinskiiOptions:
     """The same, from TOML text. Raises ConfigError."""
     try:
         table: Any = parse_toml(content).get("axis")
@@ -108,7 +113,7 @@ def feedforward_of(content: str, source: str, axis: str | None = None) -> Prandt
         raise ConfigError(source, describe(error, "axis.feedforward", table["feedforward"])) from None
 
 
-def write_new(path: Path, content: str) -> None:
+def write_new_file(path: Path, content: str) -> None:
     """Write a text file, never over an existing one. Raises OutputError."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rtloop.errors import RtloopError
 from rtloop.hil.modal import Real
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording, load
 from rtloop.signals import trip_causes
@@ -20,7 +20,7 @@ from rtloop.signals import trip_causes
 LEAST_SPAN_TO_NOISE = 50.0
 """Position must move by this many standard deviations of its noise."""
 LEAST_TICKS = 100
-LARGEST_AGAINST = -0.5
+LARGEST_ANTICORRELATION = -0.5
 """Correlation of position and drive below which a position goes against a slow drive."""
 PLATEAU_DRIVE = 0.02
 """A reading that stands still at its extreme while the drive moves by more than this part of its span is clipped."""
@@ -35,7 +35,7 @@ class UnsuitableData(RtloopError):
 
 
 @dataclass(frozen=True)
-class Measured:
+class AxisRecording:
     """Drive and position of one axis, each (ticks,): the position of a tick was measured before its drive was written.
 
     In a recording that was imported the two are taken as sampled together: its rows are paired anew, so that here,
@@ -60,15 +60,15 @@ class Measured:
         return self.period_s * np.arange(self.drive_v.size, dtype=np.float64) if self.time_s is None else self.time_s
 
 
-def measured(path: Path, axis: str | None = None) -> Measured:
+def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     """One recording's axis (the only one, if there is one). Raises RecordingError, UnsuitableData."""
     recording = load(path)
-    axis = axis_of(recording, axis, path)
+    axis = select_axis(recording, axis, path)
     drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
     if drive.size < LEAST_TICKS:
         raise UnsuitableData(f"{path}: {drive.size} ticks; at least {LEAST_TICKS} are needed")
     if "flags" in recording:
-        _refuse_trip(path, recording["flags"])
+        _require_untripped(path, recording["flags"])
     reading_name = f"{axis}_adc_v" if f"{axis}_adc_v" in recording else f"{axis}_position_um"
     require_usable(str(path), drive, position, recording[reading_name])
     intervals = np.diff(deadlines)
@@ -81,19 +81,21 @@ def measured(path: Path, axis: str | None = None) -> Measured:
     commands = recording[command] if command in recording else np.full(drive.size, np.nan)
     if "imported" in recording.header:
         drive, commands, position, deadlines = drive[1:], commands[1:], position[:-1], deadlines[1:]
-    return Measured(
-        str(path), period_ns * 1e-9, drive, position, commands, is_even, recording.configuration, _digest(recording.paths),
-        deadlines * 1e-9,
+    return AxisRecording(
+        str(path), period_ns * 1e-9, drive, position, commands, is_even, recording.configuration,
+        _digest(recording.paths), deadlines * 1e-9,
     )  # fmt: skip
 
 
-def distinct(runs: Sequence[Measured], others: Sequence[Measured] = ()) -> tuple[list[Measured], list[str]]:
+def distinct(
+    runs: Sequence[AxisRecording], others: Sequence[AxisRecording] = ()
+) -> tuple[list[AxisRecording], list[str]]:
     """Return the runs whose ticks are in no earlier run and in none of `others`, and a sentence for each run left out.
 
     A copy of a recording is no independent evidence.
     """
     seen = {_ticks_of(run): run.name for run in others}
-    retained, sentences = list[Measured](), list[str]()
+    retained, sentences = list[AxisRecording](), list[str]()
     for run in runs:
         ticks = _ticks_of(run)
         if ticks in seen:
@@ -104,7 +106,7 @@ def distinct(runs: Sequence[Measured], others: Sequence[Measured] = ()) -> tuple
     return retained, sentences
 
 
-def _ticks_of(run: Measured) -> str:
+def _ticks_of(run: AxisRecording) -> str:
     """SHA-256 of the drive and the position of every tick."""
     return hashlib.sha256(run.drive_v.tobytes() + run.position_um.tobytes()).hexdigest()
 
@@ -120,7 +122,7 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
     """Raise UnsuitableData where a signal is not finite or clipped, or where nothing moved."""
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
         raise UnsuitableData(f"{name}: drive or position holds numbers that are not finite")
-    noise, span = noise_of(position_um), float(np.ptp(position_um))
+    noise, span = noise_std(position_um), float(np.ptp(position_um))
     if np.ptp(drive_v) == 0:
         raise UnsuitableData(
             f"{name}: too little excitation: the drive stays at {drive_v[0]:g} V; a sine, step or chirp is needed"
@@ -130,17 +132,17 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real) -> 
             f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
             f"at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm is needed: drive further"
         )
-    if (tick := _clipped(drive_v, adc_v)) is not None:
+    if (tick := _first_clipped_tick(drive_v, adc_v)) is not None:
         raise UnsuitableData(
             f"{name}: saturated: the reading stands still at {adc_v[tick]:.6g} V from tick {tick} on while it should "
             "move; a smaller drive, or a sensor or converter of larger range, is needed"
         )
 
 
-def require_rising(run: Measured) -> None:
+def require_rising(run: AxisRecording) -> None:
     """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere."""
     drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
-    if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_AGAINST:
+    if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
         slope = float(np.polyfit(drive_v, position_um, 1)[0])
         raise UnsuitableData(
             f"{run.name}: the sign is wrong: the position falls where the drive rises, by {-slope:.3g} µm/V. Turn the "
@@ -149,12 +151,12 @@ def require_rising(run: Measured) -> None:
         )
 
 
-def noise_of(position: Real) -> float:
+def noise_std(position: Real) -> float:
     """Standard deviation of white noise on a smooth signal, from its second differences' median."""
     return float(np.median(np.abs(np.diff(position, 2)))) / 0.6745 / 6**0.5
 
 
-def _clipped(drive: Real, adc: Real) -> int | None:
+def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
     """First tick of a plateau at an extreme that is none of the signal's own, or None. A rest at the start is."""
     changes = np.abs(np.diff(adc))
     usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
@@ -172,7 +174,7 @@ def _clipped(drive: Real, adc: Real) -> int | None:
     return None
 
 
-def _refuse_trip(path: Path, flags: Real) -> None:
+def _require_untripped(path: Path, flags: Real) -> None:
     is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
     if not np.any(is_tripped):
         return
@@ -183,24 +185,26 @@ def _refuse_trip(path: Path, flags: Real) -> None:
     )
 
 
-def axis_of(recording: Recording, axis: str | None, path: Path) -> str:
+def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
     """The one that is meant, the only one by default. Raises RecordingError."""
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:
         return str(axes[0])
     if axis is None or axis not in axes:
-        raise RecordingError(f"{path}: {_which(axis)}, it holds {', '.join(axes) or 'none'}: --axis says which")
+        raise RecordingError(
+            f"{path}: {_axis_complaint(axis)}, it holds {', '.join(axes) or 'none'}: --axis says which"
+        )
     return axis
 
 
-def _which(axis: str | None) -> str:
+def _axis_complaint(axis: str | None) -> str:
     return "of several axes" if axis is None else f"no axis {axis!r}"
 
 
 def _digest(paths: tuple[Path, ...]) -> str:
     digest = hashlib.sha256()
     for path in paths:
-        with os.fdopen(open_named(path), "rb") as file:
+        with os.fdopen(open_user_file(path), "rb") as file:
             for block in iter(lambda: file.read(1 << 20), b""):
                 digest.update(block)
     return digest.hexdigest()

@@ -8,47 +8,53 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.design.identification.plots import figure_of, label, save
+from rtloop.design.identification.plots import create_figure, label_panel, save_figure
 from rtloop.hil.modal import Complex, Real
 
-MEASURED, PROMISED = "tab:blue", "0.15"
-SHOWN = 2.0
+MEASURED_COLOR, MODEL_COLOR = "tab:blue", "0.15"
+PLANE_LIMIT = 2.0
 """Of the plane of L, to each side."""
 
 
-def plot_response(content: Mapping[str, Any], output: Path) -> None:
-    """Of a `Measurement` as it is told in JSON. Raises OutputError, MissingExtra."""
-    curves = content["response"]
+def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
+    """Of a `LoopMeasurement` as it is told in JSON. Raises OutputError, MissingExtra."""
+    curves = measurement["response"]
     hz, loop, spread = np.array(curves["hz"]), _complex(curves["loop"]), np.array(curves["loop_spread"], float)
     model = _complex(curves["model_loop"]) if "model_loop" in curves else None
-    figure, ((magnitude, plane), (phase, sensitivity)) = figure_of(2, 2, (12, 8))
-    margins = content["margins"]
-    _with_spread(magnitude, hz, np.abs(loop), np.abs(loop) * spread)
+    figure, ((magnitude, plane), (phase, sensitivity)) = create_figure(2, 2, (12, 8))
+    margins = measurement["margins"]
+    _plot_with_spread(magnitude, hz, np.abs(loop), np.abs(loop) * spread)
     size = np.abs(_complex(curves["sensitivity"]))
-    _with_spread(sensitivity, hz, size, size * np.array(curves["sensitivity_spread"], float))
-    phase.semilogx(hz, np.degrees(np.unwrap(np.angle(loop))), ".-", color=MEASURED, markersize=3, linewidth=0.8)
-    plane.plot(loop.real, loop.imag, ".-", color=MEASURED, markersize=3, linewidth=0.8, label="measured")
+    _plot_with_spread(sensitivity, hz, size, size * np.array(curves["sensitivity_spread"], float))
+    phase.semilogx(hz, np.degrees(np.unwrap(np.angle(loop))), ".-", color=MEASURED_COLOR, markersize=3, linewidth=0.8)
+    plane.plot(loop.real, loop.imag, ".-", color=MEASURED_COLOR, markersize=3, linewidth=0.8, label="measured")
     if model is not None:
-        magnitude.loglog(hz, np.abs(model), color=PROMISED, linewidth=0.8, label="model")
+        magnitude.loglog(hz, np.abs(model), color=MODEL_COLOR, linewidth=0.8, label="model")
         promised = np.abs(_complex(curves["model_sensitivity"]))
-        sensitivity.loglog(hz, promised, color=PROMISED, linewidth=0.8, label="model")
-        phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=PROMISED, linewidth=0.8)
-        plane.plot(model.real, model.imag, color=PROMISED, linewidth=0.8, label="model")
+        sensitivity.loglog(hz, promised, color=MODEL_COLOR, linewidth=0.8, label="model")
+        phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=MODEL_COLOR, linewidth=0.8)
+        plane.plot(model.real, model.imag, color=MODEL_COLOR, linewidth=0.8, label="model")
     plane.plot([-1], [0], "+", color="tab:red", markersize=10)
-    plane.set(xlim=(-SHOWN, SHOWN), ylim=(-SHOWN, SHOWN), aspect="equal")
+    plane.set(xlim=(-PLANE_LIMIT, PLANE_LIMIT), ylim=(-PLANE_LIMIT, PLANE_LIMIT), aspect="equal")
     magnitude.axhline(1, color="0.6", linewidth=0.6)
-    label(magnitude, "frequency / Hz", "|L|", f"loop: gain margin {_told(margins['gain_margin'])}")
-    label(
-        phase, "frequency / Hz", "phase of L / °", f"phase margin {_told(margins['phase_margin_deg'])} °", legend=False
+    label_panel(magnitude, "frequency / Hz", "|L|", f"loop: gain margin {_format_margin(margins['gain_margin'])}")
+    label_panel(
+        phase,
+        "frequency / Hz",
+        "phase of L / °",
+        f"phase margin {_format_margin(margins['phase_margin_deg'])} °",
+        legend=False,
     )
-    label(sensitivity, "frequency / Hz", "|S|", f"largest |S| {_told(margins['max_sensitivity'])}")
-    label(plane, "Re L", "Im L", f"modulus margin {_told(margins['modulus_margin'])}")
-    save(figure, output)
+    label_panel(sensitivity, "frequency / Hz", "|S|", f"largest |S| {_format_margin(margins['max_sensitivity'])}")
+    label_panel(plane, "Re L", "Im L", f"modulus margin {_format_margin(margins['modulus_margin'])}")
+    save_figure(figure, output)
 
 
-def _with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
-    panel.loglog(hz, size, ".-", color=MEASURED, markersize=3, linewidth=0.8, label="measured")
-    panel.fill_between(hz, np.maximum(size - 2 * std, 1e-9), size + 2 * std, color=MEASURED, alpha=0.2, label="±2σ")
+def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
+    panel.loglog(hz, size, ".-", color=MEASURED_COLOR, markersize=3, linewidth=0.8, label="measured")
+    panel.fill_between(
+        hz, np.maximum(size - 2 * std, 1e-9), size + 2 * std, color=MEASURED_COLOR, alpha=0.2, label="±2σ"
+    )
 
 
 def _complex(pairs: Any) -> Complex:
@@ -56,5 +62,5 @@ def _complex(pairs: Any) -> Complex:
     return parts[:, 0] + 1j * parts[:, 1]
 
 
-def _told(found: Mapping[str, float | None]) -> str:
+def _format_margin(found: Mapping[str, float | None]) -> str:
     return "–" if found["value"] is None else f"{found['value']:.4g} ± {found['std']:.2g}"

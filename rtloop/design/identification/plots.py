@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
-from rtloop.design.identification.dynamics.instrumental import left_by
+from rtloop.design.identification.dynamics.instrumental import residual_noise
 from rtloop.design.identification.dynamics.outside import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import FrequencyResponse
 from rtloop.design.identification.hysteresis.identify_hysteresis import HysteresisFit
 from rtloop.design.identification.hysteresis.judgement import Judgement
-from rtloop.errors import MissingExtra, writing
+from rtloop.errors import MissingExtra, output_errors
 from rtloop.hil.modal import Real
 from rtloop.hil.trusted import overwrite_file
-from rtloop.hysteresis.compensation import Residual, compensated
+from rtloop.hysteresis.compensation import Residual, compensated_output
 from rtloop.laws.shipped.play_model import PlayModel
 
 POINTS = 20_000
@@ -31,7 +31,7 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
 
     Raises OutputError, MissingExtra.
     """
-    figure, (loop_panel, time_panel, drive_panel) = figure_of(1, 3, (17, 5))
+    figure, (loop_panel, time_panel, drive_panel) = create_figure(1, 3, (17, 5))
     for i, judgement in enumerate(judgements):
         name = {"label": Path(judgement.name).name} if len(judgements) > 1 else {}
         color = f"C{i}"
@@ -41,54 +41,56 @@ def plot_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement], output:
         loop_panel.plot(judgement.drive_v, position - judgement.error_um, color="0.15", linewidth=0.8, **model)
         time_panel.plot(time_s, judgement.error_um, color=color, linewidth=0.8, **name)
         drive_panel.plot(judgement.drive_v, judgement.error_um, color=color, linewidth=0.8)
-        time_panel.plot(time_s, judgement.early_um, color=color, linewidth=0.8, alpha=0.3)
-    label(loop_panel, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
+        time_panel.plot(time_s, judgement.early_error_um, color=color, linewidth=0.8, alpha=0.3)
+    label_panel(loop_panel, "drive / V", "position / µm", f"h/H {fit.measured_loop.percent:.2f} % measured, "
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
-    rms_um = float(np.sqrt(np.mean([judgement.rms_um**2 for judgement in judgements if judgement.judged_part])))
-    label(time_panel, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1)
-    label(drive_panel, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
-    save(figure, output)
+    rms_um = float(np.sqrt(np.mean([judgement.rms_um**2 for judgement in judgements if judgement.judged_share])))
+    label_panel(
+        time_panel, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1
+    )
+    label_panel(drive_panel, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
+    save_figure(figure, output)
 
 
 def plot_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, output: Path) -> None:
     """Response and model in time (Fig 5 of the paper) and over frequency. Raises OutputError, MissingExtra."""
-    figure, (time, frequency) = figure_of(1, 2)
+    figure, (time, frequency) = create_figure(1, 2)
     offset = run.position_um[0]
     count = min(run.input.size, POINTS)
     time_s = np.arange(count) * run.period_s
     time.plot(time_s, run.position_um[:count], color="tab:blue", linewidth=2, label="measured")
-    residual_um = left_by(fit.model, run) if isinstance(run, LoopExcitation) else None
-    modelled = fit.model.output(run.input) + offset if residual_um is None else run.position_um - residual_um
+    residual_um = residual_noise(fit.model, run) if isinstance(run, LoopExcitation) else None
+    modelled = fit.model.simulate_output(run.input) + offset if residual_um is None else run.position_um - residual_um
     time.plot(time_s, modelled[:count], color="0.15", linewidth=0.8, label="model")
-    label(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
+    label_panel(time, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %")
     if measured is not None:
-        trusted = measured.trusted
+        trusted = measured.is_trusted
         magnitude = np.abs(measured.response[trusted])
         frequency.loglog(measured.hz[trusted], magnitude, ".", color="tab:blue", markersize=3, label="measured")
     hz = np.geomspace(1.0, 0.5 / run.period_s, 4000)
     response = fit.model.discrete().response(np.exp(2j * np.pi * hz * run.period_s))[0]
     frequency.loglog(hz, np.abs(response), color="0.15", linewidth=0.8, label="model")
     modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
-    label(frequency, "frequency / Hz", "position per input", modes)
-    save(figure, output)
+    label_panel(frequency, "frequency / Hz", "position per input", modes)
+    save_figure(figure, output)
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
     """y over v (Fig 7 of the paper) and Ω with its bound. Raises OutputError, MissingExtra."""
-    figure, (output_panel, residual_panel) = figure_of(1, 2)
+    figure, (output_panel, residual_panel) = create_figure(1, 2)
     command: Real = residual.command_um * np.sin(np.linspace(0, 5 * np.pi, 4000))
-    y = compensated(actuator, inverse, command)
+    y = compensated_output(actuator, inverse, command)
     output_panel.plot(command, y, color="tab:blue", linewidth=1)
-    label(output_panel, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
+    label_panel(output_panel, "v / µm", "y / µm", "output of the inverse compensation", legend=False)
     bound = residual.bound_um(residual.gain)
     residual_panel.plot(command, y - residual.gain * command, color="tab:red", linewidth=1, label="Ω of a sine")
     for sign in (-1, 1):
         residual_panel.axhline(sign * bound, color="0.15", linewidth=0.8, label="±ξ" if sign > 0 else None)
-    label(residual_panel, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
-    save(figure, output)
+    label_panel(residual_panel, "v / µm", "Ω = y − ρ v / µm", f"ρ {residual.gain:.4f}, ξ {bound:.3g} µm")
+    save_figure(figure, output)
 
 
-def figure_of(rows: int, columns: int, size: tuple[float, float] = (12, 5)) -> tuple[Any, Any]:
+def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5)) -> tuple[Any, Any]:
     """A figure with its panels. Raises MissingExtra."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -100,7 +102,7 @@ def figure_of(rows: int, columns: int, size: tuple[float, float] = (12, 5)) -> t
     return figure, figure.subplots(rows, columns)
 
 
-def label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
+def label_panel(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> None:
     """Axes, title, grid."""
     panel.set_xlabel(x)
     panel.set_ylabel(y)
@@ -110,7 +112,7 @@ def label(panel: Any, x: str, y: str, title: str, *, legend: bool = True) -> Non
         panel.legend(fontsize=8)
 
 
-def save(figure: Any, output: Path) -> None:
+def save_figure(figure: Any, output: Path) -> None:
     """Write the PNG. Raises OutputError."""
-    with writing(output), os.fdopen(overwrite_file(output), "wb") as file:
+    with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
         figure.savefig(file, format="png", dpi=110)

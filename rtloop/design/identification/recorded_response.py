@@ -6,16 +6,16 @@ import tomllib
 from contextlib import suppress
 from pathlib import Path
 
-from rtloop.analysis.measured.measurement import IN_STEP, SIGNALS, Measurement, measurement
+from rtloop.analysis.measured.measurement import SIGNALS, TICK_DRIVEN, LoopMeasurement, measure_loop
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import loop_delay_ticks, promised_loop
-from rtloop.design.identification.measured import UnsuitableData, axis_of
+from rtloop.design.identification.measured import UnsuitableData, select_axis
 from rtloop.hil.modal import Real
 from rtloop.recording.load import load
 
 
-def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> Measurement:
+def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> LoopMeasurement:
     """From the longest multisine in the reference of an axis (the only one, if there is one).
 
     The model is that of the recorded configuration. Raises RecordingError, UnsuitableData.
@@ -25,10 +25,10 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
         raise UnsuitableData(
             f"{path}: was imported, and nothing in it says which loop was closed; identify hysteresis, dynamics take it"
         )
-    axis = axis_of(recording, axis, path)
+    axis = select_axis(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])
     names = {name: f"{axis}_{name}" for name in SIGNALS}
-    if recording.header["driver"]["kind"] != IN_STEP:
+    if recording.header["driver"]["kind"] != TICK_DRIVEN:
         names["periods_missed"] = "periods_missed"
     if f"{axis}_feed_um" in recording:
         names["feed_um"] = f"{axis}_feed_um"
@@ -36,7 +36,9 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     signals: dict[str, Real] = dict(zip(names, recording.read(*names.values()), strict=True))
     configuration = tomllib.loads(recording.configuration)
     axis_table = next(table for table in configuration["axis"] if table["name"] == axis)
-    rig_ticks = configuration["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == IN_STEP else 0
+    rig_ticks = (
+        configuration["driver"].get("latency_ticks", 0) if recording.header["driver"]["kind"] == TICK_DRIVEN else 0
+    )
     model, model_resonance, taps = None, None, axis_table.get("prefilter", {}).get("command_taps", ())
     with suppress(ValueError):  # a law of somebody's own, of which the recording alone says nothing linear
         options = AxisOptions.model_validate(axis_table)
@@ -44,6 +46,6 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
         model_resonance = options.model and resonance_hz(options.model.transfer())
     near_hz = near_hz or (model_resonance[0] if model_resonance else None)
     try:
-        return measurement(signals, rate_hz, near_hz, model, taps)
+        return measure_loop(signals, rate_hz, near_hz, model, taps)
     except ValueError as fault:
         raise UnsuitableData(f"{path}: {fault}") from None

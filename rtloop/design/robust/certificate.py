@@ -13,15 +13,15 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
-from rtloop.analysis.margins import highest
+from rtloop.analysis.margins import find_maximum
 from rtloop.design.robust.objective import Walls
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.linear.discretise import DiscreteController
 
-SWEPT, DRAWN = 41, 200
+SWEEP_POINTS, RANDOM_PLANTS = 41, 200
 
 
-class Worst(NamedTuple):
+class WorstCase(NamedTuple):
     """A value and where it was found."""
 
     value: float
@@ -32,18 +32,18 @@ class Certificate(NamedTuple):
     """The worst of `plants` plants: stable or not, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain."""
 
     plants: int
-    radius: Worst
-    decay_ms: Worst
-    sensitivity: Worst
-    disturbance: Worst
-    noise_gain: Worst
+    radius: WorstCase
+    decay_ms: WorstCase
+    sensitivity: WorstCase
+    disturbance: WorstCase
+    noise_gain: WorstCase
 
     @property
     def is_stable(self) -> bool:
         """Every loop is."""
         return self.radius.value < 1
 
-    def missed(self, walls: Walls, decay_ms: float | None) -> list[str]:
+    def violations(self, walls: Walls, decay_ms: float | None) -> list[str]:
         """What is not kept, in words; nothing where all is."""
         if not self.is_stable:
             return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]
@@ -59,16 +59,22 @@ class Certificate(NamedTuple):
             if case.value > limit * (1 + 1e-9)
         ]
 
-    def worst(self) -> list[Scenario]:
+    def worst_scenarios(self) -> list[Scenario]:
         """The scenarios that are worst in something, each once."""
         return list(dict.fromkeys(case.scenario for case in self[1:]))
 
 
-def certified(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
+def certify(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
     """Of a controller, over sweeps and random draws of a family's plants."""
-    scenarios = dict.fromkeys([*family.corners(), *family.swept(SWEPT), *family.drawn(DRAWN, seed)])
-    measures = {scenario: _measured(controller, family, walls, scenario) for scenario in scenarios}
-    cases = [Worst(*max((values[i], scenario) for scenario, values in measures.items())) for i in range(5)]
+    scenarios = dict.fromkeys(
+        [
+            *family.corner_scenarios(),
+            *family.sweep_scenarios(SWEEP_POINTS),
+            *family.random_scenarios(RANDOM_PLANTS, seed),
+        ]
+    )
+    measures = {scenario: _measure_loop(controller, family, walls, scenario) for scenario in scenarios}
+    cases = [WorstCase(*max((values[i], scenario) for scenario, values in measures.items())) for i in range(5)]
     return Certificate(len(measures), *cases)
 
 
@@ -91,7 +97,7 @@ def noise_gain(loop: Loop) -> float:
     return math.sqrt(covariance + d[1] ** 2)
 
 
-def _measured(
+def _measure_loop(
     controller: DiscreteController, family: Family, walls: Walls, scenario: Scenario
 ) -> tuple[float, float, float, float, float]:
     """Largest |pole|, τ in ms, max |S|, |S| at the disturbance's frequency, noise gain; infinite if unstable."""
@@ -101,5 +107,5 @@ def _measured(
         return radius, math.inf, math.inf, math.inf, math.inf
     disturbance = float(loop.sensitivity(walls.disturbance_hz)[0]) if walls.disturbance_hz else 0.0
     decay = slowest_ms(loop, family.bands)
-    peak, _ = highest(loop.sensitivity, loop.frequencies)
+    peak, _ = find_maximum(loop.sensitivity, loop.frequencies)
     return radius, decay, peak, disturbance, noise_gain(loop)

@@ -19,34 +19,34 @@ import numpy as np
 from rtloop.analysis.closed_loop import discrete_loop
 from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import parse
-from rtloop.design.chain import Stage, text_with
-from rtloop.design.identification.hysteresis.creep import creep_explains
+from rtloop.design.chain import Stage, stage_configuration
+from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
 from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
-from rtloop.design.robust.search import Progress, Robust, robust_controller
-from rtloop.design.robust.section import provenance, taps_provenance, taps_values, written_values
-from rtloop.design.robust.shape import Shaped, Subject, shaped
-from rtloop.design.robust.subject import lacking, subject_of
+from rtloop.design.robust.search import Progress, RobustDesign, find_robust_controller
+from rtloop.design.robust.section import provenance, robust_values, taps_provenance, taps_values
+from rtloop.design.robust.shape import Subject, TapDesign, design_taps
+from rtloop.design.robust.subject import build_subject, missing_requirements
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions, DisturbanceOptions
 from rtloop.errors import ConfigError, NoDesign
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 
 RANGES_PERCENT = (10.0, 5.0, 2.0)
 """Of the resonance that a controller bears, where [scenarios] is left out."""
 TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
 """Of the resonance that taps fit, where [shape.scenarios] is left out."""
-PERIODS = 2.9
+TAP_PERIODS = 2.9
 """Of the slowest leading mode, that the taps last where their number is left out."""
 NARROW_PERCENT = 2.5
 """Half of the band for settling: what the inverse leaves of hysteresis, and noise, may take the other half."""
-LEAST_DAMPING, ABOUT = 0.1, 1.5
+LEAST_DAMPING, FREQUENCY_FACTOR = 0.1, 1.5
 """In closed loop, from the lowest leading mode's frequency by this factor down to the highest one's up: taps make steps
 of a model, and what the stage does besides rings on."""
 FEWEST_POINTS = 3
 """Of a tick, in the programme of many taps; the proof looks at as many as ever."""
-HELD, SLOWER = 0.1, 100.0
+HELD_SENSITIVITY, DISTURBANCE_RATIO = 0.1, 100.0
 """Where a specification has no disturbance, |S| at the slowest leading mode's frequency divided by SLOWER."""
 
 
@@ -55,66 +55,66 @@ class RobustChain(NamedTuple):
 
     stage: Stage
     design: DesignOptions
-    robust: Robust
+    robust: RobustDesign
     subject: Subject
-    taps: Shaped
+    taps: TapDesign
 
 
-def designed_robustly(
+def design_robust_loop(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str, spec_text: str,
     progress: Progress = lambda _: None,
 ) -> tuple[RobustChain, str]:  # fmt: skip
     """A controller, its taps, and the configuration that has both in axis `axis` (the first).
 
     `spec_name` is the specification's file relative to `folder`, where the configuration is to stand. Raises NoDesign
-    with what is missed. The specification is one that `require_enough` lets through.
+    with what is missed. The specification is one that `require_specified` lets through.
     """
-    _require_plays(stage, design)
-    final_design = stage.asked(design)
-    final_design, controller = _controller(final_design, progress)
+    _require_play_model(stage, design)
+    final_design = stage.complete_design(design)
+    final_design, controller = _find_controller(final_design, progress)
     comments = provenance(controller, final_design, spec_name, spec_text)
-    parts = {"controller": written_values(controller, final_design)}
-    plain_text = text_with(stage, parts, comments, axis, spec_name)
+    parts = {"controller": robust_values(controller, final_design)}
+    plain_text = stage_configuration(stage, parts, comments, axis, spec_name)
     configuration, findings = parse(plain_text, "designed", folder, spec_name), Findings()
     checks = check_axes(configuration, findings)
     axis_options = next(entry for entry in configuration.axes if axis in (None, entry.name))
     check = next(entry for entry in checks if entry.name == axis_options.name)
     try:
-        subject = subject_of(axis_options, check, _with_taps(final_design, controller.family))
+        subject = build_subject(axis_options, check, _choose_tap_options(final_design, controller.family))
     except ValueError as error:
         raise NoDesign(f"axis.{axis_options.name}.{error}") from None
-    subject = _within_command(subject, final_design)
-    subject, taps = _taps(subject, "scenarios" in design.shape.model_fields_set, progress)
+    subject = _limit_command(subject, final_design)
+    subject, taps = _find_taps(subject, "scenarios" in design.shape.model_fields_set, progress)
     comments += taps_provenance(taps, subject, spec_name)
-    text = text_with(stage, {**parts, "prefilter": taps_values(taps.taps)}, comments, axis, spec_name)
+    text = stage_configuration(stage, {**parts, "prefilter": taps_values(taps.taps)}, comments, axis, spec_name)
     return RobustChain(stage, final_design, controller, subject, taps), text
 
 
-def require_enough(design: DesignOptions, source: str) -> None:
+def require_specified(design: DesignOptions, source: str) -> None:
     """Before minutes are spent. Raises ConfigError."""
     specification = design.specification
-    faults = lacking(specification)
+    faults = missing_requirements(specification)
     if specification.disturbance is not None and specification.disturbance.up_to_hz is None:
         faults.append("specification.disturbance.up_to_hz: missing; no loop holds a disturbance at all frequencies")
     if faults:
         raise ConfigError(source, faults)
 
 
-CREEP = (
+CREEP_TEXT = (
     "; a lag over time explains most of it: creep, by the look of it. How much it is, recordings at several speeds "
     "tell (`rtloop identify hysteresis` takes them together)"
 )
-OTHER_SIZES = ", and what steps of other sizes do is not in the recording"
+OTHER_SIZES_TEXT = ", and what steps of other sizes do is not in the recording"
 
 
-def _require_plays(stage: Stage, design: DesignOptions) -> None:
+def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     """Raise NoDesign where steps cannot be promised: the inverse leaves what no recording tells.
 
     A specification that says how much hysteresis is left (`simulation.residual_percent`) has it simulated instead.
     """
     left_um = unexplained_um([stage.slow], stage.hysteresis)
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
-        why = CREEP if creep_explains(stage.slow) else OTHER_SIZES
+        why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
             f"{stage.slow.name}: the actuator is no sum of plays: {left_um:.3g} µm rms are left however many there "
             f"are{why}. With simulation.residual_percent, how much "
@@ -122,30 +122,30 @@ def _require_plays(stage: Stage, design: DesignOptions) -> None:
         )
 
 
-def _controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions, Robust]:
+def _find_controller(asked: DesignOptions, progress: Progress) -> tuple[DesignOptions, RobustDesign]:
     """The controller for the widest range that has one. Raises NoDesign."""
-    asked = _with_disturbance(asked)
-    *wider, last = _ranges(asked)
+    asked = _add_disturbance(asked)
+    *wider, last = _candidate_designs(asked)
     for narrowed in wider:
         try:
-            return narrowed, _damped(narrowed, progress)
+            return narrowed, _find_damped_controller(narrowed, progress)
         except NoController as error:
             progress(f"±{narrowed.scenarios.resonance_percent:g} % is too wide: {error}")
     try:
-        return last, _damped(last, progress)
+        return last, _find_damped_controller(last, progress)
     except (NoController, ValueError) as error:
         prefix = "" if not wider else f"not even for resonances within ±{last.scenarios.resonance_percent:g} %: "
         raise NoDesign(f"{prefix}{error}") from None
 
 
-def _damped(asked: DesignOptions, progress: Progress) -> Robust:
+def _find_damped_controller(asked: DesignOptions, progress: Progress) -> RobustDesign:
     """A controller that damps what rings about the leading modes, unless `robust.decay_ms` says what is enough.
 
     Raises NoController.
     """
-    robust = robust_controller(asked, progress)
+    robust = find_robust_controller(asked, progress)
     if asked.robust.decay_ms is None and robust.family.leading:
-        hz, damping = _lightest(robust)
+        hz, damping = _least_damped_mode(robust)
         if damping < LEAST_DAMPING:
             raise NoController(
                 f"robust: {hz:.4g} Hz keep ringing, with a damping of {damping:.2g} in closed loop; {LEAST_DAMPING:g} "
@@ -155,18 +155,18 @@ def _damped(asked: DesignOptions, progress: Progress) -> Robust:
     return robust
 
 
-def _lightest(found: Robust) -> tuple[float, float]:
+def _least_damped_mode(found: RobustDesign) -> tuple[float, float]:
     """Frequency in Hz and damping of the lightest closed-loop mode of the model about its leading ones."""
     family = found.family
-    controller = discretise(found.controller, family.period_s, "matched")
+    controller = discretise_controller(found.controller, family.period_s, "matched")
     rates = discrete_loop(controller, family.plant(family.nominal), family.nominal.delay_ticks).rates
     sizes, leading = np.abs(rates), np.abs(family.modes[list(family.leading)])
-    nearby = rates[(sizes > leading.min() / ABOUT) & (sizes < leading.max() * ABOUT)]
+    nearby = rates[(sizes > leading.min() / FREQUENCY_FACTOR) & (sizes < leading.max() * FREQUENCY_FACTOR)]
     least_damped = min(nearby, key=lambda rate: -rate.real / abs(rate), default=complex(-1.0))
     return abs(least_damped) / (2 * math.pi), float(-least_damped.real / abs(least_damped))
 
 
-def _ranges(asked: DesignOptions) -> Iterator[DesignOptions]:
+def _candidate_designs(asked: DesignOptions) -> Iterator[DesignOptions]:
     """What is asked for, or one range after the other."""
     if "scenarios" in asked.model_fields_set:
         yield asked
@@ -176,7 +176,7 @@ def _ranges(asked: DesignOptions) -> Iterator[DesignOptions]:
         yield asked.model_copy(update={"scenarios": scenarios})
 
 
-def _with_disturbance(asked: DesignOptions) -> DesignOptions:
+def _add_disturbance(asked: DesignOptions) -> DesignOptions:
     """`asked` with a disturbance: without any the slowest integrator would do."""
     specification = asked.specification
     if specification.disturbance is not None or asked.plant is None:
@@ -184,15 +184,15 @@ def _with_disturbance(asked: DesignOptions) -> DesignOptions:
     period_s = 1 / asked.controller.rate_hz
     family = Family(asked.plant.transfer(), asked.plant.delay_ticks, asked.scenarios, period_s)
     slowest_hz = _slowest_hz(family)
-    disturbance = DisturbanceOptions(largest_um=1.0, error_um=HELD, up_to_hz=slowest_hz / SLOWER)
+    disturbance = DisturbanceOptions(largest_um=1.0, error_um=HELD_SENSITIVITY, up_to_hz=slowest_hz / DISTURBANCE_RATIO)
     return asked.model_copy(update={"specification": specification.model_copy(update={"disturbance": disturbance})})
 
 
-def _with_taps(asked: DesignOptions, family: Family) -> DesignOptions:
+def _choose_tap_options(asked: DesignOptions, family: Family) -> DesignOptions:
     """`asked` with as many taps as the slowest leading mode needs, judged at as many points in all as 48 taps are, in
     a band that leaves room for what is not linear."""
     shape: ShapeOptions = asked.shape
-    needed_taps = math.ceil(PERIODS / (_slowest_hz(family) * family.period_s))
+    needed_taps = math.ceil(TAP_PERIODS / (_slowest_hz(family) * family.period_s))
     taps = min(max(needed_taps, shape.taps), MOST_TAPS)
     points = max(FEWEST_POINTS, shape.points_per_tick * shape.taps // taps)
     defaults = {"taps": taps, "points_per_tick": points, "band_percent": NARROW_PERCENT}
@@ -206,7 +206,7 @@ def _slowest_hz(family: Family) -> float:
     return float(np.min(leading, initial=0.1 / family.period_s))
 
 
-def _within_command(subject: Subject, asked: DesignOptions) -> Subject:
+def _limit_command(subject: Subject, asked: DesignOptions) -> Subject:
     """v no larger than the specification says that a step may need, where that is more than the step."""
     command, bounds = asked.specification.command, subject.bounds
     if command is None or command.command_um <= command.reference_um:
@@ -217,14 +217,14 @@ def _within_command(subject: Subject, asked: DesignOptions) -> Subject:
     return replace(subject, bounds=limited)
 
 
-def _taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject, Shaped]:
+def _find_taps(subject: Subject, is_asked: bool, progress: Progress) -> tuple[Subject, TapDesign]:
     """The taps for the widest range that has some. Raises NoDesign."""
     if is_asked:
-        return subject, shaped(subject, progress=progress)
-    *wider, last = [subject.around(percent) for percent in TAPS_RANGES_PERCENT]
+        return subject, design_taps(subject, progress=progress)
+    *wider, last = [subject.restrict_resonance(percent) for percent in TAPS_RANGES_PERCENT]
     for narrowed in wider:
         try:
-            return narrowed, shaped(narrowed, progress=progress)
+            return narrowed, design_taps(narrowed, progress=progress)
         except NoDesign as error:
             progress(f"taps for ±{narrowed.options.scenarios.resonance_percent:g} %: {error}")
-    return last, shaped(last, progress=progress)
+    return last, design_taps(last, progress=progress)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.hil.modal import Complex, Real
-from rtloop.linear.discretise import discretised
+from rtloop.linear.discretise import discretise_transfer
 from rtloop.linear.transfer import Transfer
 
 FASTEST, SLOWEST = 2.5, 1e-3
@@ -30,37 +30,37 @@ class Candidates(NamedTuple):
 
     gain: Real
     zero: Real
-    above: Real
-    below: Real
+    numerators: Real
+    denominators: Real
 
     def response(self, z: Complex) -> Complex:
         """C at points (f,) of the z plane, (k, f)."""
         value = self.gain[:, None] * (z - self.zero[:, None]) / (z - 1)
-        for i in range(self.above.shape[1]):
-            value = value * _quadratic(self.above[:, i], z) / _quadratic(self.below[:, i], z)
+        for i in range(self.numerators.shape[1]):
+            value = value * _quadratic(self.numerators[:, i], z) / _quadratic(self.denominators[:, i], z)
         return value
 
     def matrices(self) -> tuple[Real, Real, Real, Real]:
         """A (k, n, n), b (k, n), c (k, n), d (k,) of the sections in series."""
-        count, sections = self.above.shape[:2]
+        count, sections = self.numerators.shape[:2]
         n = 1 + 2 * sections
         a, b, c = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
         a[:, 0, 0], b[:, 0], c[:, 0] = 1.0, 1.0, self.gain * (1 - self.zero)
         for i in range(sections):
             row = 1 + 2 * i
-            a[:, row, row : row + 2], a[:, row + 1, row] = -self.below[:, i], 1.0
+            a[:, row, row : row + 2], a[:, row + 1, row] = -self.denominators[:, i], 1.0
             a[:, row, :row], b[:, row] = c[:, :row], self.gain
-            c[:, row : row + 2] = self.above[:, i] - self.below[:, i]
+            c[:, row : row + 2] = self.numerators[:, i] - self.denominators[:, i]
         return a, b, c, self.gain
 
 
-def bounds(sections: int) -> tuple[Real, Real]:
+def point_bounds(sections: int) -> tuple[Real, Real]:
     """Least and largest numbers of a point, each (2 + 4·sections,)."""
     low, high = zip(*(SECTION * sections), strict=True)
     return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])
 
 
-def candidates(points: Real) -> Candidates:
+def build_candidates(points: Real) -> Candidates:
     """Controllers of points (k, 2 + 4m) within their bounds."""
     sections = points[:, 2:].reshape(points.shape[0], -1, 4)
     numerators = _coefficients(np.exp(sections[..., 0]), sections[..., 1])
@@ -68,14 +68,14 @@ def candidates(points: Real) -> Candidates:
     return Candidates(np.exp(points[:, 0]), 1 - np.exp(points[:, 1]), numerators, denominators)
 
 
-def transfer_of(point: Real, period_s: float) -> Transfer:
+def point_transfer(point: Real, period_s: float) -> Transfer:
     """C(s) of which the method "matched" makes C(z) again, root by root: none stands at infinity or on a fold."""
     sections = point[2:].reshape(-1, 4)
     zero_rates = [root for size, damping, _, _ in sections for root in _rates(math.exp(size), damping)]
     pole_rates = [root for _, _, size, damping in sections for root in _rates(math.exp(size), math.exp(damping))]
     zeros: Complex = np.array([math.log1p(-math.exp(point[1])), *zero_rates]) / complex(period_s)
     poles: Complex = np.array([0.0, *pole_rates]) / complex(period_s)
-    image = discretised(Transfer(zeros, poles, 1.0), period_s, "matched")
+    image = discretise_transfer(Transfer(zeros, poles, 1.0), period_s, "matched")
     return Transfer(zeros, poles, math.exp(point[0]) / image.gain)
 
 

@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import sampled_plant
-from rtloop.design.robust.controller import bounds, candidates
+from rtloop.design.robust.controller import build_candidates, point_bounds
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.realisation import System
 
-FAR, STEEP = 100.0, 10.0
-INSIDE = 0.99
+UNSTABLE_COST, WALL_SLOPE = 100.0, 10.0
+INSIDE_SHARE = 0.99
 """A search keeps a hundredth away from its walls, for what lies between its frequencies and its scenarios."""
 
 
@@ -49,38 +49,42 @@ class Objective:
 
     def __init__(self, family: Family, scenarios: Sequence[Scenario], walls: Walls, sections: int):
         self.walls, self.period_s = walls, family.period_s
-        self.low, self.high = bounds(sections)
+        self.low, self.high = point_bounds(sections)
         self.bands = family.bands if family.modes.size else np.array([[0.0, np.inf]])
         plants = [
             sampled_plant(family.plant(scenario), family.period_s, scenario.delay_ticks) for scenario in scenarios
         ]
-        self.plants = _alike(plants)
-        hz, self.shares = _grid(family, walls)
+        self.plants = _stack_plants(plants)
+        hz, self.shares = _frequency_grid(family, walls)
         self.z = np.exp(2j * np.pi * hz * family.period_s)
         self.responses = np.array([plant.response(self.z) for plant in plants])
 
     def __call__(self, points: Real) -> Real:
         """Costs (k,) of points (k, n); outside the bounds what the nearest point within costs, and the distance."""
         clipped = np.clip(points, self.low, self.high)
-        measures, walls = self.measured(clipped), self.walls
+        measures, walls = self.measure(clipped), self.walls
         limited = [(measures.sensitivity, walls.sensitivity), (measures.noise_gain, walls.noise_gain)]
         if walls.disturbance_hz:
             limited.append((measures.disturbance, walls.disturbance))
         with np.errstate(invalid="ignore"):
-            excess = sum(np.maximum(0, np.log(value / (INSIDE * limit))) for value, limit in limited)
+            excess = sum(np.maximum(0, np.log(value / (INSIDE_SHARE * limit))) for value, limit in limited)
             decay = np.log(np.maximum(measures.decay_s / self.period_s, 1.0))
-            cost = 0.5 * (decay.max(axis=1) + decay.mean(axis=1)) + STEEP * excess
-        cost = np.where((measures.radius < 1) & np.isfinite(cost), cost, FAR * (1 + np.minimum(measures.radius, FAR)))
+            cost = 0.5 * (decay.max(axis=1) + decay.mean(axis=1)) + WALL_SLOPE * excess
+        cost = np.where(
+            (measures.radius < 1) & np.isfinite(cost),
+            cost,
+            UNSTABLE_COST * (1 + np.minimum(measures.radius, UNSTABLE_COST)),
+        )
         return cost + np.sum((points - clipped) ** 2, axis=1)
 
-    def measured(self, points: Real) -> Measures:
+    def measure(self, points: Real) -> Measures:
         """The worst of every quantity for points (k, n) within the bounds."""
-        controllers = candidates(points)
-        z_poles = self._poles(*controllers.matrices())
+        controllers = build_candidates(points)
+        z_poles = self._closed_loop_poles(*controllers.matrices())
         rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s
         sizes = np.abs(np.angle(z_poles)) / self.period_s
         time_constants = -1 / np.minimum(rates, -1e-9)
-        decay = np.stack([_slowest(time_constants, sizes, low, high) for low, high in self.bands], axis=1)
+        decay = np.stack([_slowest_constant(time_constants, sizes, low, high) for low, high in self.bands], axis=1)
         controller = controllers.response(self.z)
         sensitivity = 1 / np.abs(1 + controller[:, None] * self.responses)
         noise = np.sqrt((np.abs(controller[:, None]) * sensitivity) ** 2 @ self.shares)
@@ -93,7 +97,7 @@ class Objective:
             noise.max(axis=1),
         )
 
-    def _poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
+    def _closed_loop_poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
         """Closed-loop poles in z, (k, scenarios, n)."""
         ap, bp, cp = self.plants
         n, order = a.shape[1], a.shape[1] + ap.shape[1]
@@ -105,14 +109,14 @@ class Objective:
         return np.linalg.eigvals(joint).astype(complex)
 
 
-def _slowest(constants: Real, sizes: Real, low: float, high: float) -> Real:
+def _slowest_constant(constants: Real, sizes: Real, low: float, high: float) -> Real:
     """The largest of time constants (k, scenarios, n) whose poles lie in a band, of all where none does, (k,)."""
     is_counted = (sizes >= low) & (sizes <= high)
     is_counted |= ~is_counted.any(axis=2, keepdims=True)
     return np.where(is_counted, constants, 0.0).max(axis=(1, 2))
 
 
-def _alike(plants: Sequence[System]) -> tuple[Real, Real, Real]:
+def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
     """Matrices stacked; plants of less delay get states that nothing moves and nobody sees."""
     order = max(plant.b.size for plant in plants)
     a, b, c = (np.zeros((len(plants), *shape)) for shape in ((order, order), (order,), (order,)))
@@ -122,7 +126,7 @@ def _alike(plants: Sequence[System]) -> tuple[Real, Real, Real]:
     return a, b, c
 
 
-def _grid(family: Family, walls: Walls) -> tuple[Real, Real]:
+def _frequency_grid(family: Family, walls: Walls) -> tuple[Real, Real]:
     """Frequencies in Hz and their shares of half the rate; that of the disturbance stands first and has none."""
     top = 0.5 / family.period_s
     grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]

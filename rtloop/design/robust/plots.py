@@ -7,12 +7,12 @@ import io
 import numpy as np
 
 from rtloop.design.robust.programme import BAND
-from rtloop.design.robust.shape import Shaped, Subject
-from rtloop.design.verification.plots import PAPER_TIME, RUN_TIME, TEMPLATE
+from rtloop.design.robust.shape import Subject, TapDesign
+from rtloop.design.verification.plots import CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR
 from rtloop.errors import MissingExtra
 
 
-def picture(found: Shaped, subject: Subject, title: str) -> bytes:
+def draw_taps(found: TapDesign, subject: Subject, title: str) -> bytes:
     """A PNG file. Raises MissingExtra without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -25,18 +25,18 @@ def picture(found: Shaped, subject: Subject, title: str) -> bytes:
     if found.curve:
         settling, overshoots = np.array(found.curve).T
         trade.semilogy(
-            settling, 100 * np.maximum(overshoots, 1e-6), color=RUN_TIME, marker="o", label="least overshoot"
+            settling, 100 * np.maximum(overshoots, 1e-6), color=RUNNING_COLOR, marker="o", label="least overshoot"
         )
-    trade.axhline(100 * subject.overshoot, color=TEMPLATE, linestyle="--", label="overshoot, as specified")
-    trade.axvline(found.settling_ms, color=PAPER_TIME, linestyle=":", label="chosen")
+    trade.axhline(100 * subject.overshoot, color=TEMPLATE_COLOR, linestyle="--", label="overshoot, as specified")
+    trade.axvline(found.settling_ms, color=CONTINUOUS_COLOR, linestyle=":", label="chosen")
     trade.set_xlabel("settling time / ms, in every scenario")
     trade.set_ylabel("overshoot / %")
     time, x, v = found.step
     period_s = subject.controller.period_s
-    position.plot(1e3 * time, x, color=RUN_TIME, label="x on the model, between ticks too")
+    position.plot(1e3 * time, x, color=RUNNING_COLOR, label="x on the model, between ticks too")
     position.axhspan(1 - BAND, 1 + BAND, color="0.9", label=f"±{100 * BAND:g} %")
     position.set_ylabel("x per unit step")
-    command.step(1e3 * period_s * np.arange(v.size), v, where="post", color=RUN_TIME, label="v on the model")
+    command.step(1e3 * period_s * np.arange(v.size), v, where="post", color=RUNNING_COLOR, label="v on the model")
     command.set_ylabel("v per unit step")
     command.set_xlabel("time / ms")
     for panel in (position, command):

@@ -17,24 +17,24 @@ import numpy.typing as npt
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from rtloop.design.robust.responses import Responses, columns
+from rtloop.design.robust.responses import Responses, delayed_columns
 from rtloop.hil.modal import Real
 
 BAND = 0.05
 """Around the final value, for settling."""
 TOLERANCE = 1e-7
 """By which a row may be missed: 4 pm of 40 µm."""
-EVERY, MOST_NEW = 7, 400
+ROW_STRIDE, MOST_NEW = 7, 400
 """Ticks of which a programme begins with one, while taps last; how many rows join it at once."""
-MODESTY = 0.01
+TAP_WEIGHT = 0.01
 """Weight of the taps' sizes beside the variation of v: what one row does the other can undo, without end."""
-INSIDE = 0.99
+USED_SHARE = 0.99
 """Share of what is allowed that a programme uses, for what lies between its points and its scenarios."""
 LARGEST_TAP = 20.0
 """Far beyond what a drive allows; without any bound the solver's presolve may lose its way."""
-DEAREST = 1e5
+LARGEST_PRICE = 1e5
 """What a row that is missed by 1 costs: more than keeping any costs where all can be kept."""
-MISSED = 1e-6
+SOLVER_TOLERANCE = 1e-6
 """By which the solver may miss a row all the same."""
 
 
@@ -49,7 +49,7 @@ class Bounds(NamedTuple):
     low_um: float
     high_um: float
 
-    def command(self, static: Real) -> tuple[Real, Real]:
+    def command_limits(self, static: Real) -> tuple[Real, Real]:
         """Least and largest v per unit step such that v fits from any level to any level; `static` v/x at rest."""
         step, lowest = self.step_um, self.lowest_um
         low = np.maximum(self.low_um - lowest * static, step * static - self.high_um) / step
@@ -67,56 +67,56 @@ class Taps(NamedTuple):
 class Programme:
     """Of scenarios' responses; the first one is the model."""
 
-    def __init__(self, found: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
+    def __init__(self, scenario_responses: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
         self.taps, self.points, self.band = taps, points, band
-        self.ticks = found[0].command.shape[1]
-        self.time = np.tile(np.arange(1, self.ticks * points + 1) / points, len(found))
-        position = np.vstack([self._rows(response.position, points) for response in found])
-        self.command = np.vstack([self._rows(response.command, 1) for response in found])
+        self.ticks = scenario_responses[0].command.shape[1]
+        self.time = np.tile(np.arange(1, self.ticks * points + 1) / points, len(scenario_responses))
+        position = np.vstack([self._delayed_rows(response.position, points) for response in scenario_responses])
+        self.command = np.vstack([self._delayed_rows(response.command, 1) for response in scenario_responses])
         self.rows = np.vstack([position, self.command])
-        static = np.repeat([response.static_command for response in found], self.ticks)
-        self.low, self.high = bounds.command(static)
+        static = np.repeat([response.static_command for response in scenario_responses], self.ticks)
+        self.low, self.high = bounds.command_limits(static)
         self.undershoot = bounds.undershoot
         self.active = np.zeros(self.rows.shape[0], bool)
-        is_within_taps = np.concatenate([self.time, np.tile(np.arange(self.ticks), len(found))]) <= taps
-        self.active[: self.time.size : EVERY * points] = True
-        self.active[self.time.size :: EVERY] = True
+        is_within_taps = np.concatenate([self.time, np.tile(np.arange(self.ticks), len(scenario_responses))]) <= taps
+        self.active[: self.time.size : ROW_STRIDE * points] = True
+        self.active[self.time.size :: ROW_STRIDE] = True
         self.active &= is_within_taps
         self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
 
-    def feasible(self, settling: float, overshoot: float) -> bool:
+    def is_feasible(self, settling: float, overshoot: float) -> bool:
         """Whether some taps settle in `settling` ticks with ε ≤ `overshoot`."""
-        return self._solved(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
+        return self._solve(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
 
-    def least_overshoot(self, settling: float) -> Taps | None:
+    def least_overshoot_taps(self, settling: float) -> Taps | None:
         """The taps of least ε that settle in `settling` ticks; None where none do."""
-        solved = self._solved(settling, np.eye(2 * self.taps + 1)[-1], None)
-        return None if solved is None else self._taps(solved)
+        solved = self._solve(settling, np.eye(2 * self.taps + 1)[-1], None)
+        return None if solved is None else self._split_taps(solved)
 
-    def quietest(self, settling: float, overshoot: float) -> Taps | None:
+    def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
         """The taps of least variation of v on the model with ε ≤ `overshoot`; None where there are none."""
-        rows = self._judged_rows()
-        weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, MODESTY)
+        rows = self._penalty_rows()
+        weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)
         cost = np.concatenate([np.zeros(2 * self.taps + 1), weights])
-        solved = self._solved(settling, cost, overshoot, rows)
-        return None if solved is None else self._taps(solved)
+        solved = self._solve(settling, cost, overshoot, rows)
+        return None if solved is None else self._split_taps(solved)
 
-    def _taps(self, solved: Real) -> Taps:
+    def _split_taps(self, solved: Real) -> Taps:
         return Taps(solved[: self.taps], solved[self.taps : 2 * self.taps], float(solved[2 * self.taps]))
 
-    def _rows(self, steps: Real, points: int) -> Real:
-        return np.hstack([columns(step, self.taps, points) for step in steps])
+    def _delayed_rows(self, steps: Real, points: int) -> Real:
+        return np.hstack([delayed_columns(step, self.taps, points) for step in steps])
 
-    def _solved(self, settling: float, cost: Real, overshoot: float | None, sized: Real | None = None) -> Real | None:
+    def _solve(self, settling: float, cost: Real, overshoot: float | None, sized: Real | None = None) -> Real | None:
         """Variables: taps, ε, and the absolute value of each row of `sized` times the taps."""
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         is_settled = self.time >= settling - 1e-9
-        low = np.concatenate([np.where(is_settled, 1 - INSIDE * self.band, -self.undershoot), self.low])
+        low = np.concatenate([np.where(is_settled, 1 - USED_SHARE * self.band, -self.undershoot), self.low])
         high = np.concatenate([np.full(self.time.size, 1.0), self.high])
         slack = np.concatenate([np.ones(self.time.size), np.zeros(self.command.shape[0])])
         rows = self.rows
         limits: list[tuple[float, float | None]] = [(-LARGEST_TAP, LARGEST_TAP)] * (count - 1)
-        limits += [(0.0, INSIDE * (self.band if overshoot is None else overshoot)), *[(0.0, None)] * extra]
+        limits += [(0.0, USED_SHARE * (self.band if overshoot is None else overshoot)), *[(0.0, None)] * extra]
         static = np.concatenate([self.static, np.zeros(1 + extra)])[None]
         while True:
             rows_used = np.flatnonzero(self.active)
@@ -127,8 +127,8 @@ class Programme:
             limit = np.concatenate([high[rows_used], -low[rows_used], np.zeros(2 * extra)])
             matrix = np.vstack([np.hstack([part, np.zeros((rows_used.size, extra))]) for part in parts])
             if sized is not None:
-                matrix = np.vstack([matrix, *_sizes(sized)])
-            solution = _optimum(cost, matrix, limit, static, limits)
+                matrix = np.vstack([matrix, *_size_rows(sized)])
+            solution = _solve_dual(cost, matrix, limit, static, limits)
             if solution is None:
                 return None
             values = rows @ solution[: count - 1]
@@ -137,21 +137,21 @@ class Programme:
             new_rows = np.flatnonzero(violation > TOLERANCE)
             if not new_rows.size:
                 return solution
-            self.active[_peaks(violation, new_rows)] = True
+            self.active[_worst_rows(violation, new_rows)] = True
 
-    def _judged_rows(self) -> Real:
+    def _penalty_rows(self) -> Real:
         """What should be small, times the taps: the changes of v on the model, and the taps themselves."""
         v = self.command[: min(self.ticks, 2 * self.taps + 40)]
         return np.vstack([np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))), np.eye(2 * self.taps)])
 
 
-def _sizes(rows: Real) -> tuple[Real, Real]:
+def _size_rows(rows: Real) -> tuple[Real, Real]:
     """Rows that say −s ≤ rows·taps ≤ s, of variables taps, ε, s."""
     overshoot_column, sizes = np.zeros((rows.shape[0], 1)), -np.eye(rows.shape[0])
     return np.hstack([rows, overshoot_column, sizes]), np.hstack([-rows, overshoot_column, sizes])
 
 
-def _optimum(
+def _solve_dual(
     cost: Real, above: Real, limit: Real, static: Real, limits: Sequence[tuple[float, float | None]]
 ) -> Real | None:
     """Where A x ≤ b and the static answer is 1; None where nothing is. Raises ArithmeticError if no method can say.
@@ -166,7 +166,7 @@ def _optimum(
     rows = np.vstack([above, identity[bounded], -identity])
     allowed = np.concatenate([limit, high[bounded], -low])
     matrix = csr_array(np.vstack([rows, static]).T)
-    prices: list[tuple[float | None, float | None]] = [(0.0, DEAREST)] * rows.shape[0] + [(None, None)]
+    prices: list[tuple[float | None, float | None]] = [(0.0, LARGEST_PRICE)] * rows.shape[0] + [(None, None)]
     for method, presolve in (("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)):
         result = linprog(
             np.append(allowed, 1.0), A_eq=matrix, b_eq=-cost, bounds=prices, method=method,
@@ -174,11 +174,11 @@ def _optimum(
         )  # fmt: skip
         if result.status == 0:
             multipliers = np.asarray(result.eqlin.marginals, dtype=float)
-            return multipliers if np.max(rows @ multipliers - allowed) <= MISSED else None
+            return multipliers if np.max(rows @ multipliers - allowed) <= SOLVER_TOLERANCE else None
     raise ArithmeticError(f"the linear programme was not solved: {result.message}")
 
 
-def _peaks(broken: Real, new: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+def _worst_rows(broken: Real, new: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
     """Of rows that are broken, the worst of each run of neighbours, and not too many."""
     previous, following = np.r_[0.0, broken[:-1]], np.r_[broken[1:], 0.0]
     peaks = new[(broken[new] >= previous[new]) & (broken[new] >= following[new])]

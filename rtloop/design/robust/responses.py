@@ -14,7 +14,7 @@ import numpy as np
 
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.hil.modal import Real
-from rtloop.linear.discretise import DiscreteController, held
+from rtloop.linear.discretise import DiscreteController, zero_order_hold
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
@@ -32,11 +32,11 @@ class Responses(NamedTuple):
     """v at rest per unit of x."""
 
 
-def responses(
+def step_responses(
     controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int, ticks: int
 ) -> Responses:
     """Of one loop. Raises ValueError for a loop that is not stable."""
-    a, b, c, d = _joined(controller, plant, delay_ticks, points)
+    a, b, c, d = _loop_matrices(controller, plant, delay_ticks, points)
     order = a.shape[0]
     if not np.all(np.abs(np.linalg.eigvals(a)) < 1):
         raise ValueError("the loop is not stable")
@@ -49,23 +49,25 @@ def responses(
     return Responses(position, outputs[:, 0].T, 1 / plant.dc_gain)
 
 
-def horizon(controller: DiscreteController | Sampled, family: Family, scenarios: list[Scenario], taps: int) -> int:
+def horizon_ticks(
+    controller: DiscreteController | Sampled, family: Family, scenarios: list[Scenario], taps: int
+) -> int:
     """Ticks after which the slowest mode of all scenarios' loops has died away behind the last tap."""
     radius = 0.0
     for scenario in scenarios:
-        a, *_ = _joined(controller, family.plant(scenario), scenario.delay_ticks, 1)
+        a, *_ = _loop_matrices(controller, family.plant(scenario), scenario.delay_ticks, 1)
         radius = max(radius, float(np.max(np.abs(np.linalg.eigvals(a)))))
     decay = -1 / math.log(radius) if 0 < radius < 1 else 0.0
     return min(taps + 20 + math.ceil(TIME_CONSTANTS * decay), MOST_TICKS)
 
 
-def columns(steps: Real, taps: int, stride: int) -> Real:
+def delayed_columns(steps: Real, taps: int, stride: int) -> Real:
     """The answer to a step (k,) delayed by 0 … taps − 1 ticks of `stride` values, (k, taps)."""
     padded = np.concatenate([np.zeros((taps - 1) * stride), steps])
     return np.stack([padded[(taps - 1 - i) * stride :][: steps.size] for i in range(taps)], axis=1)
 
 
-def _joined(
+def _loop_matrices(
     controller: DiscreteController | Sampled, plant: Transfer, delay_ticks: int, points: int
 ) -> tuple[Real, Real, Real, Real]:
     """A, b (n, 2), C (1 + points, n), D (1 + points, 2) from (q, w) to v and x at the points of a tick.
@@ -73,7 +75,7 @@ def _joined(
     States: controller, commands on their way, plant.
     """
     ac, bc, cc, dc = controller.system
-    fine_plant = held(plant, controller.period_s / points)
+    fine_plant = zero_order_hold(plant, controller.period_s / points)
     nc, n = bc.size, fine_plant.b.size
     plant_start, order = nc + delay_ticks, nc + delay_ticks + n
     output_row = np.zeros(order)

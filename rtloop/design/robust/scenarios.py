@@ -13,9 +13,9 @@ from rtloop.design.robust.options import ScenarioOptions
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.transfer import Transfer
 
-BAND = (0.55, 1.85)
+MODE_BAND = (0.55, 1.85)
 """Modes of the closed loop between these multiples of a light mode's frequency are judged by their decay."""
-LEADING = 2
+LEADING_COUNT = 2
 """Light modes that move in every combination: those that stand out most."""
 
 
@@ -41,7 +41,7 @@ class Family:
         self.model, self.options, self.period_s = model, options, period_s
         self.modes = light_modes(model, period_s)
         peaks = np.abs(model.response(1j * np.abs(self.modes)))
-        self.leading = tuple(sorted(np.argsort(-peaks, kind="stable")[:LEADING].tolist()))
+        self.leading = tuple(sorted(np.argsort(-peaks, kind="stable")[:LEADING_COUNT].tolist()))
         self.delays = options.delay_ticks or (delay_ticks,)
 
     @property
@@ -50,7 +50,7 @@ class Family:
         sizes = np.abs(self.modes)
         between = np.concatenate([[0.0], np.sqrt(sizes[1:] * sizes[:-1]), [np.inf]])
         bands = np.column_stack([
-            np.maximum(BAND[0] * sizes, between[:-1]), np.minimum(BAND[1] * sizes, between[1:])
+            np.maximum(MODE_BAND[0] * sizes, between[:-1]), np.minimum(MODE_BAND[1] * sizes, between[1:])
         ])  # fmt: skip
         return bands[list(self.leading)]
 
@@ -69,7 +69,7 @@ class Family:
         """The model as it is."""
         return Scenario((0.0,) * self.modes.size, 1.0, 0.0, self.delays[0])
 
-    def corners(self) -> list[Scenario]:
+    def corner_scenarios(self) -> list[Scenario]:
         """The model, every combination of the ends, and resonances in the middle and halfway to them.
 
         Beyond LEADING light modes the others stay, or move with all: what else they may do is left to the proof.
@@ -77,8 +77,8 @@ class Family:
         r, g = self.options.resonance_percent, self.options.gain_percent
         ends = sorted({*self.options.damping})
         dampings = sorted({ends[0], ends[-1]})
-        shifts = self._shifts(-r, 0.0, r)
-        halfway = self._shifts(-r / 2, r / 2) if self.modes.size else []
+        shifts = self._resonance_shifts(-r, 0.0, r)
+        halfway = self._resonance_shifts(-r / 2, r / 2) if self.modes.size else []
         scenarios = [self.nominal]
         for ticks in self.delays:
             scenarios += [
@@ -87,7 +87,7 @@ class Family:
             scenarios += [Scenario(shift, ends[0], gain, ticks) for shift in halfway for gain in sorted({-g, g})]
         return list(dict.fromkeys(scenarios))
 
-    def _shifts(self, *places: float) -> list[tuple[float, ...]]:
+    def _resonance_shifts(self, *places: float) -> list[tuple[float, ...]]:
         """Every combination for the leading modes, the others as in the model; all modes moved together."""
         shifts = []
         for percents in itertools.product(sorted({*places}), repeat=len(self.leading)):
@@ -96,7 +96,7 @@ class Family:
             shifts.append(tuple(shift.tolist()))
         return [*dict.fromkeys([*shifts, *((place,) * self.modes.size for place in sorted({*places}))])]
 
-    def swept(self, count: int) -> Iterator[Scenario]:
+    def sweep_scenarios(self, count: int) -> Iterator[Scenario]:
         """All light modes moved together, `count` places, at every corner of damping, gain and delay."""
         r, g = self.options.resonance_percent, self.options.gain_percent
         places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]
@@ -104,7 +104,7 @@ class Family:
         for ticks, factor, gain in itertools.product(self.delays, damping, sorted({-g, g})):
             yield from (Scenario((float(place),) * self.modes.size, factor, gain, ticks) for place in places)
 
-    def drawn(self, count: int, seed: int) -> Iterator[Scenario]:
+    def random_scenarios(self, count: int, seed: int) -> Iterator[Scenario]:
         """Jointly at random: frequencies and gain evenly, damping evenly in its logarithm."""
         random, options = np.random.default_rng(seed), self.options
         r, g = options.resonance_percent, options.gain_percent

@@ -11,20 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.design.robust.certificate import Certificate, certified
-from rtloop.design.robust.controller import bounds, transfer_of
-from rtloop.design.robust.objective import FAR, Objective, Walls
+from rtloop.design.robust.certificate import Certificate, certify
+from rtloop.design.robust.controller import point_bounds, point_transfer
+from rtloop.design.robust.objective import UNSTABLE_COST, Objective, Walls
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.hil.modal import Real
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
-POPULATION, SCREENED, SHORT, TAKEN_ON, ROUNDS = 20, 300, 4, 3, 3
+POPULATION, RANDOM_POINTS, SHORT_DIVISOR, CONTINUED_COUNT, ROUNDS = 20, 300, 4, 3, 3
 """Points of a generation; points at random of which the best starts a search; the short searches' share of generations;
 how many are taken to the end; how often the worst plants of a proof may join the scenarios."""
-LEAST_TIGHTENED = 0.9
+LEAST_FACTOR = 0.9
 """A round lowers no wall by more."""
 Progress = Callable[[str], None]
 
@@ -36,7 +36,7 @@ class Minimum(NamedTuple):
     cost: float
 
 
-class Robust(NamedTuple):
+class RobustDesign(NamedTuple):
     """`controller` in s, to be discretised by "matched"; its family, walls, proof, and scenarios searched over."""
 
     controller: Transfer
@@ -46,50 +46,50 @@ class Robust(NamedTuple):
     searched: int
 
 
-def robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> Robust:
+def find_robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> RobustDesign:
     """A controller for all scenarios of `design`. Raises ValueError for a specification that lacks something, and
     NoController where the search finds none, with what is missed.
     """
     if design.plant is None:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant = design.sensor.seen_through(design.plant.transfer())
+    plant = design.sensor.add_sensor_lag(design.plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
         raise ValueError("plant: a stable model with more poles than zeros and a gain at 0 Hz above 0 is needed")
     options, period_s = design.robust, 1 / design.controller.rate_hz
     family = Family(plant, design.plant.delay_ticks, design.scenarios, period_s)
-    walls = search_walls = walls_of(design)
-    scenarios = family.corners()
+    walls = search_walls = design_walls(design)
+    scenarios = family.corner_scenarios()
     random = np.random.default_rng(options.seed)
     minimum, rounds = None, 0
     while True:
         rounds += 1
         objective = Objective(family, scenarios, search_walls, options.biquads)
         if minimum is None:
-            minimum = _searched(objective, design, random, progress)
+            minimum = _run_searches(objective, design, random, progress)
         else:
             minimum = minimise(objective, minimum.point, 0.05, options.generations, random)
-        if minimum.cost >= FAR:
+        if minimum.cost >= UNSTABLE_COST:
             raise NoController(
                 f"robust: no controller of order {1 + 2 * options.biquads} found that is stable in all of "
                 f"{len(scenarios)} scenarios; a smaller scenarios.resonance_percent, fewer delay_ticks, or more "
                 "robust.restarts would help"
             )
-        point = np.clip(minimum.point, *bounds(options.biquads))
-        controller = transfer_of(point, period_s)
-        proof = certified(discretise(controller, period_s, "matched"), family, walls, options.seed)
-        violations = proof.missed(walls, options.decay_ms)
+        point = np.clip(minimum.point, *point_bounds(options.biquads))
+        controller = point_transfer(point, period_s)
+        proof = certify(discretise_controller(controller, period_s, "matched"), family, walls, options.seed)
+        violations = proof.violations(walls, options.decay_ms)
         progress(f"proof over {proof.plants} plants: " + ("; ".join(violations) or "everything is kept"))
         if not violations or rounds == ROUNDS:
             break
-        scenarios = list(dict.fromkeys([*scenarios, *proof.worst()]))
-        search_walls = _tightened(search_walls, walls, proof)
+        scenarios = list(dict.fromkeys([*scenarios, *proof.worst_scenarios()]))
+        search_walls = _tighten(search_walls, walls, proof)
     if violations:
         raise NoController(
             "robust: the best controller found misses: "
             + "; ".join(violations)
             + ". More room there, a smaller [scenarios], more robust.restarts or biquads would help"
         )
-    return Robust(controller, family, walls, proof, len(scenarios))
+    return RobustDesign(controller, family, walls, proof, len(scenarios))
 
 
 def minimise(
@@ -120,7 +120,7 @@ def minimise(
     return best
 
 
-def walls_of(design: DesignOptions) -> Walls:
+def design_walls(design: DesignOptions) -> Walls:
     """From [robust] and from the disturbance of a specification. Raises ValueError for one without up_to_hz."""
     options, disturbance = design.robust, design.specification.disturbance
     if disturbance is None:
@@ -132,56 +132,61 @@ def walls_of(design: DesignOptions) -> Walls:
             f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; below half the rate is allowed"
         )
     return Walls(
-        options.largest_sensitivity, options.noise_gain, disturbance.error_um / disturbance.largest_um, disturbance.up_to_hz
+        options.largest_sensitivity, options.noise_gain, disturbance.error_um / disturbance.largest_um,
+        disturbance.up_to_hz,
     )  # fmt: skip
 
 
-def _tightened(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
+def _tighten(searched: Walls, walls: Walls, proof: Certificate) -> Walls:
     """Walls for another round, lower by what a proof found beyond them: a peak may stand between a search's points."""
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
     factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
-    sensitivity, noise, disturbance = (max(factor, LEAST_TIGHTENED) for factor in factors)
+    sensitivity, noise, disturbance = (max(factor, LEAST_FACTOR) for factor in factors)
     return Walls(
         max(1.0, sensitivity * searched.sensitivity), noise * searched.noise_gain, disturbance * searched.disturbance,
         walls.disturbance_hz,
     )  # fmt: skip
 
 
-def _searched(objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress) -> Minimum:
+def _run_searches(
+    objective: Objective, design: DesignOptions, random: np.random.Generator, progress: Progress
+) -> Minimum:
     """The best of `restarts` short searches of which some go on."""
     options, minima = design.robust, list[Minimum]()
     for number in range(options.restarts):
-        points = _anywhere(objective, options.biquads, random)
+        points = _random_points(objective, options.biquads, random)
         start = points[np.argmin(objective(points))]
-        minima.append(minimise(objective, start, 0.3, max(1, options.generations // SHORT), random))
-        progress(f"search {number + 1} of {options.restarts}: {_words(objective, minima[-1])}")
+        minima.append(minimise(objective, start, 0.3, max(1, options.generations // SHORT_DIVISOR), random))
+        progress(f"search {number + 1} of {options.restarts}: {_describe_minimum(objective, minima[-1])}")
     minima.sort(key=lambda minimum: minimum.cost)
-    for number, minimum in enumerate(minima[:TAKEN_ON]):
+    for number, minimum in enumerate(minima[:CONTINUED_COUNT]):
         minima.append(minimise(objective, minimum.point, 0.1, options.generations, random))
-        progress(f"continued {number + 1} of {min(TAKEN_ON, len(minima))}: {_words(objective, minima[-1])}")
+        progress(
+            f"continued {number + 1} of {min(CONTINUED_COUNT, len(minima))}: {_describe_minimum(objective, minima[-1])}"
+        )
     return min(minima, key=lambda minimum: minimum.cost)
 
 
-def _anywhere(objective: Objective, sections: int, random: np.random.Generator) -> Real:
+def _random_points(objective: Objective, sections: int, random: np.random.Generator) -> Real:
     """Points at random around the resonance: low gains, sections near it."""
     middle = (
         np.log(np.mean(objective.bands) * objective.period_s) if np.all(np.isfinite(objective.bands)) else np.log(0.3)
     )
     centre = np.array([np.log(0.02), np.log(0.05), *([middle, 0.0, middle, np.log(0.5)] * sections)])
     spread = np.array([1.0, 1.0, *([0.7, 0.7, 0.7, 0.5] * sections)])
-    return centre + spread * random.standard_normal((SCREENED, centre.size))
+    return centre + spread * random.standard_normal((RANDOM_POINTS, centre.size))
 
 
-def _listed(values: Real) -> str:
+def _join_numbers(values: Real) -> str:
     return "/".join(f"{value:.3f}" for value in values)
 
 
-def _words(objective: Objective, found: Minimum) -> str:
-    measures = objective.measured(np.clip(found.point, objective.low, objective.high)[None])
-    if found.cost >= FAR:
+def _describe_minimum(objective: Objective, found: Minimum) -> str:
+    measures = objective.measure(np.clip(found.point, objective.low, objective.high)[None])
+    if found.cost >= UNSTABLE_COST:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"
     return (
-        f"τ {_listed(1e3 * measures.decay_s[0])} ms, max |S| {measures.sensitivity[0]:.3f}, "
+        f"τ {_join_numbers(1e3 * measures.decay_s[0])} ms, max |S| {measures.sensitivity[0]:.3f}, "
         f"noise gain {measures.noise_gain[0]:.2f}, |S| at the disturbance {measures.disturbance[0]:.4f}"
     )

@@ -9,45 +9,49 @@ from typing import Any
 from rtloop import __version__
 from rtloop.design.robust.certificate import Certificate
 from rtloop.design.robust.programme import Taps
-from rtloop.design.robust.search import Robust
-from rtloop.design.robust.shape import Shaped, Subject
+from rtloop.design.robust.search import RobustDesign
+from rtloop.design.robust.shape import Subject, TapDesign
 from rtloop.design.synthesis.section import commented_section, configuration_around, controller_values, formula
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
-from rtloop.design.toml_text import edited, section
+from rtloop.design.toml_text import edit_text, write_section
 
 
-def robust_section(found: Robust, design: DesignOptions, source: str, text: str) -> str:
+def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:
     """[axis.controller]; the same specification gives the same text."""
-    return commented_section(found.controller, _output(design), provenance(found, design, source, text))
+    return commented_section(robust.controller, _output(design), provenance(robust, design, source, text))
 
 
 def robust_configuration(
-    found: Robust, design: DesignOptions, source: str, text: str, axis: str, specification: str
+    robust: RobustDesign, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
     """A whole configuration, around a simulated rig of the plant."""
     written_design = design.model_copy(update={"controller": _output(design)})
-    lines = provenance(found, design, source, text)
-    return configuration_around(found.controller, written_design, lines, axis, specification)
+    lines = provenance(robust, design, source, text)
+    return configuration_around(robust.controller, written_design, lines, axis, specification)
 
 
-def with_controller(text: str, found: Robust, design: DesignOptions, source: str, spec_text: str, axis: str) -> str:
+def insert_controller(
+    text: str, found: RobustDesign, design: DesignOptions, source: str, spec_text: str, axis: str
+) -> str:
     """A configuration's `text` with the controller in its axis. Raises ValueError where it has no such axis."""
-    return _with(
-        text, axis, {"controller": written_values(found, design)},
+    return _replace_in_axis(
+        text, axis, {"controller": robust_values(found, design)},
         provenance(found, design, source, spec_text),
     )  # fmt: skip
 
 
-def with_taps(text: str, found: Shaped, subject: Subject, source: str, axis: str, specification: str | None) -> str:
+def insert_taps(
+    text: str, found: TapDesign, subject: Subject, source: str, axis: str, specification: str | None
+) -> str:
     """A configuration's `text` with both rows of taps in its axis, whose specification stands at `specification`."""
     values = taps_values(found.taps)
     reference = {} if specification is None else {"specification": specification}
-    return _with(text, axis, {"prefilter": values, **reference}, taps_provenance(found, subject, source))
+    return _replace_in_axis(text, axis, {"prefilter": values, **reference}, taps_provenance(found, subject, source))
 
 
-def taps_section(found: Shaped, subject: Subject, source: str) -> str:
+def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
     """[axis.prefilter] alone."""
-    return section("axis.prefilter", taps_values(found.taps), taps_provenance(found, subject, source))
+    return write_section("axis.prefilter", taps_values(tap_design.taps), taps_provenance(tap_design, subject, source))
 
 
 def taps_values(taps: Taps) -> dict[str, Any]:
@@ -55,18 +59,19 @@ def taps_values(taps: Taps) -> dict[str, Any]:
     return {"taps": taps.reference.tolist(), "command_taps": taps.command.tolist()}
 
 
-def taps_provenance(found: Shaped, subject: Subject, source: str) -> list[str]:
+def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
     """Where taps come from, a line each."""
-    options, proof = subject.options.scenarios, found.proof
+    options, proof = subject.options.scenarios, tap_design.proof
     return [
         f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
         f"±{options.resonance_percent:g} %",
-        f"on {found.proved} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ {100 * proof.overshoot:.3g} %, "
+        f"on {tap_design.proved} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ "
+        f"{100 * proof.overshoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
     ]
 
 
-def kept(proof: Certificate) -> list[tuple[str, float, str]]:
+def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
     """Label, worst value and where, of everything that is certified."""
     return [
         ("slowest mode around a resonance, ms", proof.decay_ms.value, str(proof.decay_ms.scenario)),
@@ -76,24 +81,24 @@ def kept(proof: Certificate) -> list[tuple[str, float, str]]:
     ]
 
 
-def written_values(found: Robust, design: DesignOptions) -> dict[str, Any]:
+def robust_values(found: RobustDesign, design: DesignOptions) -> dict[str, Any]:
     """[axis.controller] as plain values."""
     return controller_values(found.controller, _output(design))
 
 
-def provenance(found: Robust, design: DesignOptions, source: str, text: str) -> list[str]:
+def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
     """Where a controller comes from and what is certified of it, a line each."""
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     assert design.plant is not None
     return [
         f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
         f"plant: {formula(design.plant.transfer())}",
-        f"worst of {found.certificate.plants} plants:",
-        *(f"  {name} {value:.4g} ({scenario})" for name, value, scenario in kept(found.certificate)),
+        f"worst of {robust.certificate.plants} plants:",
+        *(f"  {name} {value:.4g} ({scenario})" for name, value, scenario in certified_values(robust.certificate)),
     ]
 
 
-def _with(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
+def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
     table = tomllib.loads(text)
     names = [entry.get("name") for entry in table.get("axis", [])]
     if axis not in names:
@@ -101,10 +106,10 @@ def _with(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> s
             f"axis: {axis!r} is not in the configuration, which has {', '.join(map(str, names)) or 'none'}"
         )
     table["axis"] = [{**entry, **parts} if entry.get("name") == axis else entry for entry in table["axis"]]
-    return edited(_without(text, comments[0]), table, comments)
+    return edit_text(_remove_provenance(text, comments[0]), table, comments)
 
 
-def _without(text: str, heading: str) -> str:
+def _remove_provenance(text: str, heading: str) -> str:
     """`text` without the comments that the same command put there before: from its first words to an empty line."""
     paragraphs, mark = text.split("\n\n"), "# " + " ".join(heading.split()[:2]) + " "
     return "\n\n".join(paragraph for paragraph in paragraphs if not paragraph.startswith(mark))

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
-from rtloop.design.robust.programme import BAND, INSIDE, Bounds, Programme, Taps
-from rtloop.design.robust.responses import Responses, horizon, responses
+from rtloop.design.robust.programme import BAND, USED_SHARE, Bounds, Programme, Taps
+from rtloop.design.robust.responses import Responses, horizon_ticks, step_responses
 from rtloop.design.robust.scenarios import Family, Scenario
 from rtloop.errors import NoDesign
 from rtloop.hil.modal import Real
@@ -19,14 +19,14 @@ from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.sampled import Sampled
 from rtloop.linear.transfer import Transfer
 
-PLACES, PROVED, ROUNDS = 7, 41, 6
+SWEEP_PLACES, PROOF_PLACES, MOST_ROUNDS = 7, 41, 6
 """Of each resonance in a programme, and in the proof of its answer; how often the worst of a proof may join it."""
 PROOF_POINTS = 10
-EXCESS = 1e-4
+ALLOWED_EXCESS = 1e-4
 """Per unit step, by which v may miss its limits in a proof: 4 nm of 40 µm."""
-LONGEST = 0.9
+LONGEST_SHARE = 0.9
 """Settling beyond this part of the taps' length is not looked for."""
-CURVE = (0.93, 1.15, 23)
+CURVE_RANGE = (0.93, 1.15, 23)
 """Settling times of the trade-off, relative to the fastest, and how many."""
 
 
@@ -41,7 +41,7 @@ class Subject:
     overshoot: float
     options: ShapeOptions
 
-    def around(self, percent: float) -> Subject:
+    def restrict_resonance(self, percent: float) -> Subject:
         """For taps that fit resonances within so much of the model's, and nothing else that may change."""
         scenarios = ScenarioOptions(resonance_percent=percent, damping=(1.0,), gain_percent=0.0)
         return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
@@ -51,7 +51,7 @@ class Subject:
         return Family(self.plant, self.delay_ticks, self.options.scenarios, self.controller.period_s)
 
 
-class Judged(NamedTuple):
+class StepMeasures(NamedTuple):
     """Of a step: settling to ±5 % in ms, overshoot, by how much v goes beyond what it may (negative where it does not),
     undershoot, least and largest v, per unit.
     """
@@ -64,7 +64,7 @@ class Judged(NamedTuple):
     highest_command: float
 
 
-class Shaped(NamedTuple):
+class TapDesign(NamedTuple):
     """`taps` that settle in `settling_ms`; `fastest_ms` is the least possible; `proof` the worst of `proved` plants, at
     PROOF_POINTS points a tick; `model` the model's step, `variation` of v on it; `curve` (ms, ε) of the trade-off.
     """
@@ -73,32 +73,32 @@ class Shaped(NamedTuple):
     settling_ms: float
     fastest_ms: float
     variation: float
-    proof: Judged
+    proof: StepMeasures
     proved: int
     step: tuple[Real, Real, Real]
     curve: tuple[tuple[float, float], ...]
 
 
-def shaped(
+def design_taps(
     subject: Subject,
     *,
     curve: bool = False,
     progress: Callable[[str], None] = lambda _: None,
     may_be_late: bool = False,
-) -> Shaped:
+) -> TapDesign:
     """Taps for the specification. Raises NoDesign, with what binds and what would be possible, where there are none.
 
     `may_be_late`: where `settling_ms` cannot be reached, the taps are the fastest ones.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
-    scenarios = list(dict.fromkeys([family.nominal, *family.swept(PLACES)]))
+    scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))
     fastest, rounds, allowed_overshoot = 0.0, 0, subject.overshoot
     while True:
         rounds += 1
-        programme = programme_of(subject, scenarios)
+        programme = build_programme(subject, scenarios)
         fastest = fastest_settling(programme, allowed_overshoot, fastest)
         if fastest is None:
-            raise NoDesign(_no_taps(subject, programme))
+            raise NoDesign(_explain_no_taps(subject, programme))
         progress(
             f"{len(scenarios)} scenarios: fastest {fastest * tick_ms:.4g} ms, overshoot {100 * subject.overshoot:g} %"
         )
@@ -108,32 +108,33 @@ def shaped(
         if settling < fastest - 1e-9:
             raise NoDesign(
                 f"shape.settling_ms: {options.settling_ms:g} ms cannot be reached in all scenarios with overshoot ≤ "
-                f"{100 * subject.overshoot:g} %; the fastest is {fastest * tick_ms:.4g} ms. {_binding(subject)}"
+                f"{100 * subject.overshoot:g} %; the fastest is {fastest * tick_ms:.4g} ms. "
+                f"{_describe_relaxations(subject)}"
             )
-        taps = programme.quietest(settling, allowed_overshoot)
+        taps = programme.quietest_taps(settling, allowed_overshoot)
         if taps is None:
             raise NoDesign(
                 f"shape: {settling * tick_ms:.4g} ms is the very limit; a longer shape.settling_ms would help"
             )
         measures = {
-            scenario: judged_of(subject, taps, scenario)
-            for scenario in dict.fromkeys([*scenarios, *family.swept(PROVED)])
+            scenario: measure_step(subject, taps, scenario)
+            for scenario in dict.fromkeys([*scenarios, *family.sweep_scenarios(PROOF_PLACES)])
         }
         worst_scenarios = [max(measures, key=lambda scenario, i=i: measures[scenario][i]) for i in range(3)]
         new_scenarios = [scenario for scenario in dict.fromkeys(worst_scenarios) if scenario not in scenarios]
-        proof = _worst(measures.values())
+        proof = _worst_measures(measures.values())
         is_settled = proof.settling_ms <= (settling + 1 / options.points_per_tick) * tick_ms
-        if is_settled and proof.overshoot <= subject.overshoot and proof.excess <= EXCESS:
+        if is_settled and proof.overshoot <= subject.overshoot and proof.excess <= ALLOWED_EXCESS:
             break
-        if rounds == ROUNDS:
-            raise NoDesign(_unproved(subject, settling * tick_ms, proof, len(measures)))
+        if rounds == MOST_ROUNDS:
+            raise NoDesign(_proof_failure(subject, settling * tick_ms, proof, len(measures)))
         scenarios += new_scenarios
         if proof.overshoot > subject.overshoot:
-            allowed_overshoot *= INSIDE * subject.overshoot / proof.overshoot
-    time, position, command = _steps(subject, taps, family.nominal)
-    curve_points = trade_off(programme, fastest, tick_ms) if curve else ()
+            allowed_overshoot *= USED_SHARE * subject.overshoot / proof.overshoot
+    time, position, command = _simulate_step(subject, taps, family.nominal)
+    curve_points = trade_off_curve(programme, fastest, tick_ms) if curve else ()
     variation = float(np.sum(np.abs(np.diff(command, prepend=0.0))))
-    return Shaped(
+    return TapDesign(
         taps,
         settling * tick_ms,
         fastest * tick_ms,
@@ -145,75 +146,79 @@ def shaped(
     )
 
 
-def programme_of(subject: Subject, scenarios: list[Scenario]) -> Programme:
+def build_programme(subject: Subject, scenarios: list[Scenario]) -> Programme:
     """The linear programme over scenarios, the model first. Raises NoDesign where a loop is not stable."""
     family, options = subject.family(), subject.options
-    ticks = horizon(subject.controller, family, scenarios, options.taps)
+    ticks = horizon_ticks(subject.controller, family, scenarios, options.taps)
     scenario_responses = [
-        _answered(subject, family, scenario, options.points_per_tick, ticks) for scenario in scenarios
+        _scenario_responses(subject, family, scenario, options.points_per_tick, ticks) for scenario in scenarios
     ]
     return Programme(
         scenario_responses, options.taps, options.points_per_tick, subject.bounds, options.band_percent / 100
     )
 
 
-def fastest_settling(programme: Programme, overshoot: float, at_least: float = 0.0) -> float | None:
-    """The least settling time in ticks, `at_least` so long, at which ε ≤ `overshoot`, to a point between ticks.
+def fastest_settling(programme: Programme, overshoot: float, least_ticks: float = 0.0) -> float | None:
+    """The least settling time in ticks, `furthest` so long, at which ε ≤ `overshoot`, to a point between ticks.
 
     None where there is none.
     """
 
-    def kept(place: int) -> bool:
-        return programme.feasible(place / programme.points, overshoot)
+    def is_feasible(place: int) -> bool:
+        return programme.is_feasible(place / programme.points, overshoot)
 
-    low, longest, step = round(at_least * programme.points), int(LONGEST * programme.taps) * programme.points, 2
-    if low and kept(low):
+    low, longest, step = (
+        round(least_ticks * programme.points),
+        int(LONGEST_SHARE * programme.taps) * programme.points,
+        2,
+    )
+    if low and is_feasible(low):
         return low / programme.points
     high = low + step if low else longest
-    while not kept(high):
+    while not is_feasible(high):
         if high >= longest:
             return None
         low, step = high, 2 * step
         high = min(low + step, longest)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if kept(middle) else (middle, high)
+        low, high = (low, middle) if is_feasible(middle) else (middle, high)
     return high / programme.points
 
 
-def trade_off(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
+def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
     """Least ε for settling times around `fastest` ticks, from where it is the whole band."""
     points: list[tuple[float, float]] = []
-    for place in np.unique(np.round(np.linspace(*CURVE) * fastest * programme.points)):
-        taps = programme.least_overshoot(place / programme.points)
+    for place in np.unique(np.round(np.linspace(*CURVE_RANGE) * fastest * programme.points)):
+        taps = programme.least_overshoot_taps(place / programme.points)
         if taps is not None:
             points.append((float(place) / programme.points * tick_ms, taps.overshoot))
     return tuple(points)
 
 
-def _worst(found: Iterable[Judged]) -> Judged:
+def _worst_measures(found: Iterable[StepMeasures]) -> StepMeasures:
     """Of each quantity."""
     settling, overshoot, excess, undershoot, low, high = (np.array(values) for values in zip(*found, strict=True))
     largest = (float(column.max()) for column in (settling, overshoot, excess, undershoot))
-    return Judged(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
+    return StepMeasures(*largest, lowest_command=float(low.min()), highest_command=float(high.max()))
 
 
-def judged_of(subject: Subject, taps: Taps, scenario: Scenario) -> Judged:
+def measure_step(subject: Subject, taps: Taps, scenario: Scenario) -> StepMeasures:
     """What a step does on one plant."""
-    time, position, command = _steps(subject, taps, scenario)
-    low, high = subject.bounds.command(np.array(1 / subject.family().plant(scenario).dc_gain))
+    time, position, command = _simulate_step(subject, taps, scenario)
+    low, high = subject.bounds.command_limits(np.array(1 / subject.family().plant(scenario).dc_gain))
     excess = float(max(command.max() - high, low - command.min()))
     unsettled = np.flatnonzero(np.abs(position - 1) > BAND)
     settled_s = float(time[min(unsettled[-1] + 1, time.size - 1)]) if unsettled.size else 0.0
     overshoot, undershoot = max(0.0, float(position.max()) - 1), max(0.0, -float(position.min()))
-    return Judged(1e3 * settled_s, overshoot, excess, undershoot, float(command.min()), float(command.max()))
+    return StepMeasures(1e3 * settled_s, overshoot, excess, undershoot, float(command.min()), float(command.max()))
 
 
-def _steps(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
+def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real, Real]:
     """Times in s, x at them, and v at the ticks after a unit step, PROOF_POINTS points a tick."""
     family, count = subject.family(), taps.reference.size
-    ticks = horizon(subject.controller, family, [scenario], count)
-    loop_responses = _answered(subject, family, scenario, PROOF_POINTS, ticks)
+    ticks = horizon_ticks(subject.controller, family, [scenario], count)
+    loop_responses = _scenario_responses(subject, family, scenario, PROOF_POINTS, ticks)
     position: Real = np.zeros(ticks * PROOF_POINTS)
     command: Real = np.zeros(ticks)
     for part, row in enumerate((taps.reference, taps.command)):
@@ -225,40 +230,45 @@ def _steps(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Real, Real
     return time, position, command
 
 
-def _answered(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
+def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
     try:
-        return responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
+        return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:
         raise NoDesign(f"shape.scenarios: with {scenario} {error}; a more robust controller is needed") from None
 
 
-def _no_taps(subject: Subject, programme: Programme) -> str:
+def _explain_no_taps(subject: Subject, programme: Programme) -> str:
     """Why no settling time will do."""
-    longest = int(LONGEST * programme.taps)
-    tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot(longest)
+    longest = int(LONGEST_SHARE * programme.taps)
+    tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot_taps(longest)
     if best_taps is not None:
         return (
             f"specification.overshoot_percent: {100 * subject.overshoot:g} % cannot be kept in all scenarios with "
             f"{programme.taps} taps; the least is {100 * best_taps.overshoot:.4g} % at {longest * tick_ms:g} ms. "
             "More of it, a smaller [shape.scenarios] or more taps would help"
         )
-    return f"shape: nothing settles within {longest * tick_ms:g} ms. {_binding(subject)}"
+    return f"shape: nothing settles within {longest * tick_ms:g} ms. {_describe_relaxations(subject)}"
 
 
-def _unproved(subject: Subject, settling_ms: float, kept: Judged, plants: int) -> str:
+def _proof_failure(subject: Subject, settling_ms: float, kept: StepMeasures, plants: int) -> str:
     """What the proof misses."""
     return (
         f"shape: the taps found for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % take up to "
-        f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_beyond(kept)} on {plants} "
+        f"{kept.settling_ms:.4g} ms, overshoot by {100 * kept.overshoot:.4g} % and have v {_describe_excess(kept)} "
+        f"on {plants} "
         "plants between the scenarios; a longer shape.settling_ms or a smaller [shape.scenarios] would help"
     )
 
 
-def _beyond(kept: Judged) -> str:
-    return f"{100 * kept.excess:.2g} % of a step beyond its limits" if kept.excess > EXCESS else "within its limits"
+def _describe_excess(kept: StepMeasures) -> str:
+    return (
+        f"{100 * kept.excess:.2g} % of a step beyond its limits"
+        if kept.excess > ALLOWED_EXCESS
+        else "within its limits"
+    )
 
 
-def _binding(subject: Subject) -> str:
+def _describe_relaxations(subject: Subject) -> str:
     """What would be gained by relaxing each constraint alone."""
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
@@ -267,14 +277,14 @@ def _binding(subject: Subject) -> str:
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
         "the model alone": replace(
-            subject, options=options.model_copy(update={"scenarios": _alone(options.scenarios)})
+            subject, options=options.model_copy(update={"scenarios": _without_variation(options.scenarios)})
         ),
     }  # fmt: skip
     fastest = dict[str, float | None]()
     for name, subject_variant in variants.items():
         family = subject_variant.family()
-        scenarios = list(dict.fromkeys([family.nominal, *family.swept(3)]))
-        fastest[name] = fastest_settling(programme_of(subject_variant, scenarios), subject_variant.overshoot)
+        scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(3)]))
+        fastest[name] = fastest_settling(build_programme(subject_variant, scenarios), subject_variant.overshoot)
     listed = ", ".join(
         f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in fastest.items()
     )
@@ -282,5 +292,5 @@ def _binding(subject: Subject) -> str:
     return f"With one thing relaxed the fastest is: {listed}. What binds most is relaxed by: {best_relaxation}"
 
 
-def _alone(options: ScenarioOptions) -> ScenarioOptions:
+def _without_variation(options: ScenarioOptions) -> ScenarioOptions:
     return options.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})

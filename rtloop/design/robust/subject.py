@@ -16,7 +16,7 @@ from rtloop.hysteresis.plays import loading_curve
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 
 
-def subject_in(configuration: Configuration, name: str, spec: Path | None) -> tuple[AxisOptions, Subject, Path]:
+def load_subject(configuration: Configuration, name: str, spec: Path | None) -> tuple[AxisOptions, Subject, Path]:
     """Of the axis `name`, which specification it goes by (`spec`, else the axis's own) along with it.
 
     Raises ConfigError.
@@ -35,12 +35,12 @@ def subject_in(configuration: Configuration, name: str, spec: Path | None) -> tu
     if spec is None:
         raise ConfigError(configuration.source, [f"axis.{name}.specification: missing; --spec names one"])
     try:
-        return axis, subject_of(axis, check, load_specification(spec).design), spec
+        return axis, build_subject(axis, check, load_specification(spec).design), spec
     except ValueError as error:
         raise ConfigError(configuration.source, [f"axis.{name}: {error}"]) from None
 
 
-def lacking(asked: SpecificationOptions) -> list[str]:
+def missing_requirements(asked: SpecificationOptions) -> list[str]:
     """What a specification does not say, or not well enough, that taps need."""
     faults = []
     if asked.overshoot_percent is None or not 0 < asked.overshoot_percent <= 5:
@@ -53,14 +53,14 @@ def lacking(asked: SpecificationOptions) -> list[str]:
     return faults
 
 
-def subject_of(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
+def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Subject:
     """Of one axis. Raises ValueError, naming the key, for what is missing or cannot be."""
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
         raise ValueError("controller: missing, or nothing linear is known of it alone; taps need a loop of its own")
     if model is None:
         raise ValueError("model: missing; there is no plant to make taps for")
-    if faults := lacking(specification):
+    if faults := missing_requirements(specification):
         raise ValueError(faults[0])
     assert specification.overshoot_percent is not None
     assert specification.command is not None
@@ -68,16 +68,16 @@ def subject_of(axis: AxisOptions, check: AxisCheck, design: DesignOptions) -> Su
         raise ValueError("prefilter.sections: taps are made for a filter that has none; take them out")
     if axis.limits.slew_v_per_s is not None:
         raise ValueError("limits.slew_v_per_s: a running slew limit is not linear; taps are made for loops without one")
-    low_um, high_um = reach_um(axis)
+    low_um, high_um = command_range_um(axis)
     step_um = specification.command.reference_um
     bounds = Bounds(options.undershoot_percent / 100, step_um, -step_um if low_um < 0 else 0.0, low_um, high_um)
     return Subject(
-        check.linear, design.sensor.seen_through(model.transfer()), model.delay_ticks, bounds,
+        check.linear, design.sensor.add_sensor_lag(model.transfer()), model.delay_ticks, bounds,
         specification.overshoot_percent / 100, options,
     )  # fmt: skip
 
 
-def reach_um(axis: AxisOptions) -> tuple[float, float]:
+def command_range_um(axis: AxisOptions) -> tuple[float, float]:
     """Least and largest v in µm: what the drive's limits reach on the initial loading curve, within `command_um`."""
     limits, law = axis.limits, axis.feedforward
     limit_um = limits.command_um

@@ -11,13 +11,13 @@ import math
 import numpy as np
 
 from rtloop.analysis.closed_loop import discrete_loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import loop_margins
 from rtloop.hil.modal import Complex
 from rtloop.laws.shipped.transfer import MAX_ORDER
-from rtloop.linear.discretise import Method, discretise
+from rtloop.linear.discretise import Method, discretise_controller
 from rtloop.linear.transfer import Transfer
 
-FAR = 1000.0
+FAR_FACTOR = 1000.0
 """A root beyond so many times half the sampling rate turns the phase there by less than 0.06°: it is left out."""
 MOST_DEAD_TIME_ORDER = 6
 LARGEST_SENSITIVITY = 3.0
@@ -37,14 +37,14 @@ def dead_time(delay_s: float, order: int) -> Transfer:
     return Transfer.from_zpk(-poles, poles, (-1.0) ** n)
 
 
-def within_rate(transfer: Transfer, rate_hz: float) -> Transfer:
+def drop_fast_roots(transfer: Transfer, rate_hz: float) -> Transfer:
     """Without the roots that lie FAR beyond half of `rate_hz`; the gain at 0 Hz stays.
 
     Poles that are not stable stay, and so do as many poles as there are zeros left.
     """
-    limit = FAR * math.pi * rate_hz
-    zeros, dropped_zeros = _parted(transfer.zeros, np.abs(transfer.zeros) <= limit)
-    poles, dropped_poles = _parted(transfer.poles, (np.abs(transfer.poles) <= limit) | (transfer.poles.real >= 0))
+    limit = FAR_FACTOR * math.pi * rate_hz
+    zeros, dropped_zeros = _split_roots(transfer.zeros, np.abs(transfer.zeros) <= limit)
+    poles, dropped_poles = _split_roots(transfer.poles, (np.abs(transfer.poles) <= limit) | (transfer.poles.real >= 0))
     if zeros.size > poles.size:
         poles, dropped_poles = transfer.poles, poles[:0]
     gain = complex(transfer.gain)
@@ -55,7 +55,7 @@ def within_rate(transfer: Transfer, rate_hz: float) -> Transfer:
     return Transfer(zeros, poles, gain.real)
 
 
-def runs(
+def is_runnable(
     controller: Transfer, plant: Transfer, rate_hz: float, method: Method, prewarp_hz: float | None, delay_ticks: int
 ) -> bool:
     """Whether the loop can run at this rate, C(z) with the plant behind its hold and delay: stable, and not barely so.
@@ -65,12 +65,12 @@ def runs(
     if controller.order > MAX_ORDER:
         return False
     try:
-        discrete = discretise(controller, 1 / rate_hz, method, prewarp_hz)
+        discrete = discretise_controller(controller, 1 / rate_hz, method, prewarp_hz)
     except ValueError:
         return False
     loop = discrete_loop(discrete, plant, delay_ticks)
-    return loop.is_stable and margins(loop).max_sensitivity <= LARGEST_SENSITIVITY
+    return loop.is_stable and loop_margins(loop).max_sensitivity <= LARGEST_SENSITIVITY
 
 
-def _parted(roots: Complex, kept: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
+def _split_roots(roots: Complex, kept: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Complex, Complex]:
     return roots[kept], roots[~kept]

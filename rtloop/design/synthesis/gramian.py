@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag, solve_continuous_lyapunov
 
-from rtloop.hil.modal import Complex, Modal, Real
+from rtloop.hil.modal import Complex, ModalSystem, Real
 from rtloop.linear.realisation import System
 
 
@@ -26,17 +26,17 @@ def modal_root(poles: Complex, inputs: Complex) -> Real:
     """
     factor = _cauchy_root(poles, inputs)
     real = _to_real(poles) @ factor
-    return _one_root(np.hstack([real.real, real.imag]))
+    return _triangular_root(np.hstack([real.real, real.imag]))
 
 
 def system_roots(system: System) -> tuple[Real, Real]:
     """(L, R) with P = L Lᵀ and Q = R Rᵀ for a stable system in any form, from Lyapunov equations."""
     p = solve_continuous_lyapunov(system.a, -np.outer(system.b, system.b))
     q = solve_continuous_lyapunov(system.a.T, -np.outer(system.c, system.c))
-    return _root_of(p), _root_of(q)
+    return _gramian_root(p), _gramian_root(q)
 
 
-def real_modal_system(modal: Modal) -> System:
+def real_modal_system(modal: ModalSystem) -> System:
     """The real form whose Gramians `modal_root` factors: inputs √|r|, outputs r/√|r|, so that the two are alike."""
     upper = modal.poles.imag >= 0
     a, b, c = [], [], []
@@ -54,7 +54,7 @@ def real_modal_system(modal: Modal) -> System:
     return System(np.asarray(block_diag(*a), dtype=float), np.concatenate(b), np.concatenate(c), float(modal.direct[0]))
 
 
-def modal_vectors(modal: Modal) -> tuple[Complex, Complex]:
+def modal_vectors(modal: ModalSystem) -> tuple[Complex, Complex]:
     """β and γ (n,) with γᵢβᵢ = rᵢ and |βᵢ| = |γᵢ|."""
     residues = modal.residues[0]
     beta = np.sqrt(np.abs(residues)).astype(complex)
@@ -85,11 +85,11 @@ def _to_real(poles: Complex) -> Complex:
     return np.asarray(block_diag(*blocks), dtype=complex)
 
 
-def _one_root(wide: Real) -> Real:
+def _triangular_root(wide: Real) -> Real:
     """L (n, n), lower triangular, with L Lᵀ = wide·wideᵀ."""
     return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=float).T
 
 
-def _root_of(gramian: Real) -> Real:
+def _gramian_root(gramian: Real) -> Real:
     values, vectors = np.linalg.eigh(gramian)
     return vectors * np.sqrt(np.maximum(values, 0.0))

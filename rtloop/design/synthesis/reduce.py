@@ -16,16 +16,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rtloop.design.synthesis.gramian import modal_root, modal_vectors, real_modal_system, system_roots
-from rtloop.hil.modal import Modal, Real, RepeatedPoles, modal_sum
-from rtloop.linear.realisation import System, beside_imaginary_axis, cascade, scaled
+from rtloop.hil.modal import ModalSystem, Real, RepeatedPoles, modal_sum
+from rtloop.linear.realisation import System, cascade, imaginary_axis_points, scale_states
 from rtloop.linear.transfer import Transfer
 
 ReductionMethod = Literal["residualise", "truncate"]
-MINIMAL = 1e-14
+LEAST_RELATIVE = 1e-14
 """States of a Hankel singular value below this part of the largest are numerically not there."""
 
 
-class Reduced(NamedTuple):
+class ReducedController(NamedTuple):
     """`transfer` of the order kept; `hankel` (n,) of the stable part of the original; `error_bound` = 2 Σ σ_k left out.
 
     Modes that are not stable are kept as they are, and count in the order.
@@ -36,7 +36,7 @@ class Reduced(NamedTuple):
     error_bound: float
 
 
-class _Balanced(NamedTuple):
+class _BalancedSystem(NamedTuple):
     """A stable part, and the change of coordinates x = forward·z, z = back·x that balances it; `hankel` falls."""
 
     system: System
@@ -47,11 +47,11 @@ class _Balanced(NamedTuple):
 
 def hankel_singular_values(transfer: Transfer) -> Real:
     """σ (n,), falling, of the stable part; 2σ is about how far the response moves if the state goes."""
-    stable, _ = _parts(transfer)
-    return _balanced(stable).hankel
+    stable, _ = _split_stable(transfer)
+    return _balance(stable).hankel
 
 
-def order_for(hankel: Real, tolerance: float) -> int:
+def order_within(hankel: Real, tolerance: float) -> int:
     """The smallest order whose error bound 2 Σ σ_k is at most `tolerance` of 2 Σ σ over all states."""
     tail_sums = np.append(np.cumsum(hankel[::-1])[::-1], 0.0)
     return int(np.argmax(tail_sums <= tolerance * tail_sums[0]))
@@ -62,28 +62,29 @@ def reduce_order(
     order: int | None = None,
     method: ReductionMethod = "residualise",
     tolerance: float = 1e-3,
-) -> Reduced:
-    """The transfer function with `order` poles, by default as few as `tolerance` allows (see `order_for`).
+) -> ReducedController:
+    """The transfer function with `order` poles, by default as few as `tolerance` allows (see `order_within`).
 
     Raises ValueError for an order that is negative, above the original's, or below the number of modes that are not
     stable.
     """
-    stable, unstable = _parts(transfer)
-    balanced = _balanced(stable)
+    stable, unstable = _split_stable(transfer)
+    balanced = _balance(stable)
     unstable_count = unstable.poles.size if unstable else 0
-    stable_order = order_for(balanced.hankel, tolerance) if order is None else order - unstable_count
+    stable_order = order_within(balanced.hankel, tolerance) if order is None else order - unstable_count
     if not 0 <= stable_order <= transfer.order - unstable_count:
         raise ValueError(
-            f"order: {order} of a controller of order {transfer.order} with {unstable_count} modes that are not stable; "
+            f"order: {order} of a controller of order {transfer.order} with {unstable_count} modes that are not "
+            "stable; "
             f"{unstable_count} to {transfer.order} are allowed"
         )
     order_kept = min(stable_order, balanced.hankel.size)
     error_bound = 2 * float(balanced.hankel[order_kept:].sum())
-    reduced = _cut(balanced, order_kept, method)
-    return Reduced(_with_unstable(reduced, unstable), balanced.hankel, error_bound)
+    reduced = _reduce_states(balanced, order_kept, method)
+    return ReducedController(_add_unstable(reduced, unstable), balanced.hankel, error_bound)
 
 
-def _parts(transfer: Transfer) -> tuple[Modal | System, Modal | None]:
+def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem | None]:
     """The stable part and, where there are any, the modes that are not stable."""
     try:
         modal = modal_sum(transfer.zeros, transfer.poles, transfer.gain)
@@ -91,19 +92,19 @@ def _parts(transfer: Transfer) -> tuple[Modal | System, Modal | None]:
         modal = None
     if modal is not None:
         stable = modal.poles.real < 0
-        unstable = Modal(modal.poles[~stable], modal.residues[:, ~stable], np.zeros(1))
-        return Modal(
+        unstable = ModalSystem(modal.poles[~stable], modal.residues[:, ~stable], np.zeros(1))
+        return ModalSystem(
             modal.poles[stable], modal.residues[:, stable], modal.direct
         ), unstable if unstable.poles.size else None
     if not transfer.is_stable:
         raise ValueError("poles: repeated ones beside unstable ones; such a controller cannot be reduced")
-    points = beside_imaginary_axis(np.concatenate([transfer.zeros, transfer.poles]))
-    return scaled(cascade(transfer.zeros, transfer.poles, transfer.gain), points), None
+    points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
+    return scale_states(cascade(transfer.zeros, transfer.poles, transfer.gain), points), None
 
 
-def _balanced(part: Modal | System) -> _Balanced:
+def _balance(part: ModalSystem | System) -> _BalancedSystem:
     """The balanced realisation without what is numerically not there."""
-    if isinstance(part, Modal):
+    if isinstance(part, ModalSystem):
         beta, gamma = modal_vectors(part)
         system = real_modal_system(part)
         input_root, output_root = modal_root(part.poles, beta), modal_root(np.conj(part.poles), np.conj(gamma))
@@ -111,13 +112,13 @@ def _balanced(part: Modal | System) -> _Balanced:
         system = part
         input_root, output_root = system_roots(part)
     u, hankel, vh = np.linalg.svd(output_root.T @ input_root)
-    count = int(np.sum(hankel > MINIMAL * hankel.max(initial=0.0)))
+    count = int(np.sum(hankel > LEAST_RELATIVE * hankel.max(initial=0.0)))
     u, hankel, v = u[:, :count], hankel[:count], vh[:count].T
     forward, back = input_root @ v / np.sqrt(hankel), (output_root @ u / np.sqrt(hankel)).T
-    return _Balanced(system, forward, back, hankel)
+    return _BalancedSystem(system, forward, back, hankel)
 
 
-def _cut(balanced: _Balanced, keep: int, method: ReductionMethod) -> System:
+def _reduce_states(balanced: _BalancedSystem, keep: int, method: ReductionMethod) -> System:
     """The first `keep` states; the others left out, or at rest for good.
 
     Only the states that are kept are ever computed: residualising G(s) is truncating G(1/s), which has the same
@@ -136,7 +137,7 @@ def _cut(balanced: _Balanced, keep: int, method: ReductionMethod) -> System:
     )
 
 
-def _with_unstable(rest: System, unstable: Modal | None) -> Transfer:
+def _add_unstable(rest: System, unstable: ModalSystem | None) -> Transfer:
     """Both parts side by side."""
     if unstable is None:
         return Transfer.from_state_space(*rest)

@@ -15,23 +15,23 @@ import numpy as np
 from rtloop import __version__
 from rtloop.design.synthesis.specification import DesignOptions, OutputOptions
 from rtloop.design.synthesis.synthesise import Synthesis
-from rtloop.design.toml_text import roots, section
+from rtloop.design.toml_text import root_pairs, write_section
 from rtloop.hil.modal import Complex, RepeatedPoles, modal_sum
 from rtloop.linear.transfer import Transfer
 
-STAND_IN_UM_PER_V = 4.3
+RIG_UM_PER_V = 4.3
 """Of the rig that is written around a controller: a proportional actuator."""
-PARTED = 1e-5
+POLE_SPACING = 1e-5
 """Repeated poles are this far apart, relatively, on a rig, which takes none that repeat."""
 _METHODS = {"residualise": "balanced residualisation", "truncate": "balanced truncation"}
 
 
-def controller_section(found: Synthesis, design: DesignOptions, source: str, text: str) -> str:
+def controller_section(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> str:
     """TOML, to be put below the [[axis]] it is for. `source` and `text` are the specification's name and content.
 
     Reading the numbers gives the same bits again; without a date, the same input gives the same text.
     """
-    return commented_section(found.controller, design.controller, provenance(found, design, source, text))
+    return commented_section(synthesis.controller, design.controller, provenance(synthesis, design, source, text))
 
 
 def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
@@ -40,13 +40,15 @@ def commented_section(controller: Transfer, output: OutputOptions, lines: Sequen
 
 
 def controller_configuration(
-    found: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str
+    synthesis: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str
 ) -> str:
     """A whole configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
 
     Its rig is the plant of `design`; `specification` is the file's path relative to the configuration's.
     """
-    return configuration_around(found.controller, design, provenance(found, design, source, text), axis, specification)
+    return configuration_around(
+        synthesis.controller, design, provenance(synthesis, design, source, text), axis, specification
+    )
 
 
 def configuration_around(
@@ -55,14 +57,14 @@ def configuration_around(
     """A configuration with any controller for the plant of `design`, below comment `lines`."""
     assert design.plant is not None
     plant, delay_ticks = design.plant.transfer(), design.plant.delay_ticks
-    actuator = {"thresholds_v": [0.0], "weights_um_per_v": [STAND_IN_UM_PER_V]}
+    actuator = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
     values = {
         "loop": {"rate_hz": design.controller.rate_hz},
         "driver": {
             "kind": "sim",
             "latency_ticks": delay_ticks,
             "channels": {axis: {"input": "adc0", "output": "dac0", "um_per_v": 10.0}},
-            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": _zpk(_with_single_poles(plant))},
+            "plant": {"hysteresis": {"truth": "custom", **actuator}, "dynamics": _zpk(_separate_poles(plant))},
         },
         "axis": [
             {
@@ -77,17 +79,22 @@ def configuration_around(
     heading = [
         *lines,
         "",
-        f"Driver, feedforward and limits stand in for yours: a simulated rig of the plant, {STAND_IN_UM_PER_V} µm/V.",
+        f"Driver, feedforward and limits stand in for yours: a simulated rig of the plant, {RIG_UM_PER_V} µm/V.",
         f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
     ]
-    return section("", values, heading)
+    return write_section("", values, heading)
 
 
 def _zpk(transfer: Transfer) -> dict[str, Any]:
-    return {"form": "zpk", "gain": transfer.gain, "zeros": roots(transfer.zeros), "poles": roots(transfer.poles)}
+    return {
+        "form": "zpk",
+        "gain": transfer.gain,
+        "zeros": root_pairs(transfer.zeros),
+        "poles": root_pairs(transfer.poles),
+    }
 
 
-def _with_single_poles(plant: Transfer) -> Transfer:
+def _separate_poles(plant: Transfer) -> Transfer:
     """The plant, its repeated poles moved apart by PARTED at the same static gain."""
     try:
         modal_sum(plant.zeros, plant.poles, plant.gain)
@@ -96,15 +103,15 @@ def _with_single_poles(plant: Transfer) -> Transfer:
         root_numbers = np.concatenate(
             [np.arange(reals), np.arange(plant.order - reals) // 2]
         )  # pairs stand side by side
-        factors = 1 + PARTED * root_numbers
+        factors = 1 + POLE_SPACING * root_numbers
         return Transfer(plant.zeros, factors * plant.poles, plant.gain * float(np.prod(factors)))
     return plant
 
 
-def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
+def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
     """Where the controller comes from, a line each."""
-    hinf, weights = found.hinf, found.weights
-    order, full_order = found.controller.order, found.full.order
+    hinf, weights = synthesis.hinf, synthesis.weights
+    order, full_order = synthesis.controller.order, synthesis.full.order
     digest = hashlib.sha256(text.encode()).hexdigest()
     lines = [
         f"Synthesised by rtloop {__version__} from {source} (SHA-256 {digest[:16]}…)",
@@ -115,11 +122,11 @@ def provenance(found: Synthesis, design: DesignOptions, source: str, text: str) 
         f"H∞ (Glover & Doyle 1988): γ_opt = {hinf.gamma_opt:.6g}, γ = {hinf.gamma:.6g}, "
         f"achieved {hinf.achieved:.6g} at order {full_order}",
         "each specification is relaxed by up to γ",
-        "Hankel singular values: " + ", ".join(f"{value:.4g}" for value in found.hankel),
+        "Hankel singular values: " + ", ".join(f"{value:.4g}" for value in synthesis.hankel),
     ]
     if order < full_order:
         method = _METHODS[design.synthesis.reduction]
-        lines.append(f"reduced to order {order} by {method}: achieved {found.achieved:.6g}")
+        lines.append(f"reduced to order {order} by {method}: achieved {synthesis.achieved:.6g}")
     return lines
 
 

@@ -41,7 +41,7 @@ class CommandOptions(Options):
     command_um: float = Field(gt=0)
 
 
-def _claim(value: object) -> object:
+def _claim_table(value: object) -> object:
     """A claim may be its words alone."""
     return {"says": value} if isinstance(value, str) else value
 
@@ -58,7 +58,7 @@ class ClaimOptions(Options):
         """A value can contradict it."""
         return self.at_least is not None or self.at_most is not None
 
-    def borne_out(self, value: float) -> bool:
+    def is_borne_out(self, value: float) -> bool:
         """Whether `value` is as claimed."""
         is_above = self.at_least is None or value >= self.at_least
         return is_above and (self.at_most is None or value <= self.at_most)
@@ -83,18 +83,18 @@ class SpecificationOptions(Options):
     """The resonance may move by so much, up and down, and the loop stays stable."""
     disturbance: DisturbanceOptions | None = None
     command: CommandOptions | None = None
-    claims: dict[str, Annotated[ClaimOptions, BeforeValidator(_claim)]] = Field(default_factory=dict)
+    claims: dict[str, Annotated[ClaimOptions, BeforeValidator(_claim_table)]] = Field(default_factory=dict)
     """What a source says of actuator and controller, by the name of a quantity: printed beside what was found."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        unknown = sorted(set(self.claims) - set(QUANTITIES) - set(MEASURED))
+        unknown = sorted(set(self.claims) - set(QUANTITIES) - set(EXPERIMENT_QUANTITIES))
         if unknown:
-            allowed = ", ".join((*QUANTITIES, *MEASURED))
+            allowed = ", ".join((*QUANTITIES, *EXPERIMENT_QUANTITIES))
             raise ValueError(f"claims: {', '.join(unknown)} is not known; allowed are {allowed}")
         return self
 
-    def claimed(self, name: str) -> str:
+    def claim_words(self, name: str) -> str:
         """The words of a claim; none where nothing is claimed."""
         return self.claims[name].says if name in self.claims else ""
 
@@ -122,7 +122,7 @@ QUANTITIES = {
 }
 """Label and unit of everything that is computed of a loop."""
 
-MEASURED = (
+EXPERIMENT_QUANTITIES = (
     "hysteresis_percent",
     "hysteresis_um",
     "range_um",
@@ -157,7 +157,7 @@ class SensorOptions(Options):
         """Noise and rounding together, rms: a step of resolution spreads evenly, by its width over √12."""
         return math.hypot(self.noise_um, self.resolution_um / math.sqrt(12))
 
-    def seen_through(self, plant: Transfer) -> Transfer:
+    def add_sensor_lag(self, plant: Transfer) -> Transfer:
         """The plant with the sensor's lag behind it."""
         if self.bandwidth_hz is None:
             return plant
@@ -260,10 +260,10 @@ class DesignOptions(Options):
         return "residual_percent" in self.simulation.model_fields_set
 
 
-def weights_of(design: DesignOptions) -> Weights:
+def build_weights(design: DesignOptions) -> Weights:
     """W1, W2, W3: given ones, else by the paper's rules. Raises ValueError naming what a rule lacks."""
     own_weights, specification = design.weights, design.specification
-    tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking(specification)
+    tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking_weight(specification)
     if own_weights.command:
         command = own_weights.command.transfer()
     else:
@@ -282,7 +282,7 @@ def weights_of(design: DesignOptions) -> Weights:
     return Weights(tracking, command, disturbance)
 
 
-def _tracking(asked: SpecificationOptions) -> Transfer:
+def _tracking_weight(asked: SpecificationOptions) -> Transfer:
     """Eq (15). A given bandwidth goes before the one that a settling time asks for, 3/t rad/s."""
     if asked.static_error_percent is None:
         raise ValueError("specification.static_error_percent: missing; the tracking weight needs it")

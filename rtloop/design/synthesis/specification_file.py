@@ -31,10 +31,10 @@ def load_specification(path: Path) -> SpecificationFile:
     try:
         return SpecificationFile(path, text, DesignOptions.model_validate(raw))
     except ValidationError as error:
-        raise ConfigError(str(path), describe(error, "", raw, _keys())) from None
+        raise ConfigError(str(path), describe(error, "", raw, _allowed_keys())) from None
 
 
-def _keys() -> set[str]:
+def _allowed_keys() -> set[str]:
     """All keys that a specification may have, to guess at what was meant by another."""
     schema = DesignOptions.model_json_schema()
     parts = [schema, *schema.get("$defs", {}).values()]

@@ -11,20 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import realised
-from rtloop.design.synthesis.at_rate import LARGEST_SENSITIVITY, dead_time, runs, within_rate
-from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augmented
+from rtloop.analysis.closed_loop import realise_transfer
+from rtloop.design.synthesis.at_rate import LARGEST_SENSITIVITY, dead_time, drop_fast_roots, is_runnable
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augment
 from rtloop.design.synthesis.hinf.norm import hinf_norm
-from rtloop.design.synthesis.hinf.normalised import normalised
+from rtloop.design.synthesis.hinf.normalised import normalise
 from rtloop.design.synthesis.hinf.solver import Hinf, NoController, smallest_gamma, synthesise_hinf
 from rtloop.design.synthesis.reduce import ReductionMethod, hankel_singular_values, reduce_order
-from rtloop.design.synthesis.specification import DesignOptions, weights_of
+from rtloop.design.synthesis.specification import DesignOptions, build_weights
 from rtloop.design.synthesis.weights import Weights
 from rtloop.hil.modal import Real
 from rtloop.linear.transfer import Transfer
 
 
-class DoesNotRun(NoController):
+class NotRunnable(NoController):
     """There is a controller in continuous time, but none that can run."""
 
 
@@ -57,16 +57,16 @@ def synthesise(
     where it would not run. Raises NoController, also where γ_opt exceeds `largest_gamma`, and ValueError for an order
     that leaves no stable loop.
     """
-    augmented_plant = augmented(plant, weights)
+    augmented_plant = augment(plant, weights)
     hinf = synthesise_hinf(augmented_plant, backoff=backoff)
     if hinf.gamma_opt > largest_gamma:
-        raise NoController(_contradiction(plant, weights, hinf.gamma_opt, largest_gamma))
+        raise NoController(_explain_contradiction(plant, weights, hinf.gamma_opt, largest_gamma))
     full = Transfer.from_state_space(*hinf.controller)
     allowed = np.inf if order is not None else (1 + largest_loss) * hinf.gamma
     lowest = int(np.sum(full.poles.real >= 0))
     candidates: list[tuple[float, Transfer]] = []
     for candidate_order in range(lowest, full.order + 1) if order is None else [order]:
-        controller, achieved = _reduced(augmented_plant, full, candidate_order, reduction, finish)
+        controller, achieved = _reduce_and_finish(augmented_plant, full, candidate_order, reduction, finish)
         if np.isfinite(achieved):
             candidates.append((achieved, controller))
         if achieved <= allowed:
@@ -79,7 +79,7 @@ def synthesise(
             f"order: {order} leaves an unstable loop with method {reduction!r}; "
             "a higher one, or none so that the lowest good one is found, would help"
         )
-    raise DoesNotRun(
+    raise NotRunnable(
         f"specification: γ = {hinf.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
         f"to {full.order} leaves a loop that is stable as it runs, with max |S| ≤ {LARGEST_SENSITIVITY:g}; a longer "
         "settling_ms (a smaller bandwidth_hz) or a higher rate would help"
@@ -88,11 +88,11 @@ def synthesise(
 
 def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
     """‖F_l(P, C)‖∞ of eq (9): the factor by which the worst specification is missed; infinite if unstable."""
-    a, b, c, d = realised(controller)
-    return hinf_norm(standard.closed_with(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
+    a, b, c, d = realise_transfer(controller)
+    return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
 
-def _reduced(
+def _reduce_and_finish(
     standard: GeneralisedPlant,
     full: Transfer,
     order: int,
@@ -116,16 +116,20 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     """
     if design.plant is None:
         raise ValueError("plant: missing; a section [plant] with the model from v to x is needed")
-    plant, weights, options = design.plant.transfer(), weights_of(design), design.synthesis
-    _check(plant, design)
+    plant, weights, options = design.plant.transfer(), build_weights(design), design.synthesis
+    _require_possible(plant, design)
     ticks, output = design.plant.delay_ticks, design.controller
 
     def finish(controller: Transfer) -> Transfer | None:
-        reduced = within_rate(controller, output.rate_hz)
-        sensed_plant = design.sensor.seen_through(plant)
-        return reduced if runs(reduced, sensed_plant, output.rate_hz, output.method, output.prewarp_hz, ticks) else None
+        reduced = drop_fast_roots(controller, output.rate_hz)
+        sensed_plant = design.sensor.add_sensor_lag(plant)
+        return (
+            reduced
+            if is_runnable(reduced, sensed_plant, output.rate_hz, output.method, output.prewarp_hz, ticks)
+            else None
+        )
 
-    def designed_for(delay_s: float) -> Synthesis:
+    def synthesise_delayed(delay_s: float) -> Synthesis:
         return synthesise(
             plant * dead_time(delay_s, ticks + 1), weights, order=options.order, reduction=options.reduction,
             backoff=options.backoff_percent / 100, largest_loss=options.largest_loss_percent / 100,
@@ -134,14 +138,14 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
 
     hold_delay_s = (ticks + 0.5) / output.rate_hz
     if ticks:
-        return designed_for(hold_delay_s)
+        return synthesise_delayed(hold_delay_s)
     try:
-        return designed_for(0.0)
-    except DoesNotRun:
-        return designed_for(hold_delay_s)
+        return synthesise_delayed(0.0)
+    except NotRunnable:
+        return synthesise_delayed(hold_delay_s)
 
 
-def _check(plant: Transfer, design: DesignOptions) -> None:
+def _require_possible(plant: Transfer, design: DesignOptions) -> None:
     """What no controller can do, before one is looked for. Raises NoController."""
     specification, gain = design.specification, abs(plant.dc_gain)
     if specification.static_error_percent is not None and gain == 0:
@@ -151,12 +155,13 @@ def _check(plant: Transfer, design: DesignOptions) -> None:
         if specification.command.command_um < needed_um:
             raise NoController(
                 f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold a reference of "
-                f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a plant of static gain "
+                f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a "
+                "plant of static gain "
                 f"{gain:.6g}; at least {needed_um:.6g} µm are needed, or a smaller reference_um"
             )
 
 
-def _contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
+def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
     """Which weight makes γ large: γ without each of them."""
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
@@ -165,7 +170,7 @@ def _contradiction(plant: Transfer, weights: Weights, gamma: float, largest: flo
         "command": Weights(w1, Transfer(w2.zeros, w2.poles, w2.gain / 100), w3),
         "tracking (ten times slower)": Weights(slower, w2, w3),
     }
-    gammas = {name: _gamma(plant, relaxed) for name, relaxed in relaxed_weights.items()}
+    gammas = {name: _smallest_gamma(plant, relaxed) for name, relaxed in relaxed_weights.items()}
     hardest = min(gammas, key=lambda name: gammas[name])
     gamma_list = ", ".join(f"{name} {value:.4g}" for name, value in gammas.items())
     zeros = plant.zeros[plant.zeros.real > 0]
@@ -177,8 +182,8 @@ def _contradiction(plant: Transfer, weights: Weights, gamma: float, largest: flo
     )
 
 
-def _gamma(plant: Transfer, weights: Weights) -> float:
+def _smallest_gamma(plant: Transfer, weights: Weights) -> float:
     try:
-        return smallest_gamma(normalised(augmented(plant, weights)), 1e-4)[0]
+        return smallest_gamma(normalise(augment(plant, weights)), 1e-4)[0]
     except NoController:
         return float("inf")

@@ -33,14 +33,14 @@ from rtloop.hil.options import (
     RigOptions,
     SensorOptions,
 )
-from rtloop.hysteresis.leftover import with_hysteresis_left
+from rtloop.hysteresis.leftover import add_residual_hysteresis
 from rtloop.signals import Mode
 
-SMALLEST_RING_HZ = 1.0
+SMALLEST_RING_RATE_HZ = 1.0
 UNLIMITED_SLACK = 1 << 62
 
 
-class Stand(NamedTuple):
+class HardwareModel(NamedTuple):
     """What is known of an axis beside its configuration: its plant, white noise (µm rms) and resolution of its sensor,
     and how much hysteresis its inverse leaves (h/H in percent, 0 where nobody says).
     """
@@ -56,17 +56,17 @@ class Bench:
     """Runs steps of one axis, the others at rest. Raises ValueError where no rig can stand for the hardware, and
     ConfigError for what cannot run at all."""
 
-    def __init__(self, configuration: Configuration, stands: Mapping[str, Stand]) -> None:
+    def __init__(self, configuration: Configuration, hardware_models: Mapping[str, HardwareModel]) -> None:
         self.is_configured = configuration.driver_kind == "sim" or isinstance(
             configuration.driver_options, BoardOptions
         )
-        rig_configuration = _on_rig(configuration, stands, self.is_configured)
+        rig_configuration = _place_on_rig(configuration, hardware_models, self.is_configured)
         plan = prepare(rig_configuration, paced=False).plan
         self._plan = replace(plan, mode=Mode.CLOSED_LOOP)
         assert isinstance(rig_configuration.driver_options, RigOptions)
         self.rig, self.rate_hz = rig_configuration.driver_options, plan.pacing.rate_hz
 
-    def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, draw: int = 0) -> dict[str, Real]:
+    def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, noise_draw: int = 0) -> dict[str, Real]:
         """Every column of a record, (ticks,), while `axis` goes from rest through levels, each held for `dwell_s`.
 
         Noise is that of the rig's seed in `draw` 0, and another in any other.
@@ -83,15 +83,15 @@ class Bench:
             generators=generators,
             table=table.samples,
             ticks=ticks,
-            driver_options={**self._plan.driver_options, "seed": self.rig.seed + draw},
+            driver_options={**self._plan.driver_options, "seed": self.rig.seed + noise_draw},
         )
-        return dict(zip(plan.columns, _records(plan, ticks).T, strict=True))
+        return dict(zip(plan.columns, _run_loop(plan, ticks).T, strict=True))
 
 
-def _records(plan: Plan, ticks: int) -> Real:
+def _run_loop(plan: Plan, ticks: int) -> Real:
     """What the loop recorded, (ticks, columns); no process, no clock, no file."""
     driver, context = plan.driver(), clock_context(plan.pacing.rate_hz)
-    block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
+    block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
     try:
         ring = block.ring("ticks")
         clock = unpaced_clock(context, ring.head, block["words"], Word.RECORDER_CURSOR, UNLIMITED_SLACK)
@@ -107,7 +107,9 @@ def _records(plan: Plan, ticks: int) -> Real:
         os.close(block.fd)
 
 
-def _on_rig(configuration: Configuration, stands: Mapping[str, Stand], is_configured: bool) -> Configuration:
+def _place_on_rig(
+    configuration: Configuration, stands: Mapping[str, HardwareModel], is_configured: bool
+) -> Configuration:
     """The configuration in closed loop, at rest, on a rig. Raises ValueError for what no rig has."""
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
     axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)
@@ -137,13 +139,15 @@ def _on_rig(configuration: Configuration, stands: Mapping[str, Stand], is_config
     return replace(changed, driver_kind="sim", driver_options=rig, channels=channels)
 
 
-def _plant(axis: AxisOptions, stand: Stand, um_per_v: float) -> PlantOptions:
+def _plant(axis: AxisOptions, hardware_model: HardwareModel, um_per_v: float) -> PlantOptions:
     """What stands for an axis's hardware. Raises ValueError without a model."""
-    model = stand.model
+    model = hardware_model.model
     if model is None:
         raise ValueError(f"axis.{axis.name}.model: missing; nothing can stand for its hardware")
-    plant, actuator = model.transfer(), with_hysteresis_left(axis.feedforward.actuator(), stand.residual_percent,
-                                                             axis.limits.drive_v)  # fmt: skip
+    plant = model.transfer()
+    actuator = add_residual_hysteresis(
+        axis.feedforward.actuator(), hardware_model.residual_percent, axis.limits.drive_v
+    )
     return PlantOptions(
         hysteresis=HysteresisOptions(
             truth="custom",
@@ -158,8 +162,8 @@ def _plant(axis: AxisOptions, stand: Stand, um_per_v: float) -> PlantOptions:
         ),
         sensor=SensorOptions(
             um_per_v=um_per_v,
-            noise_um=stand.noise_um,
-            resolution_um=stand.resolution_um,
-            bandwidth_hz=stand.bandwidth_hz,
+            noise_um=hardware_model.noise_um,
+            resolution_um=hardware_model.resolution_um,
+            bandwidth_hz=hardware_model.bandwidth_hz,
         ),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop
-from rtloop.analysis.margins import margins
+from rtloop.analysis.margins import loop_margins
 from rtloop.analysis.search import zero_between
 from rtloop.analysis.step_response import step_metrics
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
@@ -21,13 +21,13 @@ class Limit(NamedTuple):
     value: float
     at_most: bool
 
-    def met(self, value: float) -> bool:
+    def is_met_by(self, value: float) -> bool:
         """Whether `value` is within, but for rounding; NaN (undefined, unstable) is not."""
         slack = 1e-9 * max(1.0, abs(self.value)) if math.isfinite(self.value) else 0.0
         return value <= self.value + slack if self.at_most else value >= self.value - slack
 
 
-def limits(asked: SpecificationOptions) -> dict[str, Limit]:
+def required_limits(asked: SpecificationOptions) -> dict[str, Limit]:
     """What is required, by the name of the quantity (`rtloop.design.synthesis.specification.QUANTITIES`)."""
     required: dict[str, Limit] = {}
     for name, at_most in (("static_error_percent", True), ("settling_ms", True), ("overshoot_percent", True),
@@ -42,7 +42,7 @@ def limits(asked: SpecificationOptions) -> dict[str, Limit]:
     return required
 
 
-def specified(loop: Loop, asked: SpecificationOptions, resonance: float | None = None) -> dict[str, float]:
+def specified_quantities(loop: Loop, asked: SpecificationOptions, resonance: float | None = None) -> dict[str, float]:
     """The quantities that a specification is about; NaN throughout for an unstable loop.
 
     `resonance` is that of the model in rad/s, None where it has none.
@@ -60,14 +60,16 @@ def specified(loop: Loop, asked: SpecificationOptions, resonance: float | None =
         "settling_ms": 1e3 * step.settling_time_s,
         "overshoot_percent": step.overshoot_percent,
         "peak_command": step.peak_command,
-        "bandwidth_hz": held_up_to(loop, math.sqrt(0.5)),
+        "bandwidth_hz": held_frequency_hz(loop, math.sqrt(0.5)),
     }
     if asked.disturbance is not None:
-        quantities["disturbance_hz"] = held_up_to(loop, asked.disturbance.error_um / asked.disturbance.largest_um)
+        quantities["disturbance_hz"] = held_frequency_hz(
+            loop, asked.disturbance.error_um / asked.disturbance.largest_um
+        )
     if asked.modulus_margin is not None:
-        quantities["modulus_margin"] = 1 / margins(loop).max_sensitivity
+        quantities["modulus_margin"] = 1 / loop_margins(loop).max_sensitivity
     if resonance is not None:
-        quantities["resonance_decay_ms"] = 1e3 * slowest_near(loop, resonance)
+        quantities["resonance_decay_ms"] = 1e3 * slowest_near_s(loop, resonance)
     return quantities
 
 
@@ -78,32 +80,32 @@ NEAR_RESONANCE = (0.55, 1.85)
 """Where a closed-loop mode counts as one of the resonance, as a part of its frequency."""
 
 
-def slowest_near(loop: Loop, resonance: float) -> float:
+def slowest_near_s(loop: Loop, resonance: float) -> float:
     """Time constant in s of the slowest mode whose frequency is near one in rad/s; 0 where there is none."""
     frequencies, (low, high) = np.abs(loop.rates.imag), NEAR_RESONANCE
     nearby = loop.rates[(frequencies > low * resonance) & (frequencies < high * resonance)]
     return float(np.max(-1 / nearby.real, initial=0.0))
 
 
-def described(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
+def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
     """What else there is to know: poles, margins, what the sensor's noise does."""
-    loop_margins = margins(loop)
+    margins = loop_margins(loop)
     name, magnitudes = (
         ("max_re_pole", loop.poles.real) if loop.period_s is None else ("max_abs_pole", np.abs(loop.poles))
     )
     return {
         name: float(magnitudes.max(initial=-math.inf)),
-        "crossover_hz": loop_margins.crossover_hz,
-        "phase_margin_deg": loop_margins.phase_margin_deg,
-        "gain_margin": loop_margins.gain_margin,
-        "modulus_margin": 1 / loop_margins.max_sensitivity,
-        "max_sensitivity": loop_margins.max_sensitivity,
+        "crossover_hz": margins.crossover_hz,
+        "phase_margin_deg": margins.phase_margin_deg,
+        "gain_margin": margins.gain_margin,
+        "modulus_margin": 1 / margins.max_sensitivity,
+        "max_sensitivity": margins.max_sensitivity,
         "sensitivity_1hz": float(loop.sensitivity(1.0)[0]),
         **_noise(loop, sensor),
     }
 
 
-def held_up_to(loop: Loop, level: float) -> float:
+def held_frequency_hz(loop: Loop, level: float) -> float:
     """The frequency in Hz below which |S| ≤ `level`: 0 if not even at rest, infinite if everywhere."""
     if abs(1 / (1 + loop.static_gain)) > level:
         return 0.0

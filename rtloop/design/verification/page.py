@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from rtloop.design.verification import text
 from rtloop.design.verification.verify import Verification
-from rtloop.values import rendered
+from rtloop.values import render_page
 
 
 def page(title: str, axes: Sequence[tuple[str, Verification, dict[str, bytes]]]) -> str:
     """The page of all axes: (name, what was found, PNG files by name) each."""
-    return rendered(__package__, title=title, axes=axes, words=text)
+    return render_page(__package__, title=title, axes=axes, words=text)

@@ -6,22 +6,22 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from rtloop.analysis.perturbation import Range
-from rtloop.design.verification.verify import Row, Scenarios, Verification
+from rtloop.analysis.perturbation import PercentRange
+from rtloop.design.verification.verify import Row, ScenarioResults, Verification
 
 
-def as_dict(found: Verification) -> dict[str, Any]:
+def as_dict(verification: Verification) -> dict[str, Any]:
     """Null for what is not defined or has no limit."""
-    robustness = found.robustness
+    robustness = verification.robustness
     return {
-        "meets": found.meets,
+        "meets": verification.meets_specification,
         "stable": {
-            "continuous": None if found.continuous is None else found.continuous.is_stable,
-            "running": found.running.is_stable,
+            "continuous": None if verification.continuous is None else verification.continuous.is_stable,
+            "running": verification.running.is_stable,
         },
-        "delay_ticks": found.delay_ticks,
-        "rate_hz": 1 / found.running.period_s if found.running.period_s else None,
-        "rows": [_row(row) for row in found.rows],
+        "delay_ticks": verification.delay_ticks,
+        "rate_hz": 1 / verification.running.period_s if verification.running.period_s else None,
+        "rows": [_row(row) for row in verification.rows],
         "resonance_shift_percent": {name: _percent(value) for name, value in robustness.shifts.items()},
         "robustness_percent": {
             name: {limit_kind: value and _percent(value) for limit_kind, value in ranges.items()}
@@ -29,20 +29,20 @@ def as_dict(found: Verification) -> dict[str, Any]:
         },
         "delay_margin_us": _number(robustness.delay_us),
         "more_delay_ticks": robustness.delay_ticks,
-        "together": None if found.together is None else found.together.as_dict(),
-        "scenarios": None if found.scenarios is None else _scenarios(found.scenarios),
-        "host_delay": None if found.host is None else asdict(found.host),
-        "simulated": None if found.simulated is None else found.simulated.as_dict(),
-        "warnings": list(found.warnings),
+        "together": None if verification.together is None else verification.together.as_dict(),
+        "scenarios": None if verification.scenarios is None else _scenarios(verification.scenarios),
+        "host_delay": None if verification.host is None else asdict(verification.host),
+        "simulated": None if verification.simulated is None else verification.simulated.as_dict(),
+        "warnings": list(verification.warnings),
     }
 
 
-def _scenarios(found: Scenarios) -> dict[str, Any]:
+def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
     rows = [
-        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": found.met(row, worst)}
-        for row, worst in found.rows
+        {"name": row.name, "worst": _number(worst.value), "plant": worst.plant, "met": scenarios.is_met(row, worst)}
+        for row, worst in scenarios.rows
     ]
-    return {"count": found.count, "rows": rows}
+    return {"count": scenarios.count, "rows": rows}
 
 
 def _row(row: Row) -> dict[str, Any]:
@@ -52,15 +52,15 @@ def _row(row: Row) -> dict[str, Any]:
         "unit": row.unit,
         "required": None if limit is None else {"value": _number(limit.value), "at_most": limit.at_most},
         "continuous": _number(row.continuous),
-        "continuous_met": row.met(row.continuous),
+        "continuous_met": row.is_met(row.continuous),
         "running": _number(row.running),
-        "running_met": row.met(row.running),
+        "running_met": row.is_met(row.running),
         "claim": row.claim or None,
     }
 
 
-def _percent(found: Range) -> list[float | None]:
-    return [None if found.down is None else -found.down, found.up]
+def _percent(tolerated: PercentRange) -> list[float | None]:
+    return [None if tolerated.down is None else -tolerated.down, tolerated.up]
 
 
 def _number(value: float | None) -> float | None:

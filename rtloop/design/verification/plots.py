@@ -20,10 +20,10 @@ from rtloop.errors import MissingExtra
 from rtloop.hil.modal import Real
 from rtloop.linear.transfer import Transfer
 
-PAPER_TIME, RUN_TIME, TEMPLATE = "tab:blue", "tab:red", "0.35"
+CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR = "tab:blue", "tab:red", "0.35"
 
 
-def pictures(found: Verification, asked: SpecificationOptions, title: str) -> dict[str, bytes]:
+def draw_pictures(found: Verification, asked: SpecificationOptions, title: str) -> dict[str, bytes]:
     """PNG files by name: bode, sensitivity, step. Raises MissingExtra without matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -46,42 +46,44 @@ def pictures(found: Verification, asked: SpecificationOptions, title: str) -> di
     return files
 
 
-def _loops(found: Verification) -> list[tuple[str, Loop, str]]:
-    rate = 1 / found.running.period_s if found.running.period_s else math.nan
-    running_label = f"as it runs: {rate:g} Hz, {found.delay_ticks} samples of delay"
-    continuous_rows = [] if found.continuous is None else [("continuous", found.continuous, PAPER_TIME)]
-    return [*continuous_rows, (running_label, found.running, RUN_TIME)]
+def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
+    rate = 1 / verification.running.period_s if verification.running.period_s else math.nan
+    running_label = f"as it runs: {rate:g} Hz, {verification.delay_ticks} samples of delay"
+    continuous_rows = (
+        [] if verification.continuous is None else [("continuous", verification.continuous, CONTINUOUS_COLOR)]
+    )
+    return [*continuous_rows, (running_label, verification.running, RUNNING_COLOR)]
 
 
-def _frequencies(loop: Loop, found: Verification) -> Real:
+def _frequencies(loop: Loop, verification: Verification) -> Real:
     """From 0.01 Hz to ten times the sampling rate, or to just below half of it, where C(z) has its zeros."""
     hz = loop.frequencies
-    period_s = found.running.period_s or 1e-12
+    period_s = verification.running.period_s or 1e-12
     return hz[(hz >= 1e-2) & (hz <= (10 if loop.period_s is None else 0.49) / period_s)]
 
 
-def _bode(panels: Any, found: Verification, _: SpecificationOptions) -> None:
-    for label, loop, color in _loops(found):
-        hz = _frequencies(loop, found)
+def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
+    for label, loop, color in _loops(verification):
+        hz = _frequencies(loop, verification)
         response = loop.open(hz)
         panels[0].loglog(hz, np.abs(response), color=color, label=f"|L| {label}")
         panels[1].semilogx(hz, np.degrees(np.unwrap(np.angle(response))), color=color, label=f"phase of L, {label}")
-    panels[0].axhline(1, color=TEMPLATE, linewidth=0.8)
-    panels[1].axhline(-180, color=TEMPLATE, linewidth=0.8, linestyle=":")
+    panels[0].axhline(1, color=TEMPLATE_COLOR, linewidth=0.8)
+    panels[1].axhline(-180, color=TEMPLATE_COLOR, linewidth=0.8, linestyle=":")
     panels[0].set_ylabel("|L|")
     panels[1].set_ylabel("phase / °")
     panels[1].set_xlabel("frequency / Hz")
 
 
-def _sensitivity(panels: Any, found: Verification, _: SpecificationOptions) -> None:
-    for label, loop, color in _loops(found):
-        hz = _frequencies(loop, found)
+def _sensitivity(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
+    for label, loop, color in _loops(verification):
+        hz = _frequencies(loop, verification)
         panels[0].loglog(hz, loop.sensitivity(hz), color=color, label=f"|S| {label}")
         panels[1].loglog(hz, loop.command_sensitivity(hz), color=color, label=f"|CS| {label}")
-    if found.weights is not None:
-        hz = _frequencies(found.continuous or found.running, found)
-        _template(panels[0], hz, found.weights.tracking, "W1", found.gamma)
-        _template(panels[1], hz, found.weights.command, "W2", found.gamma)
+    if verification.weights is not None:
+        hz = _frequencies(verification.continuous or verification.running, verification)
+        _template(panels[0], hz, verification.weights.tracking, "W1", verification.gamma)
+        _template(panels[1], hz, verification.weights.command, "W2", verification.gamma)
     panels[0].set_ylabel("|S|, error per reference")
     panels[1].set_ylabel("|CS|, command per reference")
     panels[1].set_xlabel("frequency / Hz")
@@ -89,14 +91,14 @@ def _sensitivity(panels: Any, found: Verification, _: SpecificationOptions) -> N
 
 def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | None) -> None:
     inverse = 1 / np.abs(weight.response(2j * np.pi * hz))
-    panel.loglog(hz, inverse, color=TEMPLATE, linestyle="--", label=f"1/{name}, as specified")
+    panel.loglog(hz, inverse, color=TEMPLATE_COLOR, linestyle="--", label=f"1/{name}, as specified")
     if gamma is not None and math.isfinite(gamma):
-        panel.loglog(hz, gamma * inverse, color=TEMPLATE, linestyle=":", label=f"γ/{name}, γ = {gamma:.3g}")
+        panel.loglog(hz, gamma * inverse, color=TEMPLATE_COLOR, linestyle=":", label=f"γ/{name}, γ = {gamma:.3g}")
 
 
-def _step(panels: Any, found: Verification, asked: SpecificationOptions) -> None:
-    duration_s = 4e-3 * (asked.settling_ms or 5.0)
-    for label, loop, color in _loops(found):
+def _step(panels: Any, verification: Verification, specification: SpecificationOptions) -> None:
+    duration_s = 4e-3 * (specification.settling_ms or 5.0)
+    for label, loop, color in _loops(verification):
         if not loop.is_stable:
             panels[0].plot([], [], color=color, label=f"{label}: unstable")
             panels[1].plot([], [], color=color, label=f"{label}: unstable")
@@ -106,11 +108,13 @@ def _step(panels: Any, found: Verification, asked: SpecificationOptions) -> None
         panels[0].plot(1e3 * response.time_s, response.position, label=f"x {label}", color=color)
         panels[1].plot(1e3 * response.time_s, response.command, label=f"v {label}", **style)
     panels[0].axhspan(0.95, 1.05, color="0.9", label="±5 %")
-    if asked.settling_ms is not None:
-        panels[0].axvline(asked.settling_ms, color=TEMPLATE, linestyle="--", label="settled by, as specified")
-    if asked.command is not None:
-        largest_command = asked.command.command_um / asked.command.reference_um
-        panels[1].axhline(largest_command, color=TEMPLATE, linestyle="--", label="largest v, as specified")
+    if specification.settling_ms is not None:
+        panels[0].axvline(
+            specification.settling_ms, color=TEMPLATE_COLOR, linestyle="--", label="settled by, as specified"
+        )
+    if specification.command is not None:
+        largest_command = specification.command.command_um / specification.command.reference_um
+        panels[1].axhline(largest_command, color=TEMPLATE_COLOR, linestyle="--", label="largest v, as specified")
     panels[0].set_ylabel("x per unit step")
     panels[1].set_ylabel("v per unit step")
     panels[1].set_xlabel("time / ms")

@@ -9,26 +9,34 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop
-from rtloop.analysis.margins import delay_tolerated
-from rtloop.analysis.perturbation import Change, Maker, Range, changes, lightest_pair, until_bad, until_unstable
+from rtloop.analysis.margins import delay_margin
+from rtloop.analysis.perturbation import (
+    LoopBuilder,
+    PercentRange,
+    PlantChange,
+    holding_range,
+    least_damped_pole,
+    plant_changes,
+    stability_range,
+)
 from rtloop.design.synthesis.specification import SpecificationOptions
-from rtloop.design.verification.judgement import Limit, specified
+from rtloop.design.verification.judgement import Limit, specified_quantities
 from rtloop.linear.transfer import Transfer
 
 
-def resonance_of(plant: Transfer) -> float | None:
+def resonance_frequency(plant: Transfer) -> float | None:
     """Of the most lightly damped pair of poles, in rad/s; None where there is none."""
-    return abs(lightest_pair(plant)) if np.any(plant.poles.imag > 0) else None
+    return abs(least_damped_pole(plant)) if np.any(plant.poles.imag > 0) else None
 
 
-def shift_tolerated(make: Maker, plant: Transfer) -> float:
+def tolerated_shift(make: LoopBuilder, plant: Transfer) -> float:
     """Percent by which the resonance may move up and down and the loop stays stable; infinite where none was found."""
-    resonance = changes(plant).get("resonance")
-    tolerated = Range(None, None) if resonance is None else until_unstable(make, plant, resonance)
+    resonance = plant_changes(plant).get("resonance")
+    tolerated = PercentRange(None, None) if resonance is None else stability_range(make, plant, resonance)
     return min((end for end in tolerated if end is not None), default=math.inf)
 
 
-class Worst(NamedTuple):
+class WorstValue(NamedTuple):
     """The worst value of a quantity, and the plant that has it."""
 
     value: float
@@ -40,45 +48,45 @@ Plants = Sequence[tuple[str, Transfer, int]]
 LARGER_IS_BETTER = ("bandwidth_hz", "disturbance_hz", "modulus_margin")
 
 
-def worst_of(
+def worst_values(
     make: Callable[[Transfer, int], Loop], plants: Plants, asked: SpecificationOptions, resonance: float | None
-) -> dict[str, Worst]:
+) -> dict[str, WorstValue]:
     """Of every quantity that a specification is about. NaN, where a loop is unstable, is worst of all."""
-    worst = dict[str, Worst]()
+    worst = dict[str, WorstValue]()
     for name, plant, delay_ticks in plants:
-        for quantity, value in specified(make(plant, delay_ticks), asked, resonance).items():
+        for quantity, value in specified_quantities(make(plant, delay_ticks), asked, resonance).items():
             previous = worst.get(quantity)
             if previous is None or _is_worse(value, previous.value, quantity in LARGER_IS_BETTER):
-                worst[quantity] = Worst(value, name)
+                worst[quantity] = WorstValue(value, name)
     return worst
 
 
-def _is_worse(value: float, than: float, larger_is_better: bool) -> bool:
-    if math.isnan(value) or math.isnan(than):
-        return math.isnan(value) and not math.isnan(than)
-    return value < than if larger_is_better else value > than
+def _is_worse(value: float, reference_value: float, larger_is_better: bool) -> bool:
+    if math.isnan(value) or math.isnan(reference_value):
+        return math.isnan(value) and not math.isnan(reference_value)
+    return value < reference_value if larger_is_better else value > reference_value
 
 
-def until_missed(
-    make: Maker, plant: Transfer, change: Change, asked: SpecificationOptions, required: dict[str, Limit]
-) -> Range:
+def range_until_missed(
+    make: LoopBuilder, plant: Transfer, change: PlantChange, asked: SpecificationOptions, required: dict[str, Limit]
+) -> PercentRange:
     """The range over which every limit of `required` is met; (0, 0) if one is not as it stands."""
-    resonance = resonance_of(plant)
+    resonance = resonance_frequency(plant)
 
     def met(moved: Transfer) -> bool:
         loop = make(moved)
-        values = specified(loop, asked, resonance) if loop.is_stable else {}
-        return bool(values) and all(limit.met(values[name]) for name, limit in required.items())
+        values = specified_quantities(loop, asked, resonance) if loop.is_stable else {}
+        return bool(values) and all(limit.is_met_by(values[name]) for name, limit in required.items())
 
-    return until_bad(met, plant, change, coarse=4.0, tolerance=0.01)
+    return holding_range(met, plant, change, coarse=4.0, tolerance=0.01)
 
 
 def delay_margin_us(loop: Loop) -> float:
     """The delay that brings a crossover to −1, the least over all of them; infinite without a crossover."""
-    return 1e6 * delay_tolerated(loop)[0] if loop.is_stable else 0.0
+    return 1e6 * delay_margin(loop)[0] if loop.is_stable else 0.0
 
 
-def delay_ticks_tolerated(delayed: Callable[[int], Loop], most: int = 64) -> int:
+def tolerated_delay_ticks(delayed: Callable[[int], Loop], most: int = 64) -> int:
     """The largest number of samples of delay with which, and with all fewer ones, the loop is stable; −1 if none."""
     for ticks in range(most + 1):
         if not delayed(ticks).is_stable:

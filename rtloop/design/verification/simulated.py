@@ -14,33 +14,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.held_plant import POINTS, held_plant
+from rtloop.analysis.held_plant import POINTS, hold_plant
 from rtloop.configuration.axis import AxisOptions
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.judgement import Limit, limits
+from rtloop.design.verification.judgement import Limit, required_limits
 from rtloop.hil.modal import Real
 from rtloop.hil.options import RigOptions
 from rtloop.hil.rig import zeros_poles_gain
 from rtloop.hysteresis.plays import loading_curve
 from rtloop.linear.transfer import Transfer
-from rtloop.recording.views.steps import every_step
+from rtloop.recording.views.steps import measure_steps
 from rtloop.signals import Flag, trip_causes
 
 SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
 """Of a level: so many of the slowest mode."""
-REST_S, SETTLES_S = 2.0, 0.5
+REST_S, SETTLING_S = 2.0, 0.5
 """How long the rest is looked at, and what passes before."""
-RESTS = (0.03, 0.12, 0.24, 0.48)
+REST_PLACES = (0.03, 0.12, 0.24, 0.48)
 """Where, as parts of the range."""
-CYCLES, DRAWS, MORE_DRAWS, KEPT = 12, 2, 8, 0.95
+CYCLES, DRAWS, MORE_DRAWS, STEP_QUANTILE = 12, 2, 8, 0.95
 """How often four steps are made in one run; in how many runs, each with noise of its own, and in how many where noise
 decides what a step is like; and the part of all steps that keeps what is said of them."""
-SPREAD, SPREAD_PERCENT = 0.1, 0.5
+LARGEST_SPREAD, SPREAD_PERCENT = 0.1, 0.5
 """Part of a settling time, and points of a percentage, from which on noise decides."""
-JUDGED = ("overshoot_percent", "settling_ms", "static_error_percent")
-"""Quantities of a step that a specification is about, as `every_step` gives them."""
-LIMITED = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
+JUDGED_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
+"""Quantities of a step that a specification is about, as `measure_steps` gives them."""
+LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
 
 
 class SimulatedStep(NamedTuple):
@@ -59,14 +59,14 @@ class SimulatedStep(NamedTuple):
     limited: tuple[str, ...]
     trips: tuple[str, ...]
 
-    def alike(self, name: str) -> bool:
+    def is_repeatable(self, name: str) -> bool:
         """Whether one step is like another in `name`, of JUDGED."""
-        quantile, median = getattr(self, name), self.typical[JUDGED.index(name)]
-        return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else SPREAD * quantile)
+        quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
+        return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
 
 
 @dataclass(frozen=True)
-class Simulated:
+class SimulationResult:
     """What came of it: steps, heights that the range does not allow, rms at rest; `truth` is what was simulated."""
 
     truth: str
@@ -80,7 +80,7 @@ class Simulated:
 
     def met(self, step: SimulatedStep, name: str) -> bool | None:
         """Whether a step keeps what is required of `name`; None where nothing is."""
-        return self.required[name].met(getattr(step, name)) if name in self.required else None
+        return self.required[name].is_met_by(getattr(step, name)) if name in self.required else None
 
     @property
     def missed(self) -> list[str]:
@@ -90,14 +90,17 @@ class Simulated:
         return [
             f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
             for step in self.steps
-            for name in JUDGED
+            for name in JUDGED_QUANTITIES
             if self.met(step, name) is False
         ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         steps = [
-            {**step._asdict(), "met": {name: self.met(step, name) for name in JUDGED if name in self.required}}
+            {
+                **step._asdict(),
+                "met": {name: self.met(step, name) for name in JUDGED_QUANTITIES if name in self.required},
+            }
             for step in self.steps
         ]
         return {
@@ -110,39 +113,41 @@ class Simulated:
         }
 
 
-def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> Simulated:
+def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
     """Steps of an axis whose linear loop has `slowest_s` as its slowest time constant."""
     heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
-    reach_um, to_both = _reach(axis)
+    reach_um, to_both = _largest_command(axis)
     allowed_heights = sorted(height for height in set(heights_um) if height <= reach_um)
     simulated_steps = []
     for height in allowed_heights:
         levels = (height, 0.0, -height, 0.0) if to_both else (height, 0.0, height, 0.0)
-        steps = [_run(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS)]
-        step = _summary(height, steps)
-        if not all(step.alike(name) for name in JUDGED):
-            steps += [_run(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
-            step = _summary(height, steps)
+        steps = [_run_steps(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS)]
+        step = _summarise_steps(height, steps)
+        if not all(step.is_repeatable(name) for name in JUDGED_QUANTITIES):
+            steps += [_run_steps(bench, axis.name, CYCLES * levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
+            step = _summarise_steps(height, steps)
         simulated_steps.append(step)
     truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
     omitted = tuple(sorted(set(heights_um) - set(allowed_heights)))
-    noise_x_nm, noise_v_nm = _at_rest(bench, axis.name, reach_um)
-    required = limits(design.specification)
-    return Simulated(truth, tuple(simulated_steps), omitted, reach_um, noise_x_nm, noise_v_nm, required, is_judged)
+    noise_x_nm, noise_v_nm = _rest_noise_nm(bench, axis.name, reach_um)
+    required = required_limits(design.specification)
+    return SimulationResult(
+        truth, tuple(simulated_steps), omitted, reach_um, noise_x_nm, noise_v_nm, required, is_judged
+    )
 
 
-def _at_rest(bench: Bench, axis: str, reach_um: float) -> list[float]:
+def _rest_noise_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
     """Position and command in nm rms, about their means, at some places: a loop hunts where a dead band lets it."""
     squares = []
-    for place in RESTS:
-        record = bench.run(axis, (place * reach_um,), SETTLES_S + REST_S)
-        settled = slice(round(SETTLES_S * bench.rate_hz), None)
+    for place in REST_PLACES:
+        record = bench.run(axis, (place * reach_um,), SETTLING_S + REST_S)
+        settled = slice(round(SETTLING_S * bench.rate_hz), None)
         squares.append([record[f"{axis}_{name}"][settled].var() for name in ("true_position_um", "command_um")])
     return [float(1e3 * np.sqrt(mean)) for mean in np.mean(squares, axis=0)]
 
 
-def _reach(axis: AxisOptions) -> tuple[float, bool]:
+def _largest_command(axis: AxisOptions) -> tuple[float, bool]:
     """How far a command may go at rest, and whether to both sides."""
     limits, actuator = axis.limits, axis.feedforward.actuator()
     to_both = limits.lowest_v < 0
@@ -150,26 +155,28 @@ def _reach(axis: AxisOptions) -> tuple[float, bool]:
     return min(limits.command_um, abs(float(loading_curve(actuator, drive_v)))), to_both
 
 
-class _Run(NamedTuple):
+class _StepRun(NamedTuple):
     steps: Real
     peak_drive_v: float
     flags: int
 
 
-def _run(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _Run:
-    """What came of each step, (steps, 3) as `every_step` has it, and of all."""
+def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _StepRun:
+    """What came of each step, (steps, 3) as `measure_steps` has it, and of all."""
     record = bench.run(axis, (0.0, *levels_um), dwell_s, draw)
     reference = np.repeat(record[f"{axis}_reference_um"], POINTS)
-    steps = every_step(reference, between_ticks(bench.rig, record, axis, bench.rate_hz), POINTS * bench.rate_hz)
+    steps = measure_steps(
+        reference, intersample_positions(bench.rig, record, axis, bench.rate_hz), POINTS * bench.rate_hz
+    )
     assert steps is not None
     flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
-    return _Run(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
+    return _StepRun(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
 
 
-def _summary(height_um: float, runs: Sequence[_Run]) -> SimulatedStep:
+def _summarise_steps(height_um: float, runs: Sequence[_StepRun]) -> SimulatedStep:
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
-    overshoot_percent, settling_ms, static_error_percent = kept_by_most(steps)
+    overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)
     return SimulatedStep(
         height_um,
         overshoot_percent,
@@ -177,35 +184,37 @@ def _summary(height_um: float, runs: Sequence[_Run]) -> SimulatedStep:
         static_error_percent,
         tuple(np.median(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist()),
         max(run.peak_drive_v for run in runs),
-        tuple(name for flag, name in LIMITED.items() if all_flags & flag),
+        tuple(name for flag, name in LIMIT_FLAGS.items() if all_flags & flag),
         tuple(trip_causes(all_flags)),
     )
 
 
-def kept_by_most(steps: Real) -> tuple[float, float, float]:
-    """Overshoot %, settling time ms, static error % that the part KEPT of `steps` (n, 3) of `every_step` keep.
+def step_quantiles(steps: Real) -> tuple[float, float, float]:
+    """Overshoot %, settling time ms, static error % that the part KEPT of `steps` (n, 3) of `measure_steps` keep.
 
     A step that did not reach its reference keeps no overshoot and no settling time: infinite where there are too many.
     """
     ranked = np.where(np.isnan(steps), np.inf, steps)
     method = "linear" if np.all(np.isfinite(ranked)) else "higher"
-    overshoot_percent, settling_ms, static_error_percent = np.quantile(ranked, KEPT, axis=0, method=method).tolist()
+    overshoot_percent, settling_ms, static_error_percent = np.quantile(
+        ranked, STEP_QUANTILE, axis=0, method=method
+    ).tolist()
     return overshoot_percent, settling_ms, static_error_percent
 
 
-def between_ticks(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: float) -> Real:
+def intersample_positions(rig: RigOptions, run: Mapping[str, Real], axis: str, rate_hz: float) -> Real:
     """True positions at `POINTS` of each period, (POINTS·ticks,).
 
     What hysteresis, creep and coupled axes do is held and goes through D(s); what else moves the position, such as a
     disturbance, or memory from before the run, is taken to be straight between ticks.
     """
     dynamics = rig.plants.get(axis, rig.plant).dynamics
-    sampled_plant = held_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)
+    sampled_plant = hold_plant(Transfer(*zeros_poles_gain(dynamics)), 1 / rate_hz)
     actuator_um = run[f"{axis}_hysteresis_um"].copy()
     for other_axis, share in rig.coupling.get(axis, {}).items():
         actuator_um += share * run[f"{other_axis}_hysteresis_um"]
     inputs = np.append(actuator_um[1:], actuator_um[-1])  # a record has what the period before it did
-    positions = sampled_plant.between.rows @ sampled_plant.system.driven(inputs).T + np.outer(
+    positions = sampled_plant.between.rows @ sampled_plant.system.simulate_states(inputs).T + np.outer(
         sampled_plant.between.direct, inputs
     )
     remainder = run[f"{axis}_true_position_um"] - positions[0]

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.analysis.margins import margins
-from rtloop.analysis.measured.excitation import first, fitting
-from rtloop.analysis.measured.margins import Uncertain
-from rtloop.analysis.measured.measurement import SIGNALS, measurement
-from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid
+from rtloop.analysis.margins import loop_margins
+from rtloop.analysis.measured.excitation import first_period, fit_period
+from rtloop.analysis.measured.margins import UncertainValue
+from rtloop.analysis.measured.measurement import SIGNALS, measure_loop
+from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.measured import UnsuitableData
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
@@ -63,16 +63,16 @@ def _period(options: ResponseOptions, setting: Setting) -> Real:
     model = setting.model
     moved = None if model is None else model.tracking(lines.hz)
     if model is None or moved is None:
-        wave = first(lines, options.amplitude_um)
+        wave = first_period(lines, options.amplitude_um)
     else:
-        wave = fitting(lines, moved, moved / model.plant(lines.hz), options.amplitude_um)
+        wave = fit_period(lines, moved, moved / model.plant(lines.hz), options.amplitude_um)
     return np.round(np.roll(wave, -int(np.argmin(np.abs(wave)))), DIGITS)
 
 
-def _grid(options: ResponseOptions, setting: Setting) -> Grid:
+def _grid(options: ResponseOptions, setting: Setting) -> LineGrid:
     to_hz = options.to_hz or HIGHEST_PART * setting.rate_hz
     near_hz = setting.model and setting.model.resonance_hz
-    return grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
+    return make_grid(setting.rate_hz, options.period_s, options.from_hz, to_hz, near_hz)
 
 
 def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
@@ -81,10 +81,10 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     near_hz, loop = (taken.model.resonance_hz, taken.model.loop) if taken.model else (None, None)
     signals: dict[str, Real] = dict(zip(SIGNALS, taken.read(*SIGNALS), strict=True))
     taps = taken.axis_options.prefilter.command_taps
-    found = measurement(signals, taken.rate_hz, near_hz, loop, taps)
+    found = measure_loop(signals, taken.rate_hz, near_hz, loop, taps)
     if (moved_um := found.response.moved_um) > options.amplitude_um:
         raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")
-    promised = margins(loop)._asdict() if loop else {}
+    promised = loop_margins(loop)._asdict() if loop else {}
     rows = [
         _row(taken, name, label, unit, getattr(found.margins, name), promised.get(name)) for name, label, unit in ROWS
     ]
@@ -95,7 +95,7 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
                 "resonance_hz",
                 "resonance",
                 "Hz",
-                Uncertain(found.mode.hz, found.mode.hz_std),
+                UncertainValue(found.mode.hz, found.mode.hz_std),
                 near_hz,
                 NEAR_MODE,
             )
@@ -116,7 +116,7 @@ def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
 
 
 def _row(
-    taken: Taken, name: str, label: str, unit: str, found: Uncertain, model: float | None, part: float = NEAR
+    taken: Taken, name: str, label: str, unit: str, found: UncertainValue, model: float | None, part: float = NEAR
 ) -> Row:
     near = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), part * abs(model or 0.0))
     return taken.row(name, label, unit, found.value, model, near)

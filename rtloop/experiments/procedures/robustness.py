@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from rtloop.design.verification.text import span
+from rtloop.design.verification.text import format_range
 from rtloop.experiments.procedure import Experiment, Run, hold
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.taken import Taken
@@ -85,7 +85,7 @@ def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis
     for which, run, said in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
         near = to_next(run, options.shifts_percent, down=which == "lowest")
         rows.append(ordered[0].row("", f"{which} tested shift that settles", "%", run, said, near))
-    by_it = f": by it {span(tolerated)} are tolerated" if tolerated else ""
+    by_it = f": by it {format_range(tolerated)} are tolerated" if tolerated else ""
     notes = ["The model's are those of the tested shifts with which the loop of [axis.controller] and [axis.model] is "
              f"stable as it runs{by_it}. The tolerance is the distance to the next shift that was tried.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rtloop.analysis.learning import GROWN, Learning, learning, periods, rms, untaught
-from rtloop.analysis.perturbation import around
+from rtloop.analysis.learning import (
+    MAX_ERROR_GROWTH,
+    LearningGains,
+    cycle_periods,
+    learning_gains,
+    rms,
+    unlearned_table,
+)
+from rtloop.analysis.perturbation import plants_around
 from rtloop.errors import ConfigError
 from rtloop.experiments.procedure import Experiment, Run, Unsuited, hold
 from rtloop.experiments.setting import Setting
@@ -45,7 +52,7 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
     lengths = [_period(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
         _learning(setting, options, ticks)
-    return [_run(0, options, setting, [untaught(triangle(ticks, options.amplitude_um)) for ticks in lengths])]
+    return [_run(0, options, setting, [unlearned_table(triangle(ticks, options.amplitude_um)) for ticks in lengths])]
 
 
 def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> Run | None:
@@ -58,8 +65,8 @@ def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> R
         sizes = [rms(error) for error in errors]
         best = int(np.argmin(sizes))
         table = _table(takings[best], number)
-        if sizes[-1] <= GROWN * sizes[best]:
-            table = _learning(setting, options, len(table)).improved(_table(takings[-1], number), errors[-1])
+        if sizes[-1] <= MAX_ERROR_GROWTH * sizes[best]:
+            table = _learning(setting, options, len(table)).improve(_table(takings[-1], number), errors[-1])
         tables.append(table)
     return _run(len(takings), options, setting, tables)
 
@@ -69,7 +76,7 @@ def _run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Re
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
-        settle, measured = periods(len(table), setting.rate_hz)
+        settle, measured = cycle_periods(len(table), setting.rate_hz)
         kept[name] = table
         timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, (settle + measured) * period_s,
                      frequency_hz=hz, period_ticks=len(table), periods=measured)  # fmt: skip
@@ -84,16 +91,16 @@ def _period(hz: float, rate_hz: float) -> int:
     return ticks
 
 
-def _learning(setting: Setting, options: ScanOptions, period_ticks: int) -> Learning:
+def _learning(setting: Setting, options: ScanOptions, period_ticks: int) -> LearningGains:
     """How the table of one period learns. Raises Unsuited where it would not, and where no model says how."""
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise Unsuited(
             f"axis.{setting.axis.name}.model: missing, or unstable in its loop; a scan is learned by a model"
         )
-    loops = [(name, model.loop_with(plant)) for name, plant in around(model.dynamics, percent)]
+    loops = [(name, model.loop_with(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:
-        return learning([(name, loop) for name, loop in loops if loop is not None], period_ticks)
+        return learning_gains([(name, loop) for name, loop in loops if loop is not None], period_ticks)
     except ValueError as error:
         raise Unsuited(f"axis.{setting.axis.name}.controller: {error}") from None
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_user_file
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.units import is_unit
 
@@ -28,7 +28,7 @@ INFINITE = ("inf", "-inf", "+inf", "infinity", "-infinity")
 _POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?")
-_MANNERS = (
+_NOTATIONS = (
     (";", "."),
     ("\t", "."),
     (",", "."),
@@ -40,13 +40,13 @@ _MANNERS = (
     (None, ","),
 )
 """Delimiter (None: blanks) and decimal sign; of those that fit equally the first is taken."""
-_UNIT_BEHIND = re.compile(r"(?<=\d)\s+(s|sec|ms|min|hr|V|mV|nm|µm|um|mm)$")
+_TRAILING_UNIT = re.compile(r"(?<=\d)\s+(s|sec|ms|min|hr|V|mV|nm|µm|um|mm)$")
 """As MATLAB's timetables write durations: 0.001 sec."""
-_MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
+_BYTE_ORDER_MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 _COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 
 
-class Dialect(NamedTuple):
+class CsvDialect(NamedTuple):
     """`delimiter` is None for blanks; `first`, from 0, is the line of the first numbers, `numbers` their columns."""
 
     encoding: str
@@ -60,29 +60,29 @@ class Dialect(NamedTuple):
     has_header: bool
 
 
-def dialect_of(path: Path) -> Dialect:
+def detect_dialect(path: Path) -> CsvDialect:
     """How the lines of a file are written. Raises UnreadableData where there are no rows of numbers."""
-    encoding, head, later_lines = _sample(path)
+    encoding, head, later_lines = _read_sample(path)
     lines = [*head, *later_lines]
     lines = lines[:: -(-len(lines) // SAMPLE_LINES)]
-    scores = [(_fit(lines, *notation), -place) for place, notation in enumerate(_MANNERS)]
+    scores = [(_score(lines, *notation), -place) for place, notation in enumerate(_NOTATIONS)]
     (score, place) = max(scores)
-    delimiter, decimal = _MANNERS[-place]
-    rows = [split(line, delimiter) for line in lines]
+    delimiter, decimal = _NOTATIONS[-place]
+    rows = [split_fields(line, delimiter) for line in lines]
     width = _width(rows)
     numbers = _number_columns([row for row in rows if len(row) == width], decimal)
     if score == 0 or not numbers:
         raise UnreadableData(f"{path}: holds no table: no rows of numbers, in columns divided by , ; tabs or blanks")
-    first = _first_row((split(line, delimiter) for line in head), width, numbers, decimal)
+    first = _first_row((split_fields(line, delimiter) for line in head), width, numbers, decimal)
     if first is None:
         raise UnreadableData(f"{path}: no row of numbers in its first {SAMPLE_BYTES >> 10} KiB")
     names, units, has_header = _header(head[:first], delimiter, width)
-    unit_matches = [_UNIT_BEHIND.search(field) for field in split(head[first], delimiter)]
+    unit_matches = [_TRAILING_UNIT.search(field) for field in split_fields(head[first], delimiter)]
     units = tuple(match[1] if match else unit for match, unit in zip(unit_matches, units, strict=True))
-    return Dialect(encoding, delimiter, decimal, first, names, units, numbers, _dates(rows, width), has_header)
+    return CsvDialect(encoding, delimiter, decimal, first, names, units, numbers, _dates(rows, width), has_header)
 
 
-def split(line: str, delimiter: str | None) -> list[str]:
+def split_fields(line: str, delimiter: str | None) -> list[str]:
     """The fields of a line, without blanks and quotes around them."""
     if delimiter is None:
         return line.split()
@@ -94,25 +94,27 @@ def split(line: str, delimiter: str | None) -> list[str]:
 
 def is_number(field: str, decimal: str) -> bool:
     """Whether a field is a number, alone or in front of a unit, or says that there is none."""
-    field = _UNIT_BEHIND.sub("", field)
+    field = _TRAILING_UNIT.sub("", field)
     return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
 
 
-def number_alone(text: Any) -> Any:
+def strip_units(text: Any) -> Any:
     """A column of fields (a pandas series of text) without the units behind their numbers."""
-    return text.str.replace(_UNIT_BEHIND, "", regex=True)
+    return text.str.replace(_TRAILING_UNIT, "", regex=True)
 
 
-def _sample(path: Path) -> tuple[str, list[str], list[str]]:
+def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
     """Encoding, the first lines, and some from the middle and the end. Raises UnreadableData."""
     size = path.stat().st_size
-    with os.fdopen(open_named(path), "rb") as file:
+    with os.fdopen(open_user_file(path), "rb") as file:
         blocks = [file.read(SAMPLE_BYTES)]
         for place in (size // 2, size - SAMPLE_BYTES):
             if place > SAMPLE_BYTES:
                 file.seek(place // 4 * 4)
                 blocks.append(file.read(SAMPLE_BYTES))
-    encoding = next((name for mark, name in _MARKS if blocks[0].startswith(mark)), None) or _encoding(blocks[0])
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if blocks[0].startswith(mark)), None) or _encoding(
+        blocks[0]
+    )
     plain = "utf-16-le" if blocks[0].startswith(b"\xff\xfe") else "utf-16-be" if encoding == "utf-16" else encoding
     texts = [block.decode(encoding if k == 0 else plain, "replace") for k, block in enumerate(blocks)]
     if any("\0" in text for text in texts):
@@ -134,9 +136,9 @@ def _encoding(block: bytes) -> str:
     return "utf-8"
 
 
-def _fit(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
+def _score(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
     """Numbers among the fields of the usual lines, times the part of all lines that such lines are."""
-    rows = [split(line, delimiter) for line in lines if line.strip()]
+    rows = [split_fields(line, delimiter) for line in lines if line.strip()]
     width = _width(rows)
     regular_rows = [row for row in rows if len(row) == width]
     numbers = sum(bool(field) and is_number(field, decimal) for row in regular_rows for field in row)
@@ -178,7 +180,7 @@ def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int]
 
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Names and units by the lines above the numbers, and whether there are names."""
-    header_rows = [split(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
+    header_rows = [split_fields(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
     candidates = [
         [*row, *[""] * (width - len(row))] for row in header_rows if width - 1 <= len(row) <= width and any(row)
     ]

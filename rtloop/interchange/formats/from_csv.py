@@ -13,31 +13,31 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.hil.trusted import open_named
-from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, Dialect, dialect_of, number_alone
-from rtloop.interchange.formats.groups import BYTES_AT_MOST, COLUMNS_AT_MOST, unique
-from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
-from rtloop.values import counted
+from rtloop.hil.trusted import open_user_file
+from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, CsvDialect, detect_dialect, strip_units
+from rtloop.interchange.formats.groups import MAX_BYTES, MAX_COLUMNS, unique_name
+from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
+from rtloop.values import count_text
 
 ROWS_AT_ONCE = 1 << 16
-SIGNS = {None: "blanks", "\t": "tabs"}
+DELIMITER_NAMES = {None: "blanks", "\t": "tabs"}
 
 
 def read_csv(path: Path) -> Table:
     """The columns of numbers; those of text alone are left out. Raises UnreadableData, MissingExtra."""
-    dialect = dialect_of(path)
-    if len(dialect.names) > COLUMNS_AT_MOST:
-        raise UnreadableData(f"{path}: more than {COLUMNS_AT_MOST} columns")
-    blocks = _numbers(path, dialect)
+    dialect = detect_dialect(path)
+    if len(dialect.names) > MAX_COLUMNS:
+        raise UnreadableData(f"{path}: more than {MAX_COLUMNS} columns")
+    blocks = _read_numbers(path, dialect)
     names: list[str] = []
     used_columns = (*dialect.dates, *dialect.numbers)
     for column in used_columns:
-        names.append(unique(dialect.names[column], names))
+        names.append(unique_name(dialect.names[column], names))
     columns = {name: np.concatenate([block[k] for block in blocks]) for k, name in enumerate(names)}
     units = {name: dialect.units[column] for name, column in zip(names, used_columns, strict=True)}
     for name in names[: len(dialect.dates)]:
         columns[name], units[name] = (columns[name] - columns[name][:1]) * 1e-9, "s"
-    delimiter_name = SIGNS.get(dialect.delimiter, repr(dialect.delimiter))
+    delimiter_name = DELIMITER_NAMES.get(dialect.delimiter, repr(dialect.delimiter))
     about = {
         "table": f"columns divided by {delimiter_name}, decimal {dialect.decimal!r}, "
         f"{dialect.encoding.removesuffix('-sig')}, numbers from line {dialect.first + 1} on"
@@ -51,12 +51,12 @@ def read_csv(path: Path) -> Table:
     )
 
 
-class _Lines(io.TextIOBase):
+class _NumberLines(io.TextIOBase):
     """A text from its first numbers on. Raises UnreadableData at what is no text."""
 
-    def __init__(self, path: Path, dialect: Dialect) -> None:
-        self._path, self._since = path, 0
-        self._file = os.fdopen(open_named(path), encoding=dialect.encoding, errors="replace", newline=None)
+    def __init__(self, path: Path, dialect: CsvDialect) -> None:
+        self._path, self._line_length = path, 0
+        self._file = os.fdopen(open_user_file(path), encoding=dialect.encoding, errors="replace", newline=None)
         for _ in range(dialect.first):
             self._file.readline()
 
@@ -67,8 +67,8 @@ class _Lines(io.TextIOBase):
     def read(self, size: int | None = -1) -> str:
         """As much as is asked for."""
         text = self._file.read(size)
-        self._since = len(text) - text.rfind("\n") - 1 if "\n" in text else self._since + len(text)
-        if "\0" in text or self._since > LONGEST_LINE:
+        self._line_length = len(text) - text.rfind("\n") - 1 if "\n" in text else self._line_length + len(text)
+        if "\0" in text or self._line_length > LONGEST_LINE:
             fault = "zeros, which are no text" if "\0" in text else f"a line longer than {LONGEST_LINE >> 20} MiB"
             raise UnreadableData(f"{self._path}: damaged: holds {fault}")
         return text
@@ -81,7 +81,7 @@ class _Lines(io.TextIOBase):
         self._file.close()
 
 
-def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
+def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, Any]]]:
     """Blocks of rows, each a list of columns. Raises UnreadableData, which says where something is no number."""
     try:
         import pandas
@@ -89,8 +89,8 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
         raise MissingExtra("CSV needs pandas: pip install 'rtloop[data]'") from None
     blocks: list[list[np.ndarray[Any, Any]]] = []
     without_last: list[np.ndarray[Any, Any]] = []
-    rows, max_rows = 0, min(ROWS_AT_MOST, BYTES_AT_MOST // (8 * len(dialect.numbers)))
-    lines = _Lines(path, dialect)
+    rows, max_rows = 0, min(MAX_ROWS, MAX_BYTES // (8 * len(dialect.numbers)))
+    lines = _NumberLines(path, dialect)
     try:
         with pandas.read_csv(
             lines,
@@ -108,28 +108,28 @@ def _numbers(path: Path, dialect: Dialect) -> list[list[np.ndarray[Any, Any]]]:
                 lacks_last = block.iloc[:, -1].isna().to_numpy()
                 # where all rows lack it, the column is empty, or all are as short as the first one
                 without_last.append(rows + np.flatnonzero(lacks_last)[: 1 if lacks_last.all() else None])
-                blocks.append([*dates, *(_column(path, dialect, block[column]) for column in dialect.numbers)])
+                blocks.append([*dates, *(_column_numbers(path, dialect, block[column]) for column in dialect.numbers)])
                 rows += len(block)
                 if rows > max_rows:
                     raise UnreadableData(f"{path}: more than {max_rows} rows; cut it, or write fewer columns")
     except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeError) as fault:
-        raise UnreadableData(f"{path}: {_where(str(fault), dialect)}") from None
+        raise UnreadableData(f"{path}: {_parser_message(str(fault), dialect)}") from None
     finally:
         lines.close()
-    _require_whole_rows(path, dialect, np.concatenate(without_last))
+    _require_even_rows(path, dialect, np.concatenate(without_last))
     return blocks
 
 
-def _require_whole_rows(path: Path, dialect: Dialect, without_last: np.ndarray[Any, Any]) -> None:
+def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray[Any, Any]) -> None:
     """Raise UnreadableData at one of these rows with fewer columns than the others, unless it is the last of the file.
 
     `without_last` (rows,) are rows without a number in their last column; the last row of a file may be cut off.
     """
     checked_count, short_row = 0, None
-    with contextlib.closing(_Lines(path, dialect)) as lines:
+    with contextlib.closing(_NumberLines(path, dialect)) as lines:
         for row, line in enumerate(lines):
             if short_row is not None:
-                raise UnreadableData(f"{path}: {_uneven(*short_row, dialect)}")
+                raise UnreadableData(f"{path}: {_uneven_row_message(*short_row, dialect)}")
             if checked_count == without_last.size:
                 return
             if row == without_last[checked_count]:
@@ -139,19 +139,18 @@ def _require_whole_rows(path: Path, dialect: Dialect, without_last: np.ndarray[A
                 short_row = (dialect.first + row + 1, len(fields)) if 0 < len(fields) < len(dialect.names) else None
 
 
-def _uneven(line: int, columns: int, dialect: Dialect) -> str:
-    return (
-        f"line {line} has {counted(columns, 'column')}; each line must have {len(dialect.names)}, as the first one has"
-    )
+def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
+    allowed = f"each line must have {len(dialect.names)}, as the first one has"
+    return f"line {line} has {count_text(columns, 'column')}; {allowed}"
 
 
-def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
+def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
     """A column's numbers. Raises UnreadableData at the first text."""
     import pandas
 
     if values.dtype.kind in "fiub":
         return values.to_numpy(np.float64)
-    text = number_alone(values.astype(str).str.strip())
+    text = strip_units(values.astype(str).str.strip())
     if dialect.decimal == ",":
         text = text.str.replace(",", ".")
     numbers = np.asarray(pandas.to_numeric(text, errors="coerce"), np.float64)
@@ -165,7 +164,7 @@ def _column(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
     return numbers
 
 
-def _dates_ns(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]:
+def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
     """Dates as ns since 1970, int64. Raises UnreadableData at the first that is none."""
     import pandas
 
@@ -178,9 +177,9 @@ def _dates_ns(path: Path, dialect: Dialect, values: Any) -> np.ndarray[Any, Any]
     return dates.dt.tz_localize(None).to_numpy("datetime64[ns]").astype(np.int64)
 
 
-def _where(fault: str, dialect: Dialect) -> str:
+def _parser_message(fault: str, dialect: CsvDialect) -> str:
     """pandas counts lines from the first numbers on."""
     words = fault.removeprefix("Error tokenizing data. C error: ").strip()
     if match := re.fullmatch(r"Expected (\d+) fields in line (\d+), saw (\d+)", words):
-        return _uneven(int(match[2]) + dialect.first, int(match[3]), dialect)
+        return _uneven_row_message(int(match[2]) + dialect.first, int(match[3]), dialect)
     return "damaged: " + re.sub(r"line (\d+)", lambda match: f"line {int(match[1]) + dialect.first}", words)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rtloop.interchange.formats.groups import Found, one_of
-from rtloop.interchange.formats.hdf5 import collect
+from rtloop.interchange.formats.groups import FileColumns, select_table
+from rtloop.interchange.formats.hdf5 import collect_datasets
 from rtloop.interchange.formats.table import Table
 
 
 def read_hdf5(path: Path, group: str | None = None) -> Table:
     """What was sampled together: `group`, else the only or the longest. Raises UnreadableData, MissingExtra."""
-    columns = Found(path)
-    collect(columns)
-    return one_of(path, columns.tables(), group, columns.in_other_files)
+    columns = FileColumns(path)
+    collect_datasets(columns)
+    return select_table(path, columns.grouped_tables(), group, columns.in_other_files)

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.trusted import open_named
-from rtloop.interchange.formats.groups import BYTES_AT_MOST, Found, one_of, unique
+from rtloop.hil.trusted import open_user_file
+from rtloop.interchange.formats.groups import MAX_BYTES, FileColumns, select_table, unique_name
 from rtloop.interchange.formats.hdf5 import matlab_variables
 from rtloop.interchange.formats.table import Table, UnreadableData
 
@@ -24,50 +24,50 @@ HEADER_BYTES = 128
 MATRIX, COMPRESSED = 14, 15
 """Types of the elements of a file (MathWorks, MAT-File Format, table 1-1)."""
 BLOCK = 1 << 16
-DEEPEST = 32
-HDF5_AT = 512
+MAX_DEPTH = 32
+HDF5_OFFSET = 512
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-VALUES = ("data", "values")
+VALUE_KEYS = ("data", "values")
 
 
 def read_mat(path: Path, group: str | None = None) -> Table:
     """The signals of one raster or structure: `group`, else the only or the longest one. Raises UnreadableData."""
-    with os.fdopen(open_named(path), "rb") as file:
-        head = file.read(HDF5_AT + len(HDF5_MAGIC))
-    columns = Found(path)
-    variables = matlab_variables(columns) if head[HDF5_AT:] == HDF5_MAGIC else _variables(path, head)
+    with os.fdopen(open_user_file(path), "rb") as file:
+        head = file.read(HDF5_OFFSET + len(HDF5_MAGIC))
+    columns = FileColumns(path)
+    variables = matlab_variables(columns) if head[HDF5_OFFSET:] == HDF5_MAGIC else _load_variables(path, head)
     tables: dict[str, Table] = {}
     for name, value in variables.items():
         if _is_controldesk(value):
-            for raster, table in _rasters(path, value).items():
-                tables[unique(raster or name, tables)] = table
+            for raster, table in _controldesk_tables(path, value).items():
+                tables[unique_name(raster or name, tables)] = table
         else:
-            _walk(columns, name, value, 0)
-    return one_of(path, tables | columns.tables(), group, columns.in_other_files)
+            _collect_arrays(columns, name, value, 0)
+    return select_table(path, tables | columns.grouped_tables(), group, columns.in_other_files)
 
 
-def _variables(path: Path, head: bytes) -> dict[str, Any]:
+def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
     """The variables of a file of version 5 or older, structures as dicts."""
     from scipy.io import loadmat
 
     if head[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
-        _require_bounded(path, "<" if head[126:128] == b"IM" else ">")
-    elif path.stat().st_size > BYTES_AT_MOST or not any(head[:20]):
+        _require_bounded_size(path, "<" if head[126:128] == b"IM" else ">")
+    elif path.stat().st_size > MAX_BYTES or not any(head[:20]):
         raise UnreadableData(f"{path}: not a MAT file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with os.fdopen(open_named(path), "rb") as file:
+            with os.fdopen(open_user_file(path), "rb") as file:
                 variables = loadmat(file, simplify_cells=True)
     except Exception as fault:  # scipy lets through whatever a damaged element leads to
         raise UnreadableData(f"{path}: not a MAT file, or damaged ({_first_line(fault)})") from None
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
-def _require_bounded(path: Path, order: str) -> None:
+def _require_bounded_size(path: Path, order: str) -> None:
     """Go through the elements. Raise UnreadableData where one is damaged, or all together hold more than is allowed."""
     size, position, total = path.stat().st_size, HEADER_BYTES, 0
-    with os.fdopen(open_named(path), "rb") as file:
+    with os.fdopen(open_user_file(path), "rb") as file:
         while position < size:
             file.seek(position)
             kind, length = np.frombuffer(file.read(8).ljust(8, b"\0"), f"{order}u4").tolist()
@@ -75,15 +75,15 @@ def _require_bounded(path: Path, order: str) -> None:
                 raise UnreadableData(f"{path}: damaged: no element of a MAT file stands at byte {position}")
             if position + 8 + length > size:
                 raise UnreadableData(f"{path}: cut off: its element at byte {position} ends behind the file")
-            total += length if kind == MATRIX else _expanded(path, file, length, BYTES_AT_MOST - total)
-            if total > BYTES_AT_MOST:
+            total += length if kind == MATRIX else _decompressed_size(path, file, length, MAX_BYTES - total)
+            if total > MAX_BYTES:
                 raise UnreadableData(
-                    f"{path}: holds more than {BYTES_AT_MOST >> 30} GiB; cut it with the program that wrote it"
+                    f"{path}: holds more than {MAX_BYTES >> 30} GiB; cut it with the program that wrote it"
                 )
             position += 8 + length
 
 
-def _expanded(path: Path, file: Any, length: int, limit: int) -> int:
+def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
     """Bytes of a compressed element, as far as they are no more than `limit` and a block."""
     stream, total, remaining = zlib.decompressobj(), 0, length
     try:
@@ -100,100 +100,105 @@ def _is_controldesk(value: Any) -> bool:
     """Whether this is a structure with X.Data and Y(k).Data."""
     if not isinstance(value, dict) or not {"X", "Y"} <= value.keys():
         return False
-    return all(isinstance(structure, dict) and "Data" in structure for key in "XY" for structure in _each(value[key]))
+    return all(
+        isinstance(structure, dict) and "Data" in structure for key in "XY" for structure in _as_list(value[key])
+    )
 
 
-def _rasters(path: Path, value: dict[str, Any]) -> dict[str, Table]:
+def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
     """A table for each X, of the Y that belong to it: by XIndex, by the raster's name, or by length."""
-    times, tables = _each(value["X"]), dict[str, Table]()
-    about = {"layout": "ControlDesk", **_described(value)}
+    times, tables = _as_list(value["X"]), dict[str, Table]()
+    about = {"layout": "ControlDesk", **_description(value)}
     for number, x in enumerate(times, start=1):
-        columns = Found(path)
-        name = unique(_text(x.get("Name")) or "Time", ())
-        columns.add(name, x["Data"], _text(x.get("Unit")) or "s")
+        columns = FileColumns(path)
+        name = unique_name(_as_text(x.get("Name")) or "Time", ())
+        columns.add_column(name, x["Data"], _as_text(x.get("Unit")) or "s")
         rows = np.size(x["Data"])
-        for y in _each(value["Y"]):
-            if _index(y) in (None, number) and np.size(y["Data"]) == rows and _of_raster(y, x):
-                label = _text(y.get("Name")) or "Y"
-                columns.add(unique(label, columns.columns), y["Data"], _text(y.get("Unit")))
-        raster = _text(x.get("Raster")) if len(times) > 1 else ""
+        for y in _as_list(value["Y"]):
+            if _raster_index(y) in (None, number) and np.size(y["Data"]) == rows and _rasters_agree(y, x):
+                label = _as_text(y.get("Name")) or "Y"
+                columns.add_column(unique_name(label, columns.columns), y["Data"], _as_text(y.get("Unit")))
+        raster = _as_text(x.get("Raster")) if len(times) > 1 else ""
         if columns.columns:
-            tables[unique(raster or (f"X({number})" if len(times) > 1 else ""), tables)] = Table(
+            tables[unique_name(raster or (f"X({number})" if len(times) > 1 else ""), tables)] = Table(
                 columns.columns, columns.units, name, about
             )
     return tables
 
 
-def _of_raster(y: dict[str, Any], x: dict[str, Any]) -> bool:
-    y_raster, x_raster = _text(y.get("Raster")), _text(x.get("Raster"))
+def _rasters_agree(y: dict[str, Any], x: dict[str, Any]) -> bool:
+    y_raster, x_raster = _as_text(y.get("Raster")), _as_text(x.get("Raster"))
     return not y_raster or not x_raster or y_raster == x_raster
 
 
-def _index(y: dict[str, Any]) -> int | None:
+def _raster_index(y: dict[str, Any]) -> int | None:
     number = y.get("XIndex", y.get("Xindex"))
     return int(number) if number is not None and np.size(number) == 1 else None
 
 
-def _described(value: dict[str, Any]) -> dict[str, str]:
+def _description(value: dict[str, Any]) -> dict[str, str]:
     text = value.get("Description")
     text = next((entry for entry in text.values() if isinstance(entry, str)), "") if isinstance(text, dict) else text
     return {"description": text[:200]} if isinstance(text, str) and text else {}
 
 
-def _walk(found: Found, path: str, value: Any, depth: int, unit: str | None = None) -> None:
+def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
     """Every array of numbers below a value, by its path; names and units are taken from beside it."""
-    if depth > DEEPEST:
-        raise UnreadableData(f"{found.path}: {path}: nested more than {DEEPEST} deep")
+    if depth > MAX_DEPTH:
+        raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep")
     if isinstance(value, dict):
-        properties = {key.casefold(): element for key, element in {**_fields(value.get("DataInfo")), **value}.items()}
-        unit, name = _text(properties.get("unit")) or _text(properties.get("units")), _text(properties.get("name"))
+        properties = {key.casefold(): element for key, element in {**_as_dict(value.get("DataInfo")), **value}.items()}
+        unit, name = (
+            _as_text(properties.get("unit")) or _as_text(properties.get("units")),
+            _as_text(properties.get("name")),
+        )
         for key, element in value.items():
             if key == "signals":
-                _signals(found, path, element, depth)
-            elif key.casefold() in VALUES:
-                _walk(found, f"{path}/{name or key}", element, depth + 1, unit)
+                _collect_signals(columns, path, element, depth)
+            elif key.casefold() in VALUE_KEYS:
+                _collect_arrays(columns, f"{path}/{name or key}", element, depth + 1, unit)
             else:
-                _walk(found, f"{path}/{key}", element, depth + 1)
+                _collect_arrays(columns, f"{path}/{key}", element, depth + 1)
     elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype.kind == "O"):
-        for number, element in enumerate(_each(value), start=1):
-            name = _text(element.get("Name", element.get("name"))) if isinstance(element, dict) else ""
-            _walk(found, f"{path}/{name or number}", element, depth + 1)
+        for number, element in enumerate(_as_list(value), start=1):
+            name = _as_text(element.get("Name", element.get("name"))) if isinstance(element, dict) else ""
+            _collect_arrays(columns, f"{path}/{name or number}", element, depth + 1)
     elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
-        found.left_out.append(f"{path} (an object, which only MATLAB can read: save it as a structure or an array)")
+        columns.left_out.append(f"{path} (an object, which only MATLAB can read: save it as a structure or an array)")
     elif isinstance(value, np.ndarray):
-        found.add(path, value, unit)
+        columns.add_column(path, value, unit)
 
 
-def _signals(found: Found, path: str, signals: Any, depth: int) -> None:
+def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) -> None:
     """Simulink's signals(k): values under their label; values of several dimensions have the time as the last one."""
-    for number, signal in enumerate(_each(signals), start=1):
+    for number, signal in enumerate(_as_list(signals), start=1):
         if isinstance(signal, dict) and "values" in signal:
             values = np.asarray(signal["values"])
             if values.ndim > 2:
                 values = values.reshape(-1, values.shape[-1])
             label = (
-                _text(signal.get("label"))
-                or _text(signal.get("title"))
-                or _text(signal.get("blockName"))
+                _as_text(signal.get("label"))
+                or _as_text(signal.get("title"))
+                or _as_text(signal.get("blockName"))
                 or f"signal_{number}"
             )
-            found.add(unique(f"{path}/{label.replace('/', '.')}", found.columns), values)
+            columns.add_column(unique_name(f"{path}/{label.replace('/', '.')}", columns.columns), values)
         else:
-            _walk(found, f"{path}/signals/{number}", signal, depth + 1)
+            _collect_arrays(columns, f"{path}/signals/{number}", signal, depth + 1)
 
 
-def _each(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     """A structure, or the elements of a list of them."""
     if isinstance(value, dict):
         return [value]
     return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []
 
 
-def _fields(value: Any) -> dict[str, Any]:
+def _as_dict(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _text(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return value.strip() if isinstance(value, str) else ""
 
 

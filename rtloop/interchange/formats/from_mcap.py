@@ -18,20 +18,20 @@ import numpy as np
 
 from rtloop.hil.modal import Real
 from rtloop.interchange.formats.mcap_fields import Fields, Undecodable, decoder
-from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
+from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.mcap.chunks import Source
+from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk
 from rtloop.recording.file.mcap.stock import Item, described, encoding, read_messages
 
 LOG_TIME = "log_time_s"
-MOST_TIMES, SPARE_BYTES = 64, 64 << 20
+MAX_GROWTH, SPARE_BYTES = 64, 64 << 20
 """What a table may take of memory: so many times what its messages take in the file, and a little more."""
-SHOWN = 60
+MAX_SHOWN_CHARACTERS = 60
 """Characters of a name in a message."""
 
 
-class Contents(NamedTuple):
+class McapContents(NamedTuple):
     """The number of messages by topic and encoding, the bytes of each topic's messages, and the damage of a file."""
 
     counts: Counter[tuple[str, str]]
@@ -46,25 +46,25 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
     """
     path = Path(path)
     try:
-        source = Source(path)
+        source = McapSource(path)
     except RecordingError as error:
         raise UnreadableData(str(error)) from None
     with closing(source):
-        mcap_contents = _contents(source)
-        name = _chosen(path, mcap_contents, topic)
-        return _Reading(source, mcap_contents, name).table()
+        mcap_contents = _count_messages(source)
+        name = _choose_topic(path, mcap_contents, topic)
+        return _TopicReader(source, mcap_contents, name).read_table()
 
 
-def _contents(source: Source) -> Contents:
+def _count_messages(source: McapSource) -> McapContents:
     """Every message counted."""
-    message_runs = Contents(Counter(), Counter(), [])
+    message_runs = McapContents(Counter(), Counter(), [])
     for schema, channel, message in _whole(source, message_runs.problems):
         message_runs.counts[channel.topic, encoding(channel, schema)] += 1
         message_runs.bytes[channel.topic] += MESSAGE_HEAD.size + len(message.data)
     return message_runs
 
 
-def _whole(source: Source, problems: list[str]) -> Iterator[Item]:
+def _whole(source: McapSource, problems: list[str]) -> Iterator[Item]:
     """The messages of a file up to the first damage, which becomes one of `problems`."""
     try:
         yield from read_messages(source)
@@ -72,47 +72,49 @@ def _whole(source: Source, problems: list[str]) -> Iterator[Item]:
         problems.append(f"{reason}: what comes behind it is left out")
 
 
-def _chosen(path: Path, found: Contents, topic: str | None) -> str:
+def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
     """The topic that is meant. Raises UnreadableData where nobody knows which."""
-    topics = set(found.bytes)
+    topics = set(contents.bytes)
     if topic is not None and topic in topics:
         return topic
     if not topics:
         raise UnreadableData(
-            f"{path}: an MCAP file without messages" + "".join(f"; {problem}" for problem in found.problems[:1])
+            f"{path}: an MCAP file without messages" + "".join(f"; {problem}" for problem in contents.problems[:1])
         )
     if topic is not None:
-        raise UnreadableData(f"{path}: no topic {topic[:SHOWN]!r}; there are {described(found.counts)}")
+        raise UnreadableData(
+            f"{path}: no topic {topic[:MAX_SHOWN_CHARACTERS]!r}; there are {described(contents.counts)}"
+        )
     if len(topics) > 1:
-        raise UnreadableData(f"{path}: holds several topics, of which one is to be named: {described(found.counts)}")
+        raise UnreadableData(f"{path}: holds several topics, of which one is to be named: {described(contents.counts)}")
     return topics.pop()
 
 
-class _Reading:
+class _TopicReader:
     """Of one topic. The columns are those that any of its messages has; memory grows with what is there alone."""
 
-    def __init__(self, source: Source, found: Contents, topic: str) -> None:
-        self._source, self._found, self._topic = source, found, topic
-        self._where = f"{source.path}: {topic[:SHOWN]!r}"
-        self._rows = sum(count for (name, _), count in found.counts.items() if name == topic)
-        if self._rows > ROWS_AT_MOST:
+    def __init__(self, source: McapSource, contents: McapContents, topic: str) -> None:
+        self._source, self._contents, self._topic = source, contents, topic
+        self._location = f"{source.path}: {topic[:MAX_SHOWN_CHARACTERS]!r}"
+        self._rows = sum(count for (name, _), count in contents.counts.items() if name == topic)
+        if self._rows > MAX_ROWS:
             raise UnreadableData(
-                f"{self._where}: {self._rows} messages; at most {ROWS_AT_MOST} are read, by `mcap filter`"
+                f"{self._location}: {self._rows} messages; at most {MAX_ROWS} are read, by `mcap filter`"
             )
         self._decoders: dict[int, Callable[[bytes], Fields]] = {}
         self._columns: dict[str, Real] = {}
         self._log_times = np.zeros(self._rows, np.uint64)
 
-    def table(self) -> Table:
+    def read_table(self) -> Table:
         """All of it."""
         problems, own = (
-            self._found.problems,
+            self._contents.problems,
             (values for values in _whole(self._source, []) if values[1].topic == self._topic),
         )
         for row, item in enumerate(own):
-            self._take(item, row)
+            self._add_run(item, row)
         if not self._columns:
-            raise UnreadableData(f"{self._where}: there is no number in its messages")
+            raise UnreadableData(f"{self._location}: there is no number in its messages")
         order = np.argsort(self._log_times, kind="stable")
         in_order = bool(np.all(np.diff(order) > 0))
         log_times = self._log_times if in_order else self._log_times[order]
@@ -125,7 +127,7 @@ class _Reading:
         }
         return Table({LOG_TIME: elapsed_ns * 1e-9} | columns, {LOG_TIME: "s"}, LOG_TIME, about)
 
-    def _take(self, item: Item, row: int) -> None:
+    def _add_run(self, item: Item, row: int) -> None:
         """The numbers of a message as a row. Raises UnreadableData, MissingExtra."""
         schema, channel, message = item
         self._log_times[row] = message.log_time
@@ -133,19 +135,19 @@ class _Reading:
             if channel.id not in self._decoders:
                 self._decoders[channel.id] = decoder(channel, schema)
         except Undecodable as reason:
-            raise UnreadableData(f"{self._where}: {reason}") from None
+            raise UnreadableData(f"{self._location}: {reason}") from None
         try:
             fields = self._decoders[channel.id](message.data)
         except Undecodable as reason:
-            raise UnreadableData(f"{self._where}: message {row}: {reason}") from None
+            raise UnreadableData(f"{self._location}: message {row}: {reason}") from None
         for name, value in fields.items():
             column = self._columns.get(name)
-            (self._new(name) if column is None else column)[row] = value
+            (self._add_column(name) if column is None else column)[row] = value
 
-    def _new(self, name: str) -> Real:
+    def _add_column(self, name: str) -> Real:
         """A column, of NaN."""
-        if (len(self._columns) + 1) * self._rows * 8 > MOST_TIMES * self._found.bytes[self._topic] + SPARE_BYTES:
+        if (len(self._columns) + 1) * self._rows * 8 > MAX_GROWTH * self._contents.bytes[self._topic] + SPARE_BYTES:
             reason = f"{len(self._columns)} fields and more in {self._rows} messages, each of which has few of them"
-            raise UnreadableData(f"{self._where}: {reason}: that is no table")
+            raise UnreadableData(f"{self._location}: {reason}: that is no table")
         self._columns[name] = np.full(self._rows, np.nan)
         return self._columns[name]

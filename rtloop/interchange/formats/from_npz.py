@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rtloop.hil.trusted import open_named
-from rtloop.interchange.formats.groups import Found, one_of
+from rtloop.hil.trusted import open_user_file
+from rtloop.interchange.formats.groups import FileColumns, select_table
 from rtloop.interchange.formats.table import Table, UnreadableData
 
 WORKBOOK = "xl/workbook.xml"
@@ -17,29 +17,29 @@ WORKBOOK = "xl/workbook.xml"
 
 def read_npz(path: Path, group: str | None = None) -> Table:
     """The arrays of one length: `group`, else the only or the longest ones. Raises UnreadableData."""
-    columns = Found(path)
+    columns = FileColumns(path)
     try:
-        with os.fdopen(open_named(path), "rb") as file, zipfile.ZipFile(file) as archive:
+        with os.fdopen(open_user_file(path), "rb") as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
         if any(member.filename == WORKBOOK for member in members):
             raise UnreadableData(f"{path}: an Excel workbook; save its sheet as CSV")
         for member in members:
-            columns.room(member.filename, (-(-member.file_size // 8),))
-        with os.fdopen(open_named(path), "rb") as file, np.load(file, allow_pickle=False) as arrays:
+            columns.require_room(member.filename, (-(-member.file_size // 8),))
+        with os.fdopen(open_user_file(path), "rb") as file, np.load(file, allow_pickle=False) as arrays:
             for name in arrays:
-                _add(columns, name, arrays)
+                _add_array(columns, name, arrays)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError) as fault:
         raise UnreadableData(f"{path}: not an npz file, or damaged ({fault})") from None
-    return one_of(path, columns.tables(), group)
+    return select_table(path, columns.grouped_tables(), group)
 
 
-def _add(found: Found, name: str, arrays: np.lib.npyio.NpzFile) -> None:
+def _add_array(columns: FileColumns, name: str, arrays: np.lib.npyio.NpzFile) -> None:
     try:
         array = arrays[name]
     except ValueError:
-        found.left_out.append(f"{name} (pickled objects)")
+        columns.left_out.append(f"{name} (pickled objects)")
         return
     for field in array.dtype.names or ():
-        found.add(f"{name}/{field}", array[field])
+        columns.add_column(f"{name}/{field}", array[field])
     if not array.dtype.names:
-        found.add(name, array)
+        columns.add_column(name, array)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.hil.trusted import open_named
-from rtloop.interchange.formats.groups import Found, one_of
+from rtloop.hil.trusted import open_user_file
+from rtloop.interchange.formats.groups import FileColumns, select_table
 from rtloop.interchange.formats.table import Table, UnreadableData
 
 
@@ -22,30 +22,30 @@ def read_parquet(path: Path) -> Table:
         import pyarrow.parquet
     except ImportError:
         raise MissingExtra("Parquet needs pyarrow: pip install 'rtloop[data]'") from None
-    columns = Found(path)
+    columns = FileColumns(path)
     try:
-        with os.fdopen(open_named(path), "rb") as stream, pyarrow.parquet.ParquetFile(stream) as file:
+        with os.fdopen(open_user_file(path), "rb") as stream, pyarrow.parquet.ParquetFile(stream) as file:
             schema = file.schema_arrow
             for field in schema:
-                columns.room(field.name, (file.metadata.num_rows,))
-                _add(columns, field, file.read(columns=[field.name]).column(0))
+                columns.require_room(field.name, (file.metadata.num_rows,))
+                _add_field(columns, field, file.read(columns=[field.name]).column(0))
     except (pyarrow.ArrowException, OSError) as fault:
         raise UnreadableData(f"{path}: not a Parquet file, or damaged ({str(fault).splitlines()[0]})") from None
-    table = one_of(path, columns.tables(), None)
+    table = select_table(path, columns.grouped_tables(), None)
     time_column = next((field.name for field in schema if pyarrow.types.is_timestamp(field.type)), None)
     return replace(table, time=table.time or time_column)
 
 
-def _add(found: Found, field: Any, column: Any) -> None:
+def _add_field(columns: FileColumns, field: Any, column: Any) -> None:
     import pyarrow.types as types
 
     unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
     if types.is_timestamp(field.type):
         ns = column.cast("timestamp[ns]").cast("int64").to_numpy()
-        found.add(field.name, (ns - ns[:1]) * 1e-9, "s")
+        columns.add_column(field.name, (ns - ns[:1]) * 1e-9, "s")
     elif types.is_duration(field.type):
-        found.add(field.name, column.cast("duration[ns]").cast("int64").to_numpy() * 1e-9, "s")
+        columns.add_column(field.name, column.cast("duration[ns]").cast("int64").to_numpy() * 1e-9, "s")
     elif types.is_floating(field.type) or types.is_integer(field.type) or types.is_boolean(field.type):
-        found.add(field.name, np.asarray(column.to_numpy(), np.float64), unit)
+        columns.add_column(field.name, np.asarray(column.to_numpy(), np.float64), unit)
     else:
-        found.left_out.append(f"{field.name} ({field.type})")
+        columns.left_out.append(f"{field.name} ({field.type})")

@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 
 from rtloop.hil.modal import Real
-from rtloop.interchange.formats.table import ROWS_AT_MOST, Table, UnreadableData
-from rtloop.values import counted
+from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
+from rtloop.values import count_text
 
-BYTES_AT_MOST = 1 << 30
+MAX_BYTES = 1 << 30
 """Of numbers in memory."""
-COLUMNS_AT_MOST = 2000
+MAX_COLUMNS = 2000
 MATRIX_COLUMNS = 256
 """A matrix of more columns is an image, or a map, and no table of signals."""
-TIMES = ("deadline_ns", "time", "t", "zeit", "time_s", "timestamp", "tout", "sim_time", "elapsed", "elapsed time")
+TIME_NAMES = ("deadline_ns", "time", "t", "zeit", "time_s", "timestamp", "tout", "sim_time", "elapsed", "elapsed time")
 """What a column of times is called, the likeliest first."""
-SHOWN = 8
+MAX_SHOWN_NAMES = 8
 
 
 @dataclass
-class Found:
+class FileColumns:
     """What is found in a file before it is known what belongs together: columns by path, their units, their time.
 
     `in_other_files` names what is left out because the file only points to it.
@@ -38,55 +38,55 @@ class Found:
     in_other_files: list[str] = field(default_factory=list)
     bytes: int = 0
 
-    def room(self, name: str, shape: tuple[int, ...]) -> None:
+    def require_room(self, name: str, shape: tuple[int, ...]) -> None:
         """Raise UnreadableData where so many more numbers are too many."""
         rows, size = max(shape, default=1), 8 * int(np.prod(shape, dtype=object))
         self.bytes += size
-        if rows > ROWS_AT_MOST or self.bytes > BYTES_AT_MOST:
+        if rows > MAX_ROWS or self.bytes > MAX_BYTES:
             raise UnreadableData(
-                f"{self.path}: {name}: the file's numbers take more than {BYTES_AT_MOST >> 30} GiB of memory; cut it "
+                f"{self.path}: {name}: the file's numbers take more than {MAX_BYTES >> 30} GiB of memory; cut it "
                 "with the program that wrote it, or write fewer of its signals"
             )
 
-    def add(self, name: str, values: Any, unit: str | None = None) -> None:
+    def add_column(self, name: str, values: Any, unit: str | None = None) -> None:
         """One column, or each column of a matrix; what is neither is left out."""
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
             if array.size > 1 or array.dtype.kind != "U":
-                self.left_out.append(f"{name} ({_kind(array)})")
+                self.left_out.append(f"{name} ({_kind_description(array)})")
             return
         array = np.squeeze(array) if array.ndim > 1 else array
         if array.ndim == 2 and min(array.shape) <= MATRIX_COLUMNS:
             is_row_wise = array.shape[0] < array.shape[1]
             for number, column in enumerate(array if is_row_wise else array.T, start=1):
-                self.add(f"{name}_{number}", column, unit)
+                self.add_column(f"{name}_{number}", column, unit)
         elif array.ndim != 1 or array.size < 2:
             if array.size > 1:
                 self.left_out.append(f"{name} ({'×'.join(map(str, array.shape))})")
-        elif len(self.columns) == COLUMNS_AT_MOST:
-            raise UnreadableData(f"{self.path}: more than {COLUMNS_AT_MOST} columns")
+        elif len(self.columns) == MAX_COLUMNS:
+            raise UnreadableData(f"{self.path}: more than {MAX_COLUMNS} columns")
         else:
-            name = unique(name, self.columns)
+            name = unique_name(name, self.columns)
             self.columns[name] = np.ascontiguousarray(array, np.float64)
             if unit:
                 self.units[name] = unit
 
-    def tables(self) -> dict[str, Table]:
+    def grouped_tables(self) -> dict[str, Table]:
         """What was sampled together: columns of one length, beside the time that stands nearest to them."""
-        times = [name for name in self.columns if _last(name).casefold() in TIMES]
-        times.sort(key=lambda name: TIMES.index(_last(name).casefold()))
+        times = [name for name in self.columns if _base_name(name).casefold() in TIME_NAMES]
+        times.sort(key=lambda name: TIME_NAMES.index(_base_name(name).casefold()))
         members: dict[tuple[int, str | None], list[str]] = {}
         for name, values in self.columns.items():
             time_candidates = [time for time in times if self.columns[time].size == values.size]
-            nearest_time = max(time_candidates, key=lambda time: _common(time, name), default=None)
+            nearest_time = max(time_candidates, key=lambda time: _shared_depth(time, name), default=None)
             members.setdefault((values.size, nearest_time), []).append(name)
-        about = {"left out": ", ".join(self.left_out[:SHOWN])} if self.left_out else {}
+        about = {"left out": ", ".join(self.left_out[:MAX_SHOWN_NAMES])} if self.left_out else {}
         tables: dict[str, Table] = {}
         for (rows, time), names in members.items():
-            begin = len(_shared(names))
+            begin = len(_shared_folder(names))
             short_names = {name: name[begin:] for name in names}
-            group = _shared(names).strip("/") or _parent(time or "") or counted(rows, "row")
-            tables[unique(group, tables)] = Table(
+            group = _shared_folder(names).strip("/") or _parent(time or "") or count_text(rows, "row")
+            tables[unique_name(group, tables)] = Table(
                 {short_names[name]: self.columns[name] for name in names},
                 {short_names[name]: self.units[name] for name in names if name in self.units},
                 None if time is None else short_names[time],
@@ -95,41 +95,48 @@ class Found:
         return tables
 
 
-def one_of(path: Path, tables: Mapping[str, Table], group: str | None, in_other_files: Sequence[str] = ()) -> Table:
+def select_table(
+    path: Path, tables: Mapping[str, Table], group: str | None, in_other_files: Sequence[str] = ()
+) -> Table:
     """The group that is asked for; else the only one, or the longest, and what else there is in its `about`.
 
     `in_other_files` of the table is the one given. Raises UnreadableData where there is none.
     """
     if not tables:
-        hint = f"; in other files, and left out: {', '.join(in_other_files[:SHOWN])}" if in_other_files else ""
+        hint = (
+            f"; in other files, and left out: {', '.join(in_other_files[:MAX_SHOWN_NAMES])}" if in_other_files else ""
+        )
         raise UnreadableData(f"{path}: holds no column of numbers{hint}")
     if group is not None and group not in tables:
         raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
     name = (
         group
         if group is not None
-        else max(tables, key=lambda key: (len(tables[key].columns) > 1, rows_of(tables[key])))
+        else max(tables, key=lambda key: (len(tables[key].columns) > 1, row_count(tables[key])))
     )
     other_groups = [
-        f"{other_name!r} ({counted(rows_of(table), 'row')}, {counted(len(table.columns), 'column')})"
+        f"{other_name!r} ({count_text(row_count(table), 'row')}, {count_text(len(table.columns), 'column')})"
         for other_name, table in tables.items()
         if other_name != name
     ]
     table = replace(tables[name], in_other_files=tuple(in_other_files))
     if not other_groups:
         return table
-    group_notes = {"group": name, "other groups": ", ".join(other_groups[:SHOWN]) + ", …" * (len(other_groups) > SHOWN)}
+    group_notes = {
+        "group": name,
+        "other groups": ", ".join(other_groups[:MAX_SHOWN_NAMES]) + ", …" * (len(other_groups) > MAX_SHOWN_NAMES),
+    }
     return replace(table, about={**table.about, **group_notes})
 
 
-def rows_of(table: Table) -> int:
+def row_count(table: Table) -> int:
     """How many samples each column has."""
     return next((column.size for column in table.columns.values()), 0)
 
 
-def unique(name: str, taken: Iterable[str]) -> str:
+def unique_name(name: str, names: Iterable[str]) -> str:
     """The name, or with a number behind it where it is taken."""
-    used_names = set(taken)
+    used_names = set(names)
     candidate, number = name, 1
     while candidate in used_names:
         number += 1
@@ -137,7 +144,7 @@ def unique(name: str, taken: Iterable[str]) -> str:
     return candidate
 
 
-def _last(name: str) -> str:
+def _base_name(name: str) -> str:
     return name.rpartition("/")[2]
 
 
@@ -145,24 +152,24 @@ def _parent(name: str) -> str:
     return name.rpartition("/")[0]
 
 
-def _shared(names: Sequence[str]) -> str:
+def _shared_folder(names: Sequence[str]) -> str:
     """The folder that all of the paths begin with, with its slash; empty where there is none."""
     folders = [name.split("/")[:-1] for name in names]
     shared_parts = takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))
     return "".join(f"{parts[0]}/" for parts in shared_parts)
 
 
-def _common(one: str, other: str) -> int:
+def _shared_depth(first_path: str, second_path: str) -> int:
     """Parts of the path that two columns share."""
     depth = 0
-    for first, second in zip(one.split("/")[:-1], other.split("/")[:-1], strict=False):
+    for first, second in zip(first_path.split("/")[:-1], second_path.split("/")[:-1], strict=False):
         if first != second:
             break
         depth += 1
     return depth
 
 
-def _kind(array: np.ndarray[Any, Any]) -> str:
+def _kind_description(array: np.ndarray[Any, Any]) -> str:
     return {"U": "text", "S": "text", "O": "text or cells", "c": "complex", "M": "dates"}.get(
         array.dtype.kind, "no numbers"
     )

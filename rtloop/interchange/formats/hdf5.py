@@ -16,80 +16,82 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.hil.trusted import open_named
-from rtloop.interchange.formats.groups import Found
+from rtloop.hil.trusted import open_user_file
+from rtloop.interchange.formats.groups import FileColumns
 from rtloop.interchange.formats.table import UnreadableData
-from rtloop.interchange.hdf5_signals import path_of
+from rtloop.interchange.hdf5_signals import descriptor_path
 
-DEEPEST = 32
-OBJECTS_AT_MOST = 100_000
+MAX_DEPTH = 32
+MAX_OBJECTS = 100_000
 CONTROL = r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]"
 """Characters of a name that a terminal obeys, or cannot show."""
-UNITS = ("unit", "units", "Unit", "Units")
+UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units")
 
 
 @contextmanager
-def opened(found: Found) -> Iterator[Any]:
+def open_hdf5(columns: FileColumns) -> Iterator[Any]:
     """The file; what goes wrong in reading it is an UnreadableData. Raises MissingExtra."""
     try:
         import h5py
     except ImportError:
         raise MissingExtra("HDF5, and MAT of version 7.3, need h5py: pip install 'rtloop[data]'") from None
     try:
-        with os.fdopen(open_named(found.path), "rb") as opened, h5py.File(path_of(opened), "r") as file:
+        with os.fdopen(open_user_file(columns.path), "rb") as opened, h5py.File(descriptor_path(opened), "r") as file:
             yield file
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as fault:
-        raise UnreadableData(f"{found.path}: not an HDF5 file, or damaged ({str(fault)[:200]})") from None
+        raise UnreadableData(f"{columns.path}: not an HDF5 file, or damaged ({str(fault)[:200]})") from None
 
 
-def collect(found: Found) -> None:
+def collect_datasets(columns: FileColumns) -> None:
     """Put every dataset of numbers into `found`. Raises UnreadableData, MissingExtra."""
-    with opened(found) as file:
+    with open_hdf5(columns) as file:
         datasets: dict[str, Any] = {}
-        _collect(found, datasets, file, "", set(), 0)
+        _collect_group(columns, datasets, file, "", set(), 0)
         for name, dataset in datasets.items():
-            found.room(name, dataset.shape)
+            columns.require_room(name, dataset.shape)
         for name, dataset in datasets.items():
-            _read(found, dataset, name)
+            _read_dataset(columns, dataset, name)
 
 
-def _collect(found: Found, datasets: dict[str, Any], group: Any, path: str, seen: set[Any], depth: int) -> None:
+def _collect_group(
+    columns: FileColumns, datasets: dict[str, Any], group: Any, path: str, visited: set[Any], depth: int
+) -> None:
     """The datasets of a group and of those in it, without the text."""
     import h5py
 
-    if depth > DEEPEST or len(seen) > OBJECTS_AT_MOST:
-        raise UnreadableData(f"{found.path}: {path}: nested more than {DEEPEST} deep, or of too many objects")
-    _see(group, seen)
+    if depth > MAX_DEPTH or len(visited) > MAX_OBJECTS:
+        raise UnreadableData(f"{columns.path}: {path}: nested more than {MAX_DEPTH} deep, or of too many objects")
+    _visit(group, visited)
     for key in group:
         name = f"{path}/{key}".lstrip("/")
-        member = _member(found, group, key, name)
+        member = _resolve_member(columns, group, key, name)
         if member is None:
             continue
-        if not _see(member, seen):
-            found.left_out.append(f"{name} (a link back to what is there already)")
+        if not _visit(member, visited):
+            columns.left_out.append(f"{name} (a link back to what is there already)")
         elif isinstance(member, h5py.Group):
-            _collect(found, datasets, member, name, seen, depth + 1)
+            _collect_group(columns, datasets, member, name, visited, depth + 1)
         elif (
             isinstance(member, h5py.Dataset)
-            and not _is_elsewhere(found, member, name)
+            and not _is_in_other_files(columns, member, name)
             and member.shape is not None
             and member.dtype.kind not in "OSU"
         ):
             datasets[name] = member
 
 
-def _member(found: Found, group: Any, key: str, name: str) -> Any:
+def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> Any:
     """The object of a group under `key`, if it is reached within the file; else None, and it is left out as `name`."""
     try:
-        return _within(group, key, DEEPEST)
-    except _OtherFile:
-        _name_elsewhere(found, name, "a link into another file")
+        return _resolve_path(group, key, MAX_DEPTH)
+    except _OtherFileLink:
+        _report_other_file(columns, name, "a link into another file")
     except (KeyError, OSError, RuntimeError):
-        found.left_out.append(f"{name} (a link that leads nowhere)")
+        columns.left_out.append(f"{name} (a link that leads nowhere)")
     return None
 
 
-def _within(group: Any, path: str, links: int) -> Any:
+def _resolve_path(group: Any, path: str, links: int) -> Any:
     """The object at a path, reached by hard links and at most `links` soft ones within each other.
 
     Raises _OtherFile where the path leaves the file, KeyError where it leads nowhere.
@@ -106,96 +108,101 @@ def _within(group: Any, path: str, links: int) -> Any:
         if kind == h5l.TYPE_HARD:
             member = member[part]
         elif kind == h5l.TYPE_SOFT and links > 0:
-            member = _within(member, member.id.links.get_val(key).decode("utf-8", "surrogateescape"), links - 1)
+            member = _resolve_path(member, member.id.links.get_val(key).decode("utf-8", "surrogateescape"), links - 1)
         elif kind == h5l.TYPE_SOFT:
             raise KeyError(part)
         else:
-            raise _OtherFile(part)
+            raise _OtherFileLink(part)
     return member
 
 
-def _is_elsewhere(found: Found, dataset: Any, name: str) -> bool:
+def _is_in_other_files(columns: FileColumns, dataset: Any, name: str) -> bool:
     """Whether the values of a dataset are in other files; it is left out as `name` then."""
     import h5py
 
     creation = dataset.id.get_create_plist()
     if creation.get_layout() == h5py.h5d.VIRTUAL:
-        _name_elsewhere(found, name, "a virtual dataset, made of others")
+        _report_other_file(columns, name, "a virtual dataset, made of others")
     elif creation.get_external_count():
-        _name_elsewhere(found, name, "values stored in another file")
+        _report_other_file(columns, name, "values stored in another file")
     else:
         return False
     return True
 
 
-def _name_elsewhere(found: Found, name: str, reason: str) -> None:
-    found.in_other_files.append(f"{re.sub(CONTROL, ' ', name)} ({reason})")
+def _report_other_file(columns: FileColumns, name: str, reason: str) -> None:
+    columns.in_other_files.append(f"{re.sub(CONTROL, ' ', name)} ({reason})")
 
 
-class _OtherFile(Exception):
+class _OtherFileLink(Exception):
     """A path leaves the file."""
 
 
-def _read(found: Found, dataset: Any, name: str) -> None:
+def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
     """A dataset of numbers, or the fields of one of records."""
-    unit = next((_word(dataset.attrs[key]) for key in UNITS if key in dataset.attrs), None)
+    unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
     values = dataset[()]
     for field in dataset.dtype.names or ():
-        found.add(f"{name}/{field}", values[field])
+        columns.add_column(f"{name}/{field}", values[field])
     if not dataset.dtype.names:
-        found.add(name, values, unit)
+        columns.add_column(name, values, unit)
 
 
-def _see(one: Any, seen: set[Any]) -> bool:
+def _visit(member: Any, visited: set[Any]) -> bool:
     """Whether an object is met for the first time."""
     import h5py
 
-    info = h5py.h5o.get_info(one.id)  # type: ignore[attr-defined]
+    info = h5py.h5o.get_info(member.id)  # type: ignore[attr-defined]
     address = (info.fileno, info.addr)
-    is_new = address not in seen
-    seen.add(address)
+    is_new = address not in visited
+    visited.add(address)
     return is_new
 
 
-def _word(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def matlab_variables(found: Found) -> dict[str, Any]:
+def matlab_variables(columns: FileColumns) -> dict[str, Any]:
     """Variables of a MAT file of version 7.3: structures as dicts, arrays as MATLAB shows them, text as str."""
-    with opened(found) as file:
-        return _values(found, file, {key: key for key in file if not key.startswith("#")}, file, 0)
+    with open_hdf5(columns) as file:
+        return _group_values(columns, file, {key: key for key in file if not key.startswith("#")}, file, 0)
 
 
-def _values(found: Found, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
+def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
     """The members of a group by key, for those of `names` (full name by key) that lie in the file."""
-    members = {key: _member(found, group, key, name) for key, name in names.items()}
+    members = {key: _resolve_member(columns, group, key, name) for key, name in names.items()}
     return {
-        key: _value(found, file, member, names[key], depth) for key, member in members.items() if member is not None
+        key: _member_value(columns, file, member, names[key], depth)
+        for key, member in members.items()
+        if member is not None
     }
 
 
-def _value(found: Found, file: Any, one: Any, name: str, depth: int) -> Any:
+def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth: int) -> Any:
     import h5py
 
-    if depth > DEEPEST:
-        raise UnreadableData(f"{found.path}: {name}: nested more than {DEEPEST} deep: a reference leads back to itself")
-    if isinstance(one, h5py.Group):
-        fields = _values(found, file, {str(key): f"{name}/{key}" for key in one}, one, depth + 1)
+    if depth > MAX_DEPTH:
+        raise UnreadableData(
+            f"{columns.path}: {name}: nested more than {MAX_DEPTH} deep: a reference leads back to itself"
+        )
+    if isinstance(member, h5py.Group):
+        fields = _group_values(columns, file, {str(key): f"{name}/{key}" for key in member}, member, depth + 1)
         lengths = {len(field) for field in fields.values() if isinstance(field, list)}
         if fields and len(lengths) == 1 and all(isinstance(field, list) for field in fields.values()):
             return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
         return fields
-    if _is_elsewhere(found, one, name):
+    if _is_in_other_files(columns, member, name):
         return np.empty(0)
-    kind = _word(one.attrs.get("MATLAB_class", b"double"))
-    if "MATLAB_empty" in one.attrs or one.shape is None:
+    kind = _as_text(member.attrs.get("MATLAB_class", b"double"))
+    if "MATLAB_empty" in member.attrs or member.shape is None:
         return "" if kind == "char" else np.empty(0)
-    found.room(name, one.shape)
-    values = one[()]
-    if one.dtype == h5py.ref_dtype:
+    columns.require_room(name, member.shape)
+    values = member[()]
+    if member.dtype == h5py.ref_dtype:
         return [
-            _value(found, file, file[place], f"{name}({k})", depth + 1) for k, place in enumerate(values.T.ravel(), 1)
+            _member_value(columns, file, file[place], f"{name}({k})", depth + 1)
+            for k, place in enumerate(values.T.ravel(), 1)
         ]
     if kind == "char":
         return "".join(map(chr, values.T.ravel()))

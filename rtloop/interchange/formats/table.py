@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from rtloop.errors import RtloopError
 from rtloop.hil.modal import Real
 
-ROWS_AT_MOST = 1 << 28
+MAX_ROWS = 1 << 28
 """Rows of one table; beyond them a file is cut with the program that wrote it, rather than read into all the memory."""
 
 

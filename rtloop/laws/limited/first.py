@@ -10,11 +10,11 @@ from typing import Any
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.laws.limited.announced import is_limited
-from rtloop.laws.limited.process import PROCESS, GivenUp
+from rtloop.laws.limited.process import PROCESS, AbandonedJob
 from rtloop.laws.registry import LawReference
 
 
-def must_be_limited(laws: Iterable[LawReference]) -> bool:
+def needs_limited_process(laws: Iterable[LawReference]) -> bool:
     """Whether work with these laws belongs into the limited process: one is somebody's own, and this is not it."""
     return not is_limited() and any(law.text for law in laws)
 
@@ -24,30 +24,30 @@ def run_limited(source: str, function: Callable[..., Any], *arguments: Any, comp
 
     Raises as it does, and ConfigError of `source` for a law's faults.
     """
-    return _limited(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
+    return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
 
 
-def try_first(source: str, function: Callable[..., Any], *arguments: Any) -> None:
+def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
     """Run `function` in the limited process before it runs here, unless this is that process.
 
     Raises ConfigError of `source` where a law's code ends the process, does not come to an end, or leaves something
     running. Errors of the usual kinds are left for the caller to meet.
     """
     if not is_limited():
-        _limited(source, partial(PROCESS.run, show=False), partial(_attempt, function), *arguments)
+        _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)
 
 
-def _limited(source: str, run: Callable[..., Any], function: Callable[..., Any], *arguments: Any) -> Any:
+def _run_for_source(source: str, run: Callable[..., Any], function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return run(function, *arguments)
     except ConfigError as error:
         raise ConfigError(source, error.faults) from None
-    except GivenUp as error:
+    except AbandonedJob as error:
         if not error.by_law:
             raise
         raise ConfigError(source, [str(error)]) from None
 
 
-def _attempt(function: Callable[..., Any], *arguments: Any) -> None:
+def _run_ignoring_errors(function: Callable[..., Any], *arguments: Any) -> None:
     with suppress(ValueError, RtloopError, DriverError):
         function(*arguments)

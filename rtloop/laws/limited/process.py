@@ -29,13 +29,13 @@ from rtloop.laws.limited.worker import PREPARE, RUN, Preparation
 LIMIT_S = 10.0
 """A law that is not read, or not built and verified, within this is refused. The host's load does not count."""
 START_S = 120.0
-MOST_WAITING = 6.0
+MAX_WAIT_FACTOR = 6.0
 """Times a limit, after which a process is given up however busy the host is."""
-MOST_PRINTED = 1 << 16
+MAX_OUTPUT_BYTES = 1 << 16
 """Bytes that a law's code may print in a job."""
 
 
-class GivenUp(UnavailableError):
+class AbandonedJob(UnavailableError):
     """A job did not come to an end, or its process died; `by_law` where the code of a law was running."""
 
     def __init__(self, message: str, by_law: bool) -> None:
@@ -61,7 +61,7 @@ class LimitedProcess:
         """Of its process; None where none runs."""
         return None if self._process is None else self._process.pid
 
-    def expect(self, function: Callable[..., Any]) -> None:
+    def prepare_ahead(self, function: Callable[..., Any]) -> None:
         """Start the process, and have it import `function`, without waiting for it; the first job tries again."""
         with self._lock, contextlib.suppress(OSError):
             self._start()
@@ -80,20 +80,20 @@ class LimitedProcess:
                 self._start()
                 self._prepare(function, compiles)
                 while self._unanswered:
-                    self._message(_Clock(START_S, self.pid))
+                    self._receive_message(_Clock(START_S, self.pid))
                     self._unanswered -= 1
                 self._send(pickle.dumps((RUN, pickle.dumps(arguments))))
                 kind, value = self._outcome()
             except BaseException:
                 if self._law is None:
-                    self._show_printed()
+                    self._show_output()
                 self.end()
                 raise
             if kind == "leftover":
                 self.end()
                 raise ConfigError("law", [f"{self._culprit}{value}"])
             if show:
-                self._show_printed()
+                self._show_output()
         if kind == "done":
             return pickle.loads(value)
         if kind == "faults":
@@ -144,13 +144,13 @@ class LimitedProcess:
         """The answer to a job. Raises GivenUp."""
         clock = _Clock(self.limit_s, self.pid)
         while True:
-            kind, value = self._message(clock)
+            kind, value = self._receive_message(clock)
             if kind != "begins":
-                self._read_printed()
+                self._read_output()
                 return kind, value
             self._law = value
 
-    def _message(self, clock: _Clock) -> tuple[str, Any]:
+    def _receive_message(self, clock: _Clock) -> tuple[str, Any]:
         """The next message while there is time. Raises GivenUp."""
         assert self._process is not None
         assert self._process.stdout is not None
@@ -158,14 +158,14 @@ class LimitedProcess:
         answers, printed = self._process.stdout.fileno(), self._process.stderr.fileno()
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
             if (remaining_s := clock.remaining_s) <= 0:
-                raise self._given_up(f"took longer than {clock.limit_s:g} s and was given up")
+                raise self._abandonment(f"took longer than {clock.limit_s:g} s and was given up")
             readable = select.select([answers, printed], [], [], remaining_s)[0]
             if printed in readable:
-                self._note_printed(os.read(printed, MOST_PRINTED))
+                self._add_output(os.read(printed, MAX_OUTPUT_BYTES))
             if answers in readable:
                 part = os.read(answers, 1 << 20)
                 if not part:
-                    raise self._given_up(f"ended its process ({self._how_it_ended()})")
+                    raise self._abandonment(f"ended its process ({self._exit_text()})")
                 self._data += part
         end = self._end_of_message
         message = pickle.loads(self._data[LENGTH.size : end])
@@ -176,31 +176,31 @@ class LimitedProcess:
     def _end_of_message(self) -> int:
         return LENGTH.size + LENGTH.unpack_from(self._data)[0]
 
-    def _read_printed(self) -> None:
+    def _read_output(self) -> None:
         """What was printed before the answer, and is still in the pipe. Raises GivenUp."""
         assert self._process is not None
         assert self._process.stderr is not None
         printed = self._process.stderr.fileno()
-        while select.select([printed], [], [], 0)[0] and (part := os.read(printed, MOST_PRINTED)):
-            self._note_printed(part)
+        while select.select([printed], [], [], 0)[0] and (part := os.read(printed, MAX_OUTPUT_BYTES)):
+            self._add_output(part)
 
-    def _show_printed(self) -> None:
+    def _show_output(self) -> None:
         sys.stderr.write(self._printed.decode(errors="replace"))
 
-    def _note_printed(self, part: bytes) -> None:
+    def _add_output(self, part: bytes) -> None:
         self._printed += part
-        if len(self._printed) > MOST_PRINTED:
-            raise self._given_up(f"printed more than {MOST_PRINTED >> 10} KiB")
+        if len(self._printed) > MAX_OUTPUT_BYTES:
+            raise self._abandonment(f"printed more than {MAX_OUTPUT_BYTES >> 10} KiB")
 
-    def _given_up(self, what: str) -> GivenUp:
-        return GivenUp(f"{self._culprit or 'building the law: '}{what}", self._law is not None)
+    def _abandonment(self, reason: str) -> AbandonedJob:
+        return AbandonedJob(f"{self._culprit or 'building the law: '}{reason}", self._law is not None)
 
     @property
     def _culprit(self) -> str:
         """The law whose code ran last, as a sentence begins; empty where none did."""
         return "" if self._law is None else "law {!r} ({}): ".format(*self._law)
 
-    def _how_it_ended(self) -> str:
+    def _exit_text(self) -> str:
         assert self._process is not None
         code = self._process.wait(START_S)
         return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
@@ -217,7 +217,7 @@ class _Clock:
     def remaining_s(self) -> float:
         """Until the limit, if the process waits no longer."""
         passed_s, waited_s = time.monotonic() - self._begin_s, self._waited_s - self._waited_before_s
-        return min(self.limit_s + waited_s, MOST_WAITING * self.limit_s) - passed_s
+        return min(self.limit_s + waited_s, MAX_WAIT_FACTOR * self.limit_s) - passed_s
 
     @property
     def _waited_s(self) -> float:

@@ -57,7 +57,7 @@ class Worker:
             kind, content = pickle.loads(data)
             if kind == PREPARE:
                 preparation = Preparation(*content)
-                function, limit_s = self._prepared(preparation), preparation.limit_s
+                function, limit_s = self._prepare(preparation), preparation.limit_s
                 continue
             self._law = None
             signal.setitimer(signal.ITIMER_PROF, limit_s + SPARE_S)
@@ -65,7 +65,7 @@ class Worker:
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             self._answer(*outcome)
 
-    def _prepared(self, preparation: Preparation) -> Callable[..., Any]:
+    def _prepare(self, preparation: Preparation) -> Callable[..., Any]:
         """The function of a job, with all that it needs loaded, which is acknowledged."""
         os.chdir(preparation.folder)
         sys.path[:] = preparation.module_folders
@@ -85,7 +85,7 @@ class Worker:
             kind, value = self._failure(error)
         if os.getpid() != self._pid:
             os._exit(0)  # a copy of this process that the law's code made; the law is refused for it below
-        if self._law is not None and (fault := _leftover(threads, streams)):
+        if self._law is not None and (fault := _leftover_fault(threads, streams)):
             return "leftover", fault
         return kind, value
 
@@ -100,7 +100,7 @@ class Worker:
                 return "error", str(error)
         if self._law is not None:
             kind, file = self._law
-            return "faults", ("law", [f"law {kind!r} ({file}): raised {_words(error)}{_line(error, file)}"])
+            return "faults", ("law", [f"law {kind!r} ({file}): raised {_error_text(error)}{_line_text(error, file)}"])
         if isinstance(error, ArithmeticError):
             return "faults", ("", [f"its numbers cannot be computed with ({error})"])
         raise error
@@ -125,13 +125,13 @@ def _identity(number: float) -> float:
     return number
 
 
-def _line(error: BaseException, file: str) -> str:
+def _line_text(error: BaseException, file: str) -> str:
     """Where in the law's own file it was raised."""
     lines = [number for frame, number in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == file]
     return f", in line {lines[-1]}" if lines else ""
 
 
-def _words(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     """Type and message of an error on one line, whatever it raises when it is asked for them."""
     try:
         message = " ".join(str(error).split()) + _suggestion(error)
@@ -154,7 +154,7 @@ def _streams() -> list[tuple[int, Any]]:
     return [(os.fstat(number).st_ino, getattr(sys, name)) for number, name in STREAMS.items()]
 
 
-def _leftover(threads: int, streams: list[tuple[int, Any]]) -> str | None:
+def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
     """What the law's code has left behind that would disturb any process that runs it; None where it left nothing."""
     if (more := _thread._count() - threads) > 0:
         return f"left {more} thread{'s' if more > 1 else ''} running"

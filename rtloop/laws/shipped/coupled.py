@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rtloop.hil.native.compiled import jit
-from rtloop.law.layout import MAX_COUPLED, whole_lines
+from rtloop.law.layout import MAX_COUPLED, cache_line_record
 from rtloop.law.validity import Allowed
 from rtloop.laws.contract import CoupledController
 from rtloop.laws.shipped.options import CoupledOptions
 from rtloop.linear.realisation import row_bands
 
 if TYPE_CHECKING:
-    from rtloop.linear.together import SampledTogether
+    from rtloop.linear.together import SampledCoupledSystem
 
 MAX_ORDER = 48
-COEFFICIENTS = whole_lines(
+COEFFICIENTS = cache_line_record(
     [
         ("a", np.float64, (MAX_ORDER, MAX_ORDER)),
         *((name, np.float64, (MAX_ORDER, MAX_COUPLED)) for name in ("b", "tracking", "steady_state")),
@@ -39,7 +39,7 @@ COEFFICIENTS = whole_lines(
         ("share", np.float64),
     ]
 )
-STATE = whole_lines([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float64, (MAX_ORDER,))])
+STATE = cache_line_record([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float64, (MAX_ORDER,))])
 
 
 @jit
@@ -77,7 +77,7 @@ def advance(c, s, told):
 
 
 @jit
-def go_on(c, s, told):
+def continue_from_commands(c, s, told):
     """State from which it continues at commands: its steady state for the errors, corrected along M."""
     for j in range(c.order):
         s.x[j] = 0.0
@@ -106,39 +106,41 @@ class Coupled(CoupledController):
         }
     )
     shipped = True
-    output, update, enter = commands, advance, go_on
+    output, update, enter = commands, advance, continue_from_commands
 
     @cached_property
-    def _built(self) -> tuple[SampledTogether, Any]:
+    def _controller_and_tracking(self) -> tuple[SampledCoupledSystem, Any]:
         """The discrete controller, its decoupling included, and M. Raises ValueError."""
-        from rtloop.linear.antiwindup import antiwindup_together
-        from rtloop.linear.discretise import discretise
-        from rtloop.linear.together import SampledTogether, SystemTogether, beside_each_other, tustin
+        from rtloop.linear.antiwindup import antiwindup_matrix
+        from rtloop.linear.discretise import discretise_controller
+        from rtloop.linear.together import CoupledSystem, SampledCoupledSystem, block_diagonal_system, tustin
 
         options: CoupledOptions = self.options
         decoupling = np.array(options.decoupling) if options.decoupling else np.eye(self.count)
         if options.loops:
             loops = [
-                discretise(loop_options.transfer(), self.period_s, loop_options.method, loop_options.prewarp_hz)
+                discretise_controller(
+                    loop_options.transfer(), self.period_s, loop_options.method, loop_options.prewarp_hz
+                )
                 for loop_options in options.loops
             ]
-            system = beside_each_other([loop.system for loop in loops])
-            loop_tracking = beside_each_other([loop.system._replace(b=loop.antiwindup) for loop in loops]).b
+            system = block_diagonal_system([loop.system for loop in loops])
+            loop_tracking = block_diagonal_system([loop.system._replace(b=loop.antiwindup) for loop in loops]).b
             tracking = loop_tracking @ np.linalg.inv(decoupling)
         else:
             order = len(options.a)
             arrays = [np.array(getattr(options, name), float) for name in "abcd"]
             shapes = ((order, order), (order, self.count), (self.count, order), (self.count, self.count))
             matrices = [matrix.reshape(shape) for matrix, shape in zip(arrays, shapes, strict=True)]
-            system = tustin(SystemTogether(*matrices), self.period_s, options.prewarp_hz)
-            tracking = antiwindup_together(system.a, system.b, decoupling @ system.c)
-        return SampledTogether(system.mixed(after=decoupling), self.period_s), tracking
+            system = tustin(CoupledSystem(*matrices), self.period_s, options.prewarp_hz)
+            tracking = antiwindup_matrix(system.a, system.b, decoupling @ system.c)
+        return SampledCoupledSystem(system.transform(after=decoupling), self.period_s), tracking
 
     def build(self) -> Mapping[str, Any]:
         """Matrices with room behind them. Raises ValueError for too high an order and an unstable anti-windup."""
         from rtloop.linear.antiwindup import tracking_share
 
-        controller, tracking = self._built
+        controller, tracking = self._controller_and_tracking
         a, b, c, d = controller.system
         if controller.order > MAX_ORDER:
             raise ValueError(f"controller: order {controller.order}; at most {MAX_ORDER} is allowed")
@@ -157,6 +159,6 @@ class Coupled(CoupledController):
             "share": tracking_share(a, tracking, c, self.options.tracking_s, self.period_s),
         }
 
-    def linear(self) -> SampledTogether:
+    def linear(self) -> SampledCoupledSystem:
         """From errors to commands."""
-        return self._built[0]
+        return self._controller_and_tracking[0]

@@ -12,7 +12,7 @@ BLOCK = 2 * LANES
 
 
 @jit
-def total(sums, first, second, third, fourth):
+def sum_lanes(sums, first, second, third, fourth):
     """The sum of four partial sums. `sums` keeps them: stored side by side, they are one vector to the compiler."""
     sums[0], sums[1], sums[2], sums[3] = first, second, third, fourth
     return (first + second) + (third + fourth)

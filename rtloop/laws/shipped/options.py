@@ -43,10 +43,10 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
 
     def models(self) -> tuple[PlayModel, PlayModel]:
         """Forward model and inverse, consistent with each other."""
-        return self._built
+        return self._models
 
     @cached_property
-    def _built(self) -> tuple[PlayModel, PlayModel]:
+    def _models(self) -> tuple[PlayModel, PlayModel]:
         """Once, where the options are checked. Raises ValueError for what has no inverse."""
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(
@@ -59,7 +59,7 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
                 raise ValueError(f"inverse_thresholds_um: the first, {inverse.thresholds[0]:g}, must be 0")
             return inverse.inverse(), inverse
         forward = play_model("forward model", self.thresholds_v, self.weights_um_per_v)
-        lowered = forward.without_dead_band()
+        lowered = forward.remove_dead_band()
         return (forward if self.dead_band == "exact" else lowered), lowered.inverse()
 
 

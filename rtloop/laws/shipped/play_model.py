@@ -47,7 +47,7 @@ class PlayModel:
         weights = np.concatenate([[1 / sums[0]], -self.weights[1:] / (sums[1:] * sums[:-1])])
         return PlayModel(thresholds, weights)
 
-    def without_dead_band(self) -> PlayModel:
+    def remove_dead_band(self) -> PlayModel:
         """The same model with all thresholds lowered by the first: what remains behind the dead band r_0."""
         return PlayModel(self.thresholds - self.thresholds[0], self.weights)
 

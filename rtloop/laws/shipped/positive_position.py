@@ -50,7 +50,7 @@ class PositivePosition(Controller):
             raise ValueError(
                 f"gain: {options.gain:g}; times the plant's gain at 0 Hz it is {gain:.4g}, and must be below 1"
             )
-        a, b = held_resonance(2 * math.pi * options.filter_hz, options.damping, self.period_s)
+        a, b = discretise_resonance(2 * math.pi * options.filter_hz, options.damping, self.period_s)
         return {
             "a": a,
             "b": b,
@@ -79,7 +79,9 @@ class PositivePosition(Controller):
         s.integral_um = told.command_um - c.gain * told.position_um
 
 
-def held_resonance(omega: float, damping: float, period_s: float) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+def discretise_resonance(
+    omega: float, damping: float, period_s: float
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²) behind a hold; the states are its output, and its rate over ω."""
     decay, angle = math.exp(-damping * omega * period_s), omega * math.sqrt(1 - damping**2) * period_s
     share = damping / math.sqrt(1 - damping**2)

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.hil.native.compiled import inlined, jit
-from rtloop.law.layout import whole_lines
+from rtloop.hil.native.compiled import jit, jit_inline
+from rtloop.law.layout import cache_line_record
 from rtloop.law.validity import Allowed
 from rtloop.laws.contract import Feedforward
-from rtloop.laws.shipped.lanes import LANES, total
+from rtloop.laws.shipped.lanes import LANES, sum_lanes
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.play_model import MAX_PLAYS
 
-COEFFICIENTS = whole_lines(
+COEFFICIENTS = cache_line_record(
     [
         ("inverse_thresholds_um", np.float64, (MAX_PLAYS,)),
         ("inverse_weights_v_per_um", np.float64, (MAX_PLAYS,)),
@@ -33,7 +33,7 @@ COEFFICIENTS = whole_lines(
         ("dead_band_threshold_v", np.float64),
     ]
 )
-STATE = whole_lines(
+STATE = cache_line_record(
     [
         ("inverse_plays_um", np.float64, (MAX_PLAYS,)),
         ("model_plays_v", np.float64, (MAX_PLAYS,)),
@@ -43,8 +43,8 @@ STATE = whole_lines(
 )
 
 
-@inlined
-def play(value, threshold, last):
+@jit_inline
+def play_output(value, threshold, last):
     """Play operator of half-width `threshold` ≥ 0 after state `last`, by comparisons: NaN and −0 cannot surprise."""
     low = value - threshold
     high = value + threshold
@@ -52,14 +52,14 @@ def play(value, threshold, last):
     return high if high < raised else raised
 
 
-@inlined
+@jit_inline
 def four_plays(value, thresholds, last, i):
     """Plays number i … i + 3 after `value`."""
     return (
-        play(value, thresholds[i], last[i]),
-        play(value, thresholds[i + 1], last[i + 1]),
-        play(value, thresholds[i + 2], last[i + 2]),
-        play(value, thresholds[i + 3], last[i + 3]),
+        play_output(value, thresholds[i], last[i]),
+        play_output(value, thresholds[i + 1], last[i + 1]),
+        play_output(value, thresholds[i + 2], last[i + 2]),
+        play_output(value, thresholds[i + 3], last[i + 3]),
     )
 
 
@@ -77,11 +77,11 @@ def plays_sum(value, thresholds, weights, plays, count, sums):
         second += weights[i + 1] * second_play
         third += weights[i + 2] * third_play
         fourth += weights[i + 3] * fourth_play
-    return total(sums, first, second, third, fourth)
+    return sum_lanes(sums, first, second, third, fourth)
 
 
 @jit
-def moved_plays_sum(value, thresholds, weights, plays, count, sums):
+def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
     """The same sum, and the plays move."""
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
@@ -92,7 +92,7 @@ def moved_plays_sum(value, thresholds, weights, plays, count, sums):
         third += weights[i + 2] * third_play
         fourth += weights[i + 3] * fourth_play
         plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = first_play, second_play, third_play, fourth_play
-    return total(sums, first, second, third, fourth)
+    return sum_lanes(sums, first, second, third, fourth)
 
 
 @jit
@@ -104,7 +104,7 @@ def move_plays(value, thresholds, plays, count):
 
 
 @jit
-def drive_for(c, s, command_um):
+def inverse_drive(c, s, command_um):
     """Drive in V that the inverse gives for a command in µm, dead band included; the memory does not move."""
     drive = plays_sum(
         command_um, c.inverse_thresholds_um, c.inverse_weights_v_per_um, s.inverse_plays_um, c.play_count, s.sums
@@ -119,9 +119,9 @@ def drive_for(c, s, command_um):
 
 
 @jit
-def follow(c, s, drive_v):
+def update_model(c, s, drive_v):
     """Advance the memory by the drive applied, and return v_applied = P̂[u_applied] in µm."""
-    applied_um = moved_plays_sum(
+    applied_um = move_and_sum_plays(
         drive_v, c.model_thresholds_v, c.model_weights_um_per_v, s.model_plays_v, c.play_count, s.sums
     )
     move_plays(applied_um, c.inverse_thresholds_um, s.inverse_plays_um, c.play_count)
@@ -129,7 +129,7 @@ def follow(c, s, drive_v):
 
 
 @jit
-def go_on(c, s, drive_v):
+def enter_at_drive(c, s, drive_v):
     """Another mode may have left the drive anywhere within the dead band."""
     if c.dead_band_v > 0.0:
         s.dead_band_direction = (drive_v - s.model_plays_v[0]) / c.dead_band_v
@@ -143,7 +143,7 @@ class PrandtlIshlinskii(Feedforward):
     coefficients, state = COEFFICIENTS, STATE
     allowed_coefficients = MappingProxyType({"play_count": Allowed(0, MAX_PLAYS, LANES)})
     shipped = True
-    output, update, enter = drive_for, follow, go_on
+    output, update, enter = inverse_drive, update_model, enter_at_drive
 
     def build(self) -> Mapping[str, Any]:
         """Thresholds and weights of the model and of its inverse, padded to whole blocks."""

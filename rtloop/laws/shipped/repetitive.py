@@ -84,11 +84,11 @@ class Repetitive(Controller):
 
     def _require_contraction(self, weights: np.ndarray[Any, Any]) -> None:
         """Raise ValueError where the memory adds to an error from one period to the next, at some frequency."""
-        from rtloop.linear.discretise import held
+        from rtloop.linear.discretise import zero_order_hold
 
         turns = np.linspace(1e-6, 0.5, GRID)
         z = np.exp(2j * np.pi * turns)
-        plant = held(self.model.transfer(), self.period_s).response(z) * z ** -float(self.model.delay_ticks)
+        plant = zero_order_hold(self.model.transfer(), self.period_s).response(z) * z ** -float(self.model.delay_ticks)
         loop = self.options.ki_per_s * self.period_s / (z - 1) * plant
         width = weights.size // 2
         smoothed = np.sum(weights * np.cos(2 * np.pi * np.outer(turns, np.arange(-width, width + 1))), axis=1)
@@ -96,7 +96,8 @@ class Repetitive(Controller):
         if error_growth.max() >= 1:
             hz = turns[np.argmax(error_growth)] / self.period_s
             raise ValueError(
-                f"gain: at {hz:.4g} Hz an error grows to {error_growth.max():.3g} of itself from one period to the next; a "
+                f"gain: at {hz:.4g} Hz an error grows to {error_growth.max():.3g} of itself from one period to the "
+                "next; a "
                 "smaller gain, more smooth_ticks or another lead_ticks is needed (or allow_unstable)"
             )
 

@@ -1,6 +1,6 @@
 """C(z), any linear controller from error to command, in state space: x⁺ = A x + b e, v = c x + d e.
 
-From C(s) by `rtloop.linear.discretise`, which is imported where a law is built and not where it runs.
+From C(s) by `rtloop.linear.discretise_controller`, which is imported where a law is built and not where it runs.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.hil.native.compiled import inlined, jit
-from rtloop.law.layout import whole_lines
+from rtloop.hil.native.compiled import jit, jit_inline
+from rtloop.law.layout import cache_line_record
 from rtloop.law.validity import SWITCH, Allowed
 from rtloop.laws.contract import Controller
-from rtloop.laws.shipped.lanes import BLOCK, LANES, total
+from rtloop.laws.shipped.lanes import BLOCK, LANES, sum_lanes
 from rtloop.laws.shipped.options import TransferControllerOptions
 from rtloop.linear.realisation import blocks, row_bands
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MAX_ORDER = 24
 # States stand in blocks of four pairs, four first ones and then their four partners; A within the pairs is `own` and
 # `partner`, `coupling` holds the rest of A, of whose rows only the columns start ≤ j < stop are non-zero.
-COEFFICIENTS = whole_lines(
+COEFFICIENTS = cache_line_record(
     [
         *((name, np.float64, (MAX_ORDER,)) for name in ("own", "partner", "b", "c", "tracking", "steady_state")),
         ("coupling", np.float64, (MAX_ORDER, MAX_ORDER)),
@@ -40,7 +40,7 @@ COEFFICIENTS = whole_lines(
         ("tracking_share", np.float64),
     ]
 )
-STATE = whole_lines(
+STATE = cache_line_record(
     [
         ("controller", np.float64, (MAX_ORDER,)),
         ("scratch", np.float64, (MAX_ORDER,)),
@@ -63,7 +63,7 @@ def command(c, s, told):
         second += w[i + 1] * x[i + 1] + w[i + 5] * x[i + 5]
         third += w[i + 2] * x[i + 2] + w[i + 6] * x[i + 6]
         fourth += w[i + 3] * x[i + 3] + w[i + 7] * x[i + 7]
-    return total(s.sums, first, second, third, fourth) + c.d * told.error_um
+    return sum_lanes(s.sums, first, second, third, fourth) + c.d * told.error_um
 
 
 @jit
@@ -79,10 +79,10 @@ def advance(c, s, told):
     x = s.controller
     for block in range(c.order // BLOCK):
         i = block * BLOCK
-        state_0, partner_0 = _moved_pair(c, s, i, error_um, shortfall_um)
-        state_1, partner_1 = _moved_pair(c, s, i + 1, error_um, shortfall_um)
-        state_2, partner_2 = _moved_pair(c, s, i + 2, error_um, shortfall_um)
-        state_3, partner_3 = _moved_pair(c, s, i + 3, error_um, shortfall_um)
+        state_0, partner_0 = _next_pair(c, s, i, error_um, shortfall_um)
+        state_1, partner_1 = _next_pair(c, s, i + 1, error_um, shortfall_um)
+        state_2, partner_2 = _next_pair(c, s, i + 2, error_um, shortfall_um)
+        state_3, partner_3 = _next_pair(c, s, i + 3, error_um, shortfall_um)
         x[i], x[i + 1], x[i + 2], x[i + 3] = state_0, state_1, state_2, state_3
         x[i + 4], x[i + 5], x[i + 6], x[i + 7] = partner_0, partner_1, partner_2, partner_3
     if c.coupled != 0:
@@ -91,8 +91,8 @@ def advance(c, s, told):
                 s.controller[i] += c.coupling[i, j] * s.scratch[j]
 
 
-@inlined
-def _moved_pair(c, s, i, error_um, shortfall_um):
+@jit_inline
+def _next_pair(c, s, i, error_um, shortfall_um):
     """States i and i + LANES after a tick, as far as they depend on each other and on the inputs."""
     j = i + LANES
     first = s.controller[i] + c.tracking[i] * shortfall_um
@@ -104,7 +104,7 @@ def _moved_pair(c, s, i, error_um, shortfall_um):
 
 
 @jit
-def go_on(c, s, told):
+def continue_from_command(c, s, told):
     """State from which C continues at a command: its steady state for the error, corrected along m."""
     for i in range(c.order):
         s.controller[i] = c.steady_state[i] * told.error_um
@@ -128,15 +128,15 @@ class TransferController(Controller):
         }
     )
     shipped = True
-    output, update, enter = command, advance, go_on
+    output, update, enter = command, advance, continue_from_command
 
     @cached_property
     def discrete(self) -> DiscreteController:
         """C(z). Raises ValueError for what cannot be discretised."""
-        from rtloop.linear.discretise import discretise
+        from rtloop.linear.discretise import discretise_controller
 
         options: TransferControllerOptions = self.options
-        return discretise(options.transfer(), self.period_s, options.method, options.prewarp_hz)
+        return discretise_controller(options.transfer(), self.period_s, options.method, options.prewarp_hz)
 
     def build(self) -> Mapping[str, Any]:
         """States in the kernels' order. Raises ValueError for too high an order and an unstable anti-windup."""
@@ -148,7 +148,7 @@ class TransferController(Controller):
             raise ValueError(f"controller: order {order}; at most {MAX_ORDER} is allowed")
         a, m, c = controller.a, controller.antiwindup, controller.c
         share = tracking_share(a, m, c, self.options.tracking_s, self.period_s)
-        places = _places(controller.a)
+        places = _kernel_places(controller.a)
         a = np.zeros((MAX_ORDER, MAX_ORDER))
         a[np.ix_(places, places)] = controller.a
         states = np.arange(MAX_ORDER)
@@ -164,11 +164,11 @@ class TransferController(Controller):
             "coupled": bool(a.any()),
             "row_start": bands[:, 0],
             "row_stop": bands[:, 1],
-            "b": _placed(controller.b, places),
-            "c": _placed(c, places),
+            "b": _reorder(controller.b, places),
+            "c": _reorder(c, places),
             "d": controller.d,
-            "tracking": _placed(m, places),
-            "steady_state": _placed(controller.steady_state_gain, places),
+            "tracking": _reorder(m, places),
+            "steady_state": _reorder(controller.steady_state_gain, places),
             "tracking_share": share,
         }
 
@@ -177,13 +177,13 @@ class TransferController(Controller):
         return self.discrete
 
 
-def _placed(values: npt.NDArray[np.float64], places: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def _reorder(values: npt.NDArray[np.float64], places: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
     vector = np.zeros(MAX_ORDER)
     vector[places] = values
     return vector
 
 
-def _places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+def _kernel_places(a: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     """Place of each state in the kernels' order: blocks of four pairs, a pair's two states LANES apart.
 
     The two states of a 2×2 block of A make a pair, and so do the other states, two by two.

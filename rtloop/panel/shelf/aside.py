@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from rtloop.errors import RtloopError
-from rtloop.values import counted
+from rtloop.values import count_text
 
 AT_A_TIME, MOST_WAITING = 2, 8
 TIMEOUT_S = 120.0
@@ -45,7 +45,7 @@ class Aside:
         Raises Crowded, or Failed with its `error`.
         """
         if self._there >= self._most_waiting:
-            raise Crowded(f"{counted(self._most_waiting, 'request')} of this kind wait already; try again")
+            raise Crowded(f"{count_text(self._most_waiting, 'request')} of this kind wait already; try again")
         self._there += 1
         try:
             async with self._turn:

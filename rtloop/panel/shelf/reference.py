@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from rtloop.hil.trusted import open_found
+from rtloop.hil.trusted import open_without_link
 from rtloop.panel.envelope import envelope
 from rtloop.panel.shelf.shelf import shown_name
 from rtloop.panel.stretch import index_of
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.wishes import MAX_PIXELS
-from rtloop.recording.cutting.seek import Seeker
+from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.signals import TICK
@@ -40,8 +40,8 @@ class Wanted(BaseModel):
 
 def sweep(path: Path, wanted: Wanted) -> bytes:
     """The frame. Raises ValueError for what the recording does not have, RecordingError."""
-    with Reader(path, tolerant=True, opener=open_found) as reader:
-        seeker = Seeker(reader)
+    with Reader(path, tolerant=True, opener=open_without_link) as reader:
+        seeker = ChunkSeeker(reader)
         first, end = _stretch(seeker, wanted)
         values = _values(seeker, [index_of(name, reader.columns) for name in wanted.signals], first, end)
         points = envelope(values, wanted.pixels)
@@ -54,8 +54,8 @@ def sweep(path: Path, wanted: Wanted) -> bytes:
         return pack("sweep", header | beside | {"file": shown_name(path.name)}, arrays)
 
 
-def _stretch(seeker: Seeker, wanted: Wanted) -> tuple[int, int]:
-    begin, last, cut = seeker.first(), seeker.last(), seeker.reader.header.get("cut")
+def _stretch(seeker: ChunkSeeker, wanted: Wanted) -> tuple[int, int]:
+    begin, last, cut = seeker.first_span(), seeker.last_span(), seeker.reader.header.get("cut")
     if begin is None or last is None:
         raise ValueError("the recording holds no ticks")
     first, end = (begin.first, last.last + 1) if cut is None else (cut["first"], cut["end"])
@@ -69,10 +69,10 @@ def _stretch(seeker: Seeker, wanted: Wanted) -> tuple[int, int]:
     return first, end
 
 
-def _values(seeker: Seeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
+def _values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
     """(columns, end − first); NaN for ticks that are not there."""
     values = np.full((len(columns), end - first), np.nan)
-    for place in range(seeker.reaching(first), min(seeker.reaching(end - 1) + 1, seeker.end)):
+    for place in range(seeker.find_place(first), min(seeker.find_place(end - 1) + 1, seeker.end)):
         rows = seeker.rows(place, first, end)
         if len(rows):
             values[:, rows[:, TICK].astype(np.intp) - first] = rows[:, columns].T

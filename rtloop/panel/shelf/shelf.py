@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rtloop.errors import RtloopError
-from rtloop.hil.trusted import open_found
-from rtloop.recording.cutting.seek import Seeker
+from rtloop.hil.trusted import open_without_link
+from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.file.reader import Reader
 
 ENDINGS = (".mcap", ".mcap.part")
@@ -95,9 +95,9 @@ class Shelf:
 def _summary(path: Path, size: int) -> dict[str, Any]:
     """Of one file, from its beginning and its end."""
     try:
-        with Reader(path, tolerant=True, opener=open_found) as reader:
-            seeker = Seeker(reader)
-            first, last, end, ticks, span_s = seeker.first(), seeker.last(), seeker.final(), 0, 0.0
+        with Reader(path, tolerant=True, opener=open_without_link) as reader:
+            seeker = ChunkSeeker(reader)
+            first, last, end, ticks, span_s = seeker.first_span(), seeker.last_span(), seeker.final_totals(), 0, 0.0
             if first is not None and last is not None:
                 ticks = last.last + 1 - first.first
                 span_s = (last.last_ns - first.first_ns) / 1e9 + 1 / reader.header["rate_hz"]

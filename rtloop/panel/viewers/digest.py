@@ -11,7 +11,7 @@ from rtloop.hil.modal import Real
 from rtloop.panel.stretch import Stretch
 from rtloop.panel.views.link import Description
 from rtloop.panel.views.past import Past
-from rtloop.signals import COMMON, TICK
+from rtloop.signals import COMMON_SIGNALS, TICK
 
 
 class Taken(NamedTuple):
@@ -34,7 +34,7 @@ class Digest:
 
     def begin(self, loop: Description) -> None:
         """A run of a loop begins."""
-        names = tuple(name for name in loop.names if name != COMMON[TICK].name)
+        names = tuple(name for name in loop.names if name != COMMON_SIGNALS[TICK].name)
         if names != self.names:
             self.names, self._columns = names, [loop.names.index(name) for name in names]
             self.generation += 1

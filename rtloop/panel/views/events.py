@@ -16,7 +16,7 @@ from rtloop.errors import RtloopError
 from rtloop.panel.views.lateness import BEGINS, OVER, Lateness
 from rtloop.panel.views.link import Description, Service
 from rtloop.panel.views.words import OFF, InForce, words
-from rtloop.recording.file.topics.events import Event, event_of
+from rtloop.recording.file.topics.events import Event, event_from_message
 
 KEPT = 200
 ASK_S = 0.2
@@ -76,7 +76,7 @@ class Events:
                 except RtloopError:
                     answers = False
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
-            event = {**event_of(message, tuple(loop.axes), time_ns, name=answer.name), "run": run}
+            event = {**event_from_message(message, tuple(loop.axes), time_ns, name=answer.name), "run": run}
             if answer.change:
                 event["what"]["change"] = answer.change
             if event["kind"] not in (BEGINS, OVER):

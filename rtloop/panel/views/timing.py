@@ -10,7 +10,7 @@ from rtloop.hil.modal import Real
 from rtloop.panel.stretch import Batch, Stretch
 from rtloop.panel.views.frames import pack
 from rtloop.panel.views.link import Description
-from rtloop.signals import COMMON, DEADLINE, EXEC, LATENESS, PERIODS_MISSED
+from rtloop.signals import COMMON_SIGNALS, DEADLINE, EXEC, LATENESS, PERIODS_MISSED
 
 WINDOW_S = 60
 FINE_PER_DECADE, SHOWN_PER_DECADE = 100, 10
@@ -24,7 +24,7 @@ RECENT_S = 10
 MATTERS = 0.05
 """Of a period: less does not matter, however much worse it got."""
 EDGES_US = 10.0 ** np.linspace(*DECADES, (DECADES[1] - DECADES[0]) * FINE_PER_DECADE + 1)
-_LATENESS, _EXEC, _DEADLINE, _MISSED = (COMMON[i].name for i in (LATENESS, EXEC, DEADLINE, PERIODS_MISSED))
+_LATENESS, _EXEC, _DEADLINE, _MISSED = (COMMON_SIGNALS[i].name for i in (LATENESS, EXEC, DEADLINE, PERIODS_MISSED))
 
 
 class Second:

@@ -6,7 +6,7 @@ from typing import Any
 
 from rtloop.law.reference import Generator
 from rtloop.recording.file.topics.events import Event
-from rtloop.values import counted
+from rtloop.values import count_text
 
 OFF, RAW = "off", "raw"
 """Modes, in words. A service whose configuration has no schedule begins with the outputs off."""
@@ -55,7 +55,7 @@ def configured(reference: dict[str, Any]) -> str:
 
 
 def words(event: Event) -> str:
-    """Of an event as `event_of` makes it, of late ticks as `Lateness` does; empty where its kind says all there is."""
+    """Of an event as `event_from_message` makes it, of late ticks as `Lateness` does; empty where its kind says all."""
     what = event["what"]
     match event["kind"]:
         case "set_reference":
@@ -67,7 +67,7 @@ def words(event: Event) -> str:
         case "tripped":
             return what["reason"] or ", ".join(what["causes"])
         case "periods_missed":
-            return f"{counted(what['late_ticks'], 'late tick')}, worst {what['worst_ms']:.3g} ms"
+            return f"{count_text(what['late_ticks'], 'late tick')}, worst {what['worst_ms']:.3g} ms"
     return ""
 
 
@@ -83,7 +83,7 @@ def _reference(values: list[float]) -> str:
         case Generator.CHIRP:
             return f"chirp of {first:.6g} from {second:.6g} to {third:.6g} Hz in {fourth:.6g} s"
         case Generator.TABLE:
-            return f"{counted(int(second), 'sample')}, {'again and again' if fourth else 'once'}"
+            return f"{count_text(int(second), 'sample')}, {'again and again' if fourth else 'once'}"
         case Generator.INPUT:
             return "an input"
     return ""

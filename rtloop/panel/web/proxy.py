@@ -10,7 +10,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from rtloop.errors import HostRefused, UnavailableError
+from rtloop.errors import HostRefusal, UnavailableError
 from rtloop.panel.views.link import Service
 from rtloop.panel.views.state import NO_ANSWER
 from rtloop.panel.web.rates import Rate
@@ -79,7 +79,7 @@ class Proxy:
                 code, kind, data = await self._lanes.run(lane, exchange, *arguments)
         except Unanswered as error:
             return JSONResponse({"error": f"{NO_ANSWER}: {error.reason}"}, status_code=503)
-        except (UnavailableError, HostRefused, Busy) as error:
+        except (UnavailableError, HostRefusal, Busy) as error:
             return JSONResponse({"error": str(error)}, status_code=503)
         return Response(data, code, media_type=kind)
 

@@ -12,7 +12,7 @@ from sys import byteorder
 
 from starlette.types import Scope
 
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_user_file
 
 MAX_CLIENTS = 256
 CONNECTIONS = "/proc/self/net/tcp"
@@ -74,7 +74,7 @@ def client_of(scope: Scope) -> tuple[str, int | None]:
         return "", None
     try:
         ends = [f"{int.from_bytes(inet_aton(host), byteorder):08X}:{port:04X}" for host, port in (client, server)]
-        with os.fdopen(open_named(CONNECTIONS), encoding="ascii") as file:
+        with os.fdopen(open_user_file(CONNECTIONS), encoding="ascii") as file:
             line = next((line for line in file if f" {ends[0]} {ends[1]} {ESTABLISHED} " in line), None)
     except OSError:
         line = None

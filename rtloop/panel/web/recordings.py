@@ -22,7 +22,7 @@ from starlette.routing import BaseRoute, Route
 from starlette.types import Receive, Scope, Send
 
 from rtloop.errors import RtloopError, UnavailableError
-from rtloop.hil.trusted import open_found, open_own
+from rtloop.hil.trusted import open_own, open_without_link
 from rtloop.panel.capture import Run, present_run
 from rtloop.panel.shelf.aside import Aside, Crowded
 from rtloop.panel.shelf.reference import Wanted, sweep
@@ -108,7 +108,7 @@ class Recordings:
         path = await self._path(request)
         name = shown_name(path.name)
         try:
-            file = await self._read(lambda: os.fdopen(open_found(path), "rb"))
+            file = await self._read(lambda: os.fdopen(open_without_link(path), "rb"))
         except OSError as error:
             raise Refused(404, f"{name}: {error.strerror}") from None
         if path.suffix == ".mcap":

@@ -16,7 +16,7 @@ from pathlib import Path
 import uvicorn
 
 from rtloop.errors import OutputError, UnavailableError
-from rtloop.hil.trusted import Untrusted, open_file
+from rtloop.hil.trusted import UntrustedPath, open_file
 from rtloop.panel.viewers.foxglove import PATH, viewers_token
 from rtloop.panel.views.link import Service
 from rtloop.panel.views.wishes import MAX_MESSAGE_BYTES
@@ -79,7 +79,7 @@ def token_of(file: Path) -> str:
     """
     try:
         return _token_in(file)
-    except Untrusted as error:
+    except UntrustedPath as error:
         raise refusal(error) from None
 
 
@@ -93,14 +93,14 @@ def _token_in(file: Path) -> str:
             os.close(fd)
     except FileExistsError:
         pass
-    except Untrusted:
+    except UntrustedPath:
         raise
     except OSError as error:
         raise OutputError(f"{file}: cannot make the panel's token: {error.strerror}") from None
     try:
         with os.fdopen(open_file(file, os.O_RDONLY), encoding="ascii") as opened:
             mode, token = os.fstat(opened.fileno()).st_mode, opened.read(MOST_TOKEN_BYTES).strip()
-    except Untrusted:
+    except UntrustedPath:
         raise
     except (OSError, ValueError) as error:
         raise OutputError(f"{file}: cannot read the panel's token: {error}") from None

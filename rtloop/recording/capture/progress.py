@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.topics.contents import contents_behind, is_ticks, tells_of_ticks
+from rtloop.recording.file.topics.contents import accounts_for_ticks, chunk_contents_from, holds_ticks
 
 
-class Position(NamedTuple):
+class RingPosition(NamedTuple):
     """Up to which ticks, snapshots and events of the rings are in files; how many ticks before it are in none."""
 
     ticks: int
@@ -25,12 +25,12 @@ class Position(NamedTuple):
     events: int
     lost: int
 
-    def at_least(self, other: Position) -> Position:
+    def furthest(self, position: RingPosition) -> RingPosition:
         """This position, or `other` for the rings in which that one is further; `lost` stays."""
-        return Position(
-            max(self.ticks, other.ticks),
-            max(self.snapshots, other.snapshots),
-            max(self.events, other.events),
+        return RingPosition(
+            max(self.ticks, position.ticks),
+            max(self.snapshots, position.snapshots),
+            max(self.events, position.events),
             self.lost,
         )
 
@@ -39,56 +39,58 @@ FLUSHED = (Word.FLUSHED_TICKS, Word.FLUSHED_SNAPSHOTS, Word.FLUSHED_EVENTS, Word
 ANNOUNCED = (Word.ANNOUNCED_TICKS, Word.ANNOUNCED_SNAPSHOTS, Word.ANNOUNCED_EVENTS, Word.ANNOUNCED_LOST)
 
 
-class Progress:
+class RecorderProgress:
     """Of the recorder of `block`. What is announced is what is written, but while a write is under way."""
 
     def __init__(self, block: SharedBlock) -> None:
         self._block = block
 
     @property
-    def written(self) -> Position:
+    def written_position(self) -> RingPosition:
         """As it was noted last."""
         return self._load(FLUSHED)
 
-    def note(self, position: Position) -> None:
+    def store_written(self, position: RingPosition) -> None:
         """All before `position` is in files, or lost."""
         self._store(FLUSHED, position)
         self._store(ANNOUNCED, position)
 
     @contextmanager
-    def writing(self, byte: int, reached: Position) -> Iterator[None]:
+    def announced_write(self, begin_byte: int, end_position: RingPosition) -> Iterator[None]:
         """A write that begins at `byte` of the file and gets to `reached`, or raises and leaves the file as it was."""
-        previous = self.written
-        self._block.store(Word.ANNOUNCED_BYTE, byte)  # first: behind it there is nothing yet, whatever is announced
-        self._store(ANNOUNCED, reached)
+        previous = self.written_position
+        self._block.store(
+            Word.ANNOUNCED_BYTE, begin_byte
+        )  # first: behind it there is nothing yet, whatever is announced
+        self._store(ANNOUNCED, end_position)
         try:
             yield
         except BaseException:
             self._store(ANNOUNCED, previous)
             raise
-        self._store(FLUSHED, reached)
+        self._store(FLUSHED, end_position)
 
-    def found(self, part: Path | None) -> Position:
+    def predecessor_position(self, part: Path | None) -> RingPosition:
         """Where the recorder before this one came to, whose unfinished file is `part`."""
-        position, announced = self.written, self._load(ANNOUNCED)
-        for content in _contents_behind(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
-            if tells_of_ticks(content):
+        position, announced = self.written_position, self._load(ANNOUNCED)
+        for content in _chunk_contents_from(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
+            if accounts_for_ticks(content):
                 position = position._replace(ticks=announced.ticks, lost=announced.lost)
-            if not is_ticks(content):
+            if not holds_ticks(content):
                 position = position._replace(snapshots=announced.snapshots, events=announced.events)
         return position
 
-    def _load(self, words: Sequence[Word]) -> Position:
-        return Position(*map(self._block.load, words))
+    def _load(self, words: Sequence[Word]) -> RingPosition:
+        return RingPosition(*map(self._block.load, words))
 
-    def _store(self, words: Sequence[Word], position: Position) -> None:
+    def _store(self, words: Sequence[Word], position: RingPosition) -> None:
         for word, value in zip(words, position, strict=True):
             self._block.store(word, value)
 
 
-def _contents_behind(part: Path, byte: int) -> list[bytes]:
+def _chunk_contents_from(part: Path, byte: int) -> list[bytes]:
     """The chunks of a file from `byte` on; none where it is not there, or finished."""
     try:
-        return list(contents_behind(part, byte))
+        return list(chunk_contents_from(part, byte))
     except RecordingError:
         return []

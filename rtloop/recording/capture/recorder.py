@@ -27,7 +27,7 @@ from typing import Any
 
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import RtloopError
-from rtloop.recording.capture.names import Names
+from rtloop.recording.capture.names import RequesterNames
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.selective import SelectiveSession
 from rtloop.recording.capture.session import Options, Session
@@ -39,21 +39,21 @@ ABANDONED_S = 5.0
 """With the supervisor gone and no new tick for this long, a loop that still lives is taken as gone too."""
 
 
-class Orders:
+class SupervisorOrders:
     """JSON lines on stdin, read unbuffered, so that its end can be seen."""
 
     def __init__(self) -> None:
-        self._read, self.closed = b"", False
+        self._unread, self.is_closed = b"", False
 
     def next(self, wait_s: float | None = 0.0) -> dict[str, Any] | None:
         """The next line, where it is there or comes within `wait_s`; None: for ever."""
-        while b"\n" not in self._read:
-            if self.closed or not select.select([0], [], [], wait_s)[0]:
+        while b"\n" not in self._unread:
+            if self.is_closed or not select.select([0], [], [], wait_s)[0]:
                 return None
             data = os.read(0, 1 << 16)
-            self.closed = not data
-            self._read += data
-        line, _, self._read = self._read.partition(b"\n")
+            self.is_closed = not data
+            self._unread += data
+        line, _, self._unread = self._unread.partition(b"\n")
         return json.loads(line)
 
 
@@ -66,7 +66,7 @@ class Recorder:
         for name in ("ticks", "snapshots", "events"):
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # compiles, and takes nothing
 
-    def record(self, session: Session, orders: Orders, pause_s: float) -> str:
+    def record(self, session: Session, orders: SupervisorOrders, pause_s: float) -> str:
         """Poll until the end; returns how the loop ended: "finished", "failed" or "abandoned".
 
         "abandoned": the supervisor has closed the orders, or died, and no loop lives that could add a tick.
@@ -74,41 +74,41 @@ class Recorder:
         last_tick_s = time.monotonic()
         while True:
             state = self.block.load(Word.LOOP_STATE)
-            is_orphaned = orders.closed and self.block.driven_by() is None
+            is_orphaned = orders.is_closed and self.block.driver_pid() is None
             drained_count = session.drain()
             while (order := orders.next()) is not None:
-                session.note_removed(order["removed"])
+                session.record_removal(order["removed"])
             self.block.store(Word.RECORDER_CURSOR, session.cursor)
             session.write_due()
             self.block.store(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
             if drained_count:
                 last_tick_s = time.monotonic()
-            elif ProcessState.ended(state):
+            elif ProcessState.has_ended(state):
                 return ProcessState(state).name.lower()
-            elif is_orphaned or (orders.closed and time.monotonic() - last_tick_s > ABANDONED_S):
+            elif is_orphaned or (orders.is_closed and time.monotonic() - last_tick_s > ABANDONED_S):
                 return "abandoned"
-            if drained_count < session.room:
+            if drained_count < session.free_rows:
                 time.sleep(pause_s)
 
 
-def _supervisor_gone() -> bool:
+def _is_supervisor_gone() -> bool:
     """Whether stdin has no writer any more; reads nothing from it."""
     poll = select.poll()
     poll.register(0, 0)
     return bool(poll.poll(0))
 
 
-def run(fd: int, names: Names | None = None) -> int:
+def record_run(fd: int, names: RequesterNames | None = None) -> int:
     """Record one run from the shared block at `fd`; returns the exit code."""
     try:
-        block = SharedBlock.attach(fd, _supervisor_gone)
+        block = SharedBlock.attach(fd, _is_supervisor_gone)
     except EOFError:
         return 0  # there was nothing to record
     recorder = Recorder(block)
     block.store(Word.RECORDER_STATE, ProcessState.READY)
     totals: dict[str, Any]
     try:
-        orders = Orders()
+        orders = SupervisorOrders()
         if (command := orders.next(None)) is None:
             raise RecordingError("the recorder was given no file to write")
         header = command["header"]
@@ -135,7 +135,7 @@ def main() -> int:
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    return run(arguments.fd, None if arguments.names is None else Names(arguments.names))
+    return record_run(arguments.fd, None if arguments.names is None else RequesterNames(arguments.names))
 
 
 if __name__ == "__main__":

@@ -9,26 +9,26 @@ from __future__ import annotations
 import numpy as np
 
 from rtloop.engine.memory import SharedBlock
-from rtloop.recording.capture.pending import tick_of
-from rtloop.recording.capture.progress import Position
+from rtloop.recording.capture.pending import snapshot_tick
+from rtloop.recording.capture.progress import RingPosition
 from rtloop.recording.capture.rings import RingReader
 
-SPARE = 4
+SPARE_DIVISOR = 4
 """This part of the ring of ticks is left to the loop, which runs on while the ticks are copied: one in SPARE."""
 
 
-def snapshot_before(block: SharedBlock, reached: Position) -> Position | None:
+def snapshot_before(block: SharedBlock, end: RingPosition) -> RingPosition | None:
     """The position of the newest snapshot at or before `reached`, with the events from its tick on.
 
     None where the rings do not hold everything since that snapshot.
     """
     snapshots, events = RingReader(block, "snapshots"), RingReader(block, "events")
-    ticks = [tick_of(bytes(snapshot)) for snapshot in snapshots.take()]
-    indices = [place for place, tick in enumerate(ticks) if tick <= reached.ticks]
+    ticks = [snapshot_tick(bytes(snapshot)) for snapshot in snapshots.take()]
+    indices = [place for place, tick in enumerate(ticks) if tick <= end.ticks]
     if not indices:
         return None
     tick, slots = ticks[indices[-1]], len(block["ticks_slots"])
-    if int(block["ticks_head"][0]) - tick > slots - slots // SPARE:
+    if int(block["ticks_head"][0]) - tick > slots - slots // SPARE_DIVISOR:
         return None
     event_ticks = events.take()["tick"]
     earlier_events, oldest = np.flatnonzero(event_ticks < tick), events.position - len(event_ticks)
@@ -36,4 +36,4 @@ def snapshot_before(block: SharedBlock, reached: Position) -> Position | None:
         return None
     event = oldest + int(earlier_events[-1]) + 1 if len(earlier_events) else 0
     snapshot = snapshots.position - len(ticks) + indices[-1]
-    return Position(tick, snapshot, min(event, reached.events), reached.lost)
+    return RingPosition(tick, snapshot, min(event, end.events), end.lost)

@@ -10,78 +10,82 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import writing
-from rtloop.recording.cutting.seek import Seeker
-from rtloop.recording.cutting.source import Source, Stretch
+from rtloop.errors import output_errors
+from rtloop.recording.cutting.seek import ChunkSeeker
+from rtloop.recording.cutting.source import RunSource, TickRange
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.parts import Files, Parts, find_files
+from rtloop.recording.file.parts import RecordingPaths, RunReaders, find_files
 from rtloop.recording.file.reader import Rows
-from rtloop.recording.file.recover import Progress, grows
+from rtloop.recording.file.recover import ReportTicks, is_being_written
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import CUT, GAP, recorder_event
-from rtloop.recording.file.topics.overview import Range, uncovered
-from rtloop.recording.file.topics.ticks import missing
+from rtloop.recording.file.topics.overview import Range, uncovered_ranges
+from rtloop.recording.file.topics.ticks import missing_ranges
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE, TICK
 
-UNFINISHED = ".cutting"
+UNFINISHED_SUFFIX = ".cutting"
 
 
-class Copy:
+class RangeCopy:
     """Copies a stretch into `writer`, and keeps account."""
 
-    def __init__(self, source: Source, writer: Writer, stretch: Stretch) -> None:
-        self._source, self._writer, self._stretch = source, writer, stretch
-        self._next, self._end_ns = stretch.first, 0.0
+    def __init__(self, source: RunSource, writer: Writer, tick_range: TickRange) -> None:
+        self._source, self._writer, self._range = source, writer, tick_range
+        self._next_tick, self._end_ns = tick_range.first, 0.0
         self.gaps: list[tuple[int, int]] = []
         """(first tick, how many) of what is missing."""
-        self._said: list[dict[str, Any]] = []
-        self._skipped: list[Range] = []
+        self._recorded_gaps: list[dict[str, Any]] = []
+        self._skipped_ranges: list[Range] = []
 
-    def run(self, progress: Progress | None) -> None:
+    def run(self, progress: ReportTicks | None) -> None:
         """All of it, in order."""
-        for messages, rows in self._source.contents(self._stretch):
+        for messages, rows in self._source.contents(self._range):
             self._writer.write_messages(messages)
             self._writer.write_ticks(rows)
-            self._skipped += self._source.skipped(messages)
-            self._said += [gap for message in messages if (gap := _gap(message))]
+            self._skipped_ranges += self._source.skipped_ranges(messages)
+            self._recorded_gaps += [gap for message in messages if (gap := _recorded_gap(message))]
             if len(rows):
-                self._note(rows)
+                self._account(rows)
             if progress:
                 progress(self._writer.ticks)
-        if self._next < self._stretch.end:
-            self.gaps.append((self._next, self._stretch.end - self._next))
-        self.gaps = [piece for first, count in self.gaps for piece in uncovered(first, first + count, self._skipped)]
+        if self._next_tick < self._range.end:
+            self.gaps.append((self._next_tick, self._range.end - self._next_tick))
+        self.gaps = [
+            piece
+            for first, count in self.gaps
+            for piece in uncovered_ranges(first, first + count, self._skipped_ranges)
+        ]
 
     @property
-    def unexplained(self) -> int:
+    def unexplained_ticks(self) -> int:
         """Missing ticks of which the recorder says nothing: what held them is damaged, or was lost with a file."""
         return sum(count for _, count in self.gaps) - sum(
             max(min(first + count, gap["first_tick"] + gap["count"]) - max(first, gap["first_tick"]), 0)
             for first, count in self.gaps
-            for gap in self._said
+            for gap in self._recorded_gaps
         )
 
-    def final(self, logged: int) -> Message:
+    def final_message(self, ticks_logged: int) -> Message:
         """The event that ends the file."""
-        skipped = self._writer.skipped
-        lost = self._stretch.end - self._stretch.first - logged - skipped
-        totals = {"ticks_executed": self._stretch.end, "ticks_logged": logged, "ticks_lost": lost, "events_lost": 0}
+        skipped = self._writer.ticks_skipped
+        lost = self._range.end - self._range.first - ticks_logged - skipped
+        totals = {"ticks_executed": self._range.end, "ticks_logged": ticks_logged, "ticks_lost": lost, "events_lost": 0}
         totals |= {"ticks_skipped": skipped} if self._source.header.get("around") else {}
         problems = self._source.problems
         details = totals | {"result": CUT, "complete": lost == 0 and not problems, "problems": problems}
-        event = recorder_event(CUT, self._stretch.end, round(self._end_ns), details)
+        event = recorder_event(CUT, self._range.end, round(self._end_ns), details)
         return Message(format.EVENTS, self._writer.start_unix_ns + round(self._end_ns), json.dumps(event).encode())
 
-    def _note(self, rows: Rows) -> None:
-        self.gaps += missing(rows[:, TICK], self._next)
-        self._next = int(rows[-1, TICK]) + 1
+    def _account(self, rows: Rows) -> None:
+        self.gaps += missing_ranges(rows[:, TICK], self._next_tick)
+        self._next_tick = int(rows[-1, TICK]) + 1
         self._end_ns = float(rows[-1, DEADLINE]) + 1e9 / self._source.header["rate_hz"]
 
 
 def cut(
-    files: Files,
+    files: RecordingPaths,
     first: int | None = None,
     end: int | None = None,
     output: Path | None = None,
@@ -89,7 +93,7 @@ def cut(
     from_s: float | None = None,
     until_s: float | None = None,
     min_free_bytes: int = 0,
-    progress: Progress | None = None,
+    progress: ReportTicks | None = None,
 ) -> dict[str, Any]:
     """Write the ticks from `first` to before `end` of a recording, whole, rotated or still growing, as one of its own.
 
@@ -102,20 +106,24 @@ def cut(
     RecordingError for a stretch that is not in the recording or has no snapshot to begin from, OutputError for an
     output that exists or cannot be written.
     """
-    with Parts(find_files(files)) as readers:
-        source = Source([Seeker(reader) for reader in readers])
-        requested_range = _asked(source, first, end, from_s, until_s)
-        copied_range = source.kept(requested_range)
+    with RunReaders(find_files(files)) as readers:
+        source = RunSource([ChunkSeeker(reader) for reader in readers])
+        requested_range = _requested_range(source, first, end, from_s, until_s)
+        copied_range = source.replayable_range(requested_range)
         output = output or cut_path(source.path, requested_range.first)
         header = source.header | {
             "first_tick": copied_range.first,
             "ticks_expected": copied_range.end - copied_range.first,
-            "cut": {"first": requested_range.first, "end": requested_range.end, "files": source.files(copied_range)},
+            "cut": {
+                "first": requested_range.first,
+                "end": requested_range.end,
+                "files": source.file_names(copied_range),
+            },
         }
-        copy, ticks = _write(source, copied_range, header, output, min_free_bytes, progress)
+        copy, ticks = _write_copy(source, copied_range, header, output, min_free_bytes, progress)
         problems = [*source.problems]
-        if copy.unexplained:
-            problems.append(f"{copy.unexplained} of its ticks are not in the recording, and no gap says why")
+        if copy.unexplained_ticks:
+            problems.append(f"{copy.unexplained_ticks} of its ticks are not in the recording, and no gap says why")
         return {
             "recording": str(source.path),
             "output": str(output),
@@ -134,14 +142,16 @@ def cut_path(path: Path, tick: int, kind: str = "cut") -> Path:
     return path.with_name(f"{path.name.removesuffix('.part').removesuffix('.mcap')}.{kind}-{tick}.mcap")
 
 
-def _asked(source: Source, first: int | None, end: int | None, from_s: float | None, until_s: float | None) -> Stretch:
+def _requested_range(
+    source: RunSource, first: int | None, end: int | None, from_s: float | None, until_s: float | None
+) -> TickRange:
     """The stretch that is meant. Raises RecordingError."""
-    full_range = source.whole
+    full_range = source.full_range
     if from_s is not None:
-        first = source.due(from_s)
+        first = source.first_tick_due(from_s)
     if until_s is not None:
-        end = source.due_or_skipped(until_s)
-    requested = Stretch(full_range.first if first is None else first, full_range.end if end is None else end)
+        end = source.first_tick_due_or_skipped(until_s)
+    requested = TickRange(full_range.first if first is None else first, full_range.end if end is None else end)
     label = f"{source.path}: ticks from {requested.first} to before {requested.end}"
     if not requested.first < requested.end:
         raise RecordingError(f"{label}: no stretch; the end comes behind the beginning")
@@ -150,28 +160,35 @@ def _asked(source: Source, first: int | None, end: int | None, from_s: float | N
     return requested
 
 
-def _write(
-    source: Source, stretch: Stretch, header: dict[str, Any], output: Path, least: int, progress: Progress | None
-) -> tuple[Copy, int]:
+def _write_copy(
+    source: RunSource,
+    tick_range: TickRange,
+    header: dict[str, Any],
+    output: Path,
+    min_free_bytes: int,
+    progress: ReportTicks | None,
+) -> tuple[RangeCopy, int]:
     """The copy, and the ticks in it. Raises OutputError, RecordingError; nothing of the output is left then."""
-    unfinished_path = output.with_name(output.name + UNFINISHED)
-    with writing(output):
-        if unfinished_path.exists() and not grows(unfinished_path):
+    unfinished_path = output.with_name(output.name + UNFINISHED_SUFFIX)
+    with output_errors(output):
+        if unfinished_path.exists() and not is_being_written(unfinished_path):
             unfinished_path.unlink()
     log_time = header["created_unix_ns"] if header["paced"] else 0
-    writer = Writer(output, header, log_time, message_index=True, min_free_bytes=least, suffix=UNFINISHED)
+    writer = Writer(
+        output, header, log_time, message_index=True, min_free_bytes=min_free_bytes, suffix=UNFINISHED_SUFFIX
+    )
     try:
         writer.start_unix_ns = source.start_unix_ns
-        copy = Copy(source, writer, stretch)
+        copy = RangeCopy(source, writer, tick_range)
         copy.run(progress)
-        writer.finish(copy.final, whole=True)
+        writer.finish(copy.final_message, require_all=True)
     except BaseException:
         writer.discard()
         raise
     return copy, writer.ticks
 
 
-def _gap(message: Message) -> dict[str, Any] | None:
+def _recorded_gap(message: Message) -> dict[str, Any] | None:
     """What a message says of missing ticks."""
     if message.channel != format.EVENTS:
         return None

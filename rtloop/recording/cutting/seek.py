@@ -16,10 +16,10 @@ from rtloop.recording.file.topics.format import EVENTS
 from rtloop.recording.file.topics.ticks import Ticks
 from rtloop.signals import DEADLINE, TICK
 
-REMEMBERED = 1 << 14
+CACHED_SPANS = 1 << 14
 
 
-class Span(NamedTuple):
+class ChunkSpan(NamedTuple):
     """The ticks of a chunk, and when the first and the last of them were due, in ns since the start."""
 
     first: int
@@ -28,13 +28,13 @@ class Span(NamedTuple):
     last_ns: float
 
 
-class Seeker:
+class ChunkSeeker:
     """Places of chunks in an open file. What is damaged is passed over, and named in the reader's problems."""
 
     def __init__(self, reader: Reader) -> None:
         self.reader = reader
-        self.span = lru_cache(REMEMBERED)(self._span)
-        self.chunk = lru_cache(2)(self._chunk)
+        self.span = lru_cache(CACHED_SPANS)(self._read_span)
+        self.chunk = lru_cache(2)(self._read_chunk)
         self.damage: dict[int, list[str]] = {}
         """What is wrong with a chunk that was looked at, by its place."""
 
@@ -43,15 +43,15 @@ class Seeker:
         """The place behind the last chunk."""
         return len(self.reader.entries)
 
-    def first(self) -> Span | None:
+    def first_span(self) -> ChunkSpan | None:
         """The first chunk with ticks."""
         return next(filter(None, map(self.span, range(self.end))), None)
 
-    def last(self) -> Span | None:
+    def last_span(self) -> ChunkSpan | None:
         """The last chunk with ticks."""
         return next(filter(None, map(self.span, reversed(range(self.end)))), None)
 
-    def final(self) -> dict[str, Any] | None:
+    def final_totals(self) -> dict[str, Any] | None:
         """What was counted at the end of the file; None where it was not finished."""
         content = self.chunk(self.end - 1)
         events = (
@@ -61,18 +61,18 @@ class Seeker:
         )
         return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
 
-    def reaching(self, tick: int) -> int:
+    def find_place(self, tick: int) -> int:
         """Place of the first chunk that has `tick` or a later one; `end` where none has."""
         return self._first_place(lambda span: span.last >= tick)
 
-    def has(self, tick: int) -> bool:
+    def has_tick(self, tick: int) -> bool:
         """Whether a tick is there."""
-        return len(self.rows(self.reaching(tick), tick, tick + 1)) > 0
+        return len(self.rows(self.find_place(tick), tick, tick + 1)) > 0
 
-    def due(self, time_ns: float) -> int | None:
+    def first_tick_due(self, time_ns: float) -> int | None:
         """The first tick that was due at `time_ns` since the start, or later; None where all were due before."""
         place = self._first_place(lambda span: span.last_ns >= time_ns)
-        rows = self._rows(place)
+        rows = self._all_rows(place)
         due_rows = rows[rows[:, DEADLINE] >= time_ns] if len(rows) else rows
         return int(due_rows[0, TICK]) if len(due_rows) else None
 
@@ -81,15 +81,15 @@ class Seeker:
         span = self.span(place) if place < self.end else None
         if span is None or span.last < first or span.first >= end:
             return np.empty((0, 0))
-        rows = self._rows(place)
+        rows = self._all_rows(place)
         begin, stop = np.searchsorted(rows[:, TICK], [first, end])
         return rows[begin:stop]
 
-    def _rows(self, place: int) -> Rows:
+    def _all_rows(self, place: int) -> Rows:
         content = self.chunk(place) if place < self.end else None
         return content.rows if isinstance(content, Ticks) else np.empty((0, 0))
 
-    def _chunk(self, place: int) -> Ticks | list[Message] | None:
+    def _read_chunk(self, place: int) -> Ticks | list[Message] | None:
         """What the chunk at a place holds; None where it is damaged."""
         problem_count = len(self.reader.left_out)
         content = self.reader.chunk(self.reader.entries[place])
@@ -97,14 +97,16 @@ class Seeker:
             self.damage[place] = self.reader.left_out[problem_count:]
         return content
 
-    def _span(self, place: int) -> Span | None:
+    def _read_span(self, place: int) -> ChunkSpan | None:
         """Of the chunk at a place; None where it holds no ticks."""
-        rows = self._rows(place)
+        rows = self._all_rows(place)
         return (
-            Span(*(int(rows[row, TICK]) for row in (0, -1)), *rows[[0, -1], DEADLINE].tolist()) if len(rows) else None
+            ChunkSpan(*(int(rows[row, TICK]) for row in (0, -1)), *rows[[0, -1], DEADLINE].tolist())
+            if len(rows)
+            else None
         )
 
-    def _first_place(self, met: Callable[[Span], bool]) -> int:
+    def _first_place(self, condition: Callable[[ChunkSpan], bool]) -> int:
         """The first place whose span meets a condition that all behind it meet as well."""
         low, high, first_place = 0, self.end, self.end
         while low < high:
@@ -113,7 +115,7 @@ class Seeker:
             span = None if place is None else self.span(place)
             if place is None or span is None:
                 high = middle
-            elif met(span):
+            elif condition(span):
                 high, first_place = middle, place
             else:
                 low = place + 1

@@ -22,11 +22,11 @@ from mcap.records import Message as McapMessage
 from rtloop.errors import OutputError
 from rtloop.hil.trusted import open_own
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.mcap.chunks import Source
+from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import MESSAGE_HEAD, DamagedChunk, pack_message
 from rtloop.recording.file.mcap.stock import described, encoding, read_messages
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.checked import final_event
+from rtloop.recording.file.topics.checked import parse_final_event
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.header import read_header
 from rtloop.recording.file.topics.ticks import TickLayout
@@ -39,7 +39,7 @@ _copies: dict[tuple[int, ...], int] = {}
 _lock = threading.Lock()
 
 
-def converted(source: Source) -> Source:
+def converted(source: McapSource) -> McapSource:
     """Open the copy of a file in rtloop's own layout; the first call for a file makes it.
 
     Raises RecordingError where the file holds no recording, or one that cannot be converted.
@@ -48,10 +48,10 @@ def converted(source: Source) -> Source:
         if source.identity not in _copies:
             _copies[source.identity] = _copy(source)
         copy = _copies[source.identity]
-    return Source(source.path, lambda _: os.dup(copy))
+    return McapSource(source.path, lambda _: os.dup(copy))
 
 
-def _copy(source: Source) -> int:
+def _copy(source: McapSource) -> int:
     """Convert a file. Returns the descriptor of the copy. Raises RecordingError."""
     with tempfile.TemporaryDirectory(prefix="rtloop-") as folder:
         conversion = _Conversion(source.path, Path(folder) / "copy.mcap")
@@ -115,7 +115,7 @@ class _Conversion:
         if self._final is None:  # a recording without an end stays one
             return self._writer.part
         final = self._final
-        self._writer.finish(lambda _: final, whole=True)
+        self._writer.finish(lambda _: final, require_all=True)
         return self._target
 
     def close(self) -> None:
@@ -143,7 +143,11 @@ class _Conversion:
     def _add_other(self, message: Message) -> None:
         if self._ticks and message.log_time > self._ticks[-1].log_time:
             self._flush()
-        if self._writer and message.channel == format.EVENTS and final_event(message.payload, self._header["axes"]):
+        if (
+            self._writer
+            and message.channel == format.EVENTS
+            and parse_final_event(message.payload, self._header["axes"])
+        ):
             self._final = message
             return
         self._others.append(message)
@@ -191,7 +195,7 @@ class _Conversion:
             return
         content = b"".join(pack_message(format.TICKS, tick.log_time, tick.data) for tick in self._ticks)
         self._ticks = []
-        ticks, start_ns = self._layout.ticks(content, self._layout.columns), self._layout.start_ns(content)
+        ticks, start_ns = self._layout.parse_ticks(content, self._layout.columns), self._layout.start_ns(content)
         if self._last_tick < 0:
             self._writer.start_unix_ns = start_ns
         if ticks.first <= self._last_tick:

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.conversion import converted
-from rtloop.recording.file.mcap.chunks import Entry, Source, indexed_chunks, scanned_chunks
+from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, read_chunk_index, scan_chunks
 from rtloop.recording.file.mcap.container import MAGIC, DamagedChunk, unpack_chunk
 from rtloop.recording.file.mcap.stock import library
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import read_chunk
-from rtloop.recording.file.topics.header import own_header, read_header
+from rtloop.recording.file.topics.header import own_header_payload, read_header
 
-OWN = (format.LIBRARY, "")
+OWN_LIBRARIES = (format.LIBRARY, "")
 """What the first record says of who wrote the file, if it says it."""
 
 
-class Own:
+class OwnLayout:
     """The chunks of a file that rtloop wrote. Raises DamagedChunk where it is none, or its beginning is damaged.
 
     Raises RecordingError where its header is malformed.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: McapSource) -> None:
         self._source = source
         self.problems: list[str] = []
         self.left_out: list[str] = []
@@ -29,9 +29,9 @@ class Own:
         if not self.entries:
             raise DamagedChunk("it holds no chunk")
         content = self.content(self.entries[0])
-        self.header = read_header(source.path, own_header(content), content)
+        self.header = read_header(source.path, own_header_payload(content), content)
 
-    def content(self, entry: Entry) -> bytes:
+    def content(self, entry: ChunkEntry) -> bytes:
         """What a chunk holds. Raises DamagedChunk."""
         return unpack_chunk(read_chunk(self._source, entry))
 
@@ -41,31 +41,31 @@ class Own:
         offsets = (entry.index.message_index_offsets for entry in self.entries if entry.index)
         return any(len(channels) > 1 and format.TICKS in channels for channels in offsets)
 
-    def _find_chunks(self) -> list[Entry]:
+    def _find_chunks(self) -> list[ChunkEntry]:
         try:
-            return indexed_chunks(self._source)
+            return read_chunk_index(self._source)
         except DamagedChunk as reason:
-            entries, problems = scanned_chunks(self._source)
+            entries, problems = scan_chunks(self._source)
             self.problems += [f"{reason}: read from the beginning, without its index", *problems]
             self.left_out += problems
             return entries
 
 
-def open_layout(source: Source) -> tuple[Source, Own]:
+def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
     """The chunks of a recording, and the file that holds them: `source`, or its copy where another tool wrote it.
 
     Raises RecordingError where the file holds no recording, or is damaged or of a newer version.
     """
-    if library(source) not in OWN:
+    if library(source) not in OWN_LIBRARIES:
         try:
             return _open_converted(source)
         except RecordingError as reason:
             try:  # it may be rtloop's own with a damaged name
-                return source, Own(source)
+                return source, OwnLayout(source)
             except DamagedChunk:
                 raise reason from None
     try:
-        own = Own(source)
+        own = OwnLayout(source)
     except DamagedChunk as damage:
         try:
             return _open_converted(source)
@@ -76,9 +76,9 @@ def open_layout(source: Source) -> tuple[Source, Own]:
     return _open_converted(source) if own.is_mixed else (source, own)
 
 
-def _open_converted(source: Source) -> tuple[Source, Own]:
+def _open_converted(source: McapSource) -> tuple[McapSource, OwnLayout]:
     """The chunks of the copy of `source`, which is closed. Raises RecordingError."""
     copy = converted(source)
-    own = Own(copy)
+    own = OwnLayout(copy)
     source.close()
     return copy, own

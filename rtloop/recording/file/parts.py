@@ -11,15 +11,15 @@ from pathlib import Path
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.events import ROTATED
-from rtloop.recording.file.topics.header import OF_A_RUN, absent, absent_part
+from rtloop.recording.file.topics.header import RUN_KEYS, missing_part_message, missing_part_messages
 
-Files = Path | str | Sequence[Path | str]
+RecordingPaths = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""
 
 
-def find_files(given: Files) -> list[Path]:
+def find_files(files: RecordingPaths) -> list[Path]:
     """The files that are meant. Raises RecordingError where a pattern fits none."""
-    items = [given] if isinstance(given, str | Path) else list(given)
+    items = [files] if isinstance(files, str | Path) else list(files)
     paths: list[Path] = []
     for item in items:
         if glob.has_magic(str(item)) and not Path(item).exists():
@@ -34,13 +34,13 @@ def find_files(given: Files) -> list[Path]:
     return paths
 
 
-def files_of_run(path: Path, suffix: str) -> list[Path]:
+def run_files(path: Path, suffix: str) -> list[Path]:
     """The files with an ending of the run whose recording is `path`, NAME.mcap, in their order."""
     folder, stem = path.parent, glob.escape(path.stem)
     return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 
 
-class Parts(ExitStack):
+class RunReaders(ExitStack):
     """Tolerant readers of the files of one run, in its order, closed together.
 
     Entering raises RecordingError where the files are not of one run.
@@ -55,25 +55,25 @@ class Parts(ExitStack):
             readers = [self.enter_context(Reader(path, tolerant=True)) for path in self._paths]
             readers.sort(key=_sequence)
             _require_one_run(readers)
-            _take_each_tick_once(readers)
+            _assign_ticks(readers)
             return readers
         except BaseException:
             self.close()
             raise
 
 
-def absent_parts(readers: Sequence[Reader]) -> list[str]:
+def missing_parts(readers: Sequence[Reader]) -> list[str]:
     """What is missing before, between or behind the files of a rotated run. One file alone is a whole recording."""
     numbers, last = [_sequence(reader) for reader in readers], readers[-1].totals
     is_continued = len(readers) > 1 and last is not None and last["result"] == ROTATED
-    return [*absent(numbers), *([absent_part(numbers[-1] + 1)] if is_continued else [])]
+    return [*missing_part_messages(numbers), *([missing_part_message(numbers[-1] + 1)] if is_continued else [])]
 
 
 def _sequence(reader: Reader) -> int:
     return int(reader.header.get("sequence", 1))
 
 
-def _take_each_tick_once(readers: Sequence[Reader]) -> None:
+def _assign_ticks(readers: Sequence[Reader]) -> None:
     """Have each part begin where those before it end; what a part repeats is taken from the one before it.
 
     A part that was not finished ends, by what the next one says, where that one's repetition does.
@@ -83,16 +83,16 @@ def _take_each_tick_once(readers: Sequence[Reader]) -> None:
         is_next = _sequence(reader) == _sequence(previous) + 1
         repeats_before = reader.header.get("repeats_before") if is_next else None
         end_tick = max(end_tick, previous.totals["ticks_executed"] if previous.totals else repeats_before or 0)
-        reader.begin_at(end_tick)
+        reader.restrict_begin(end_tick)
         if repeats_before is not None and (reader.totals is None or reader.totals["ticks_executed"] > end_tick):
             for earlier_reader in readers[:number]:
-                earlier_reader.end_at(min(repeats_before, end_tick))
+                earlier_reader.restrict_end(min(repeats_before, end_tick))
 
 
 def _require_one_run(readers: Sequence[Reader]) -> None:
     first, numbers = readers[0], [_sequence(reader) for reader in readers]
     for reader in readers[1:]:
-        if any(reader.header.get(key) != first.header.get(key) for key in OF_A_RUN):
+        if any(reader.header.get(key) != first.header.get(key) for key in RUN_KEYS):
             raise RecordingError(f"{reader.path}: is not of the same run as {first.path}")
     for reader, number, next_number in zip(readers[1:], numbers, numbers[1:], strict=False):
         if number == next_number:

@@ -18,24 +18,24 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rtloop.hil.trusted import open_named
+from rtloop.hil.trusted import open_user_file
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.account import Account
+from rtloop.recording.file.account import TickAccount
 from rtloop.recording.file.layout import open_layout
-from rtloop.recording.file.mcap.chunks import Entry, Opener, Source
+from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, Opener
 from rtloop.recording.file.mcap.container import DamagedChunk
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.checked import Malformed, event_from
+from rtloop.recording.file.topics.checked import MalformedText, parse_event
 from rtloop.recording.file.topics.contents import (
     Message,
-    is_ticks,
+    holds_ticks,
     may_hold,
-    may_tell,
+    may_hold_slow,
     overlaps,
     split_messages,
 )
 from rtloop.recording.file.topics.events import FINAL, RECORDER, Event
-from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Range, plausible, ranges
+from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, Range, are_plausible, tick_ranges
 from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 
 Rows = np.ndarray[Any, Any]
@@ -56,14 +56,14 @@ class Reader:
     """An open recording. `tolerant`: what is damaged is left out and named in `problems` instead of raising.
 
     `left_out` are those of the problems for which something is missing from what is read. `opener` opens the file:
-    `open_named` of `rtloop.hil.trusted` for one that a user named, another for one found in a folder.
+    `open_user_file` of `rtloop.hil.is_trusted` for one that a user named, another for one found in a folder.
 
     Raises RecordingError, here and while reading.
     """
 
-    def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_named) -> None:
+    def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_user_file) -> None:
         self.path, self.tolerant = Path(path), tolerant
-        self._source = Source(self.path, opener)
+        self._source = McapSource(self.path, opener)
         self.size_bytes: int = self._source.size
         """Size of the file."""
         try:
@@ -76,9 +76,9 @@ class Reader:
         self.problems = [*self._layout.problems]
         self.left_out = [*self._layout.left_out]
         self.columns: tuple[str, ...] = tuple(self.header["columns"])
-        self._ticks, self._overview = TickLayout(self.columns), OverviewLayout(self.columns)
+        self._tick_layout, self._overview_layout = TickLayout(self.columns), OverviewLayout(self.columns)
         self.first_tick: int = self.header.get("first_tick", 0)
-        self._repeated_before, self._end_tick = 0, round(LARGEST) + 1
+        self._end_of_repetition, self._end_tick = 0, round(LARGEST) + 1
 
     def __enter__(self) -> Self:
         return self
@@ -90,23 +90,23 @@ class Reader:
         """Close the file."""
         self._source.close()
 
-    def begin_at(self, tick: int) -> None:
+    def restrict_begin(self, tick: int) -> None:
         """Take nothing before `tick`, which parts of the run before this one hold; some of it may stand here again."""
-        self._repeated_before = min(self.header.get("repeats_before", 0), tick)
+        self._end_of_repetition = min(self.header.get("repeats_before", 0), tick)
         self.first_tick = max(self.first_tick, tick)
 
-    def end_at(self, tick: int) -> None:
+    def restrict_end(self, tick: int) -> None:
         """Leave the events and snapshots from `tick` on to a later part, which holds them as well."""
         self._end_tick = min(self._end_tick, tick)
 
     def owns(self, tick: int) -> bool:
         """Whether the loop's events and snapshots of a tick are to be taken from this part of the run."""
-        return self._repeated_before <= tick < self._end_tick
+        return self._end_of_repetition <= tick < self._end_tick
 
     @property
-    def repeated(self) -> int:
+    def repeated_ticks(self) -> int:
         """Ticks at the beginning of the file that are taken from a part before it."""
-        return max(self._repeated_before - self.header.get("first_tick", 0), 0)
+        return max(self._end_of_repetition - self.header.get("first_tick", 0), 0)
 
     @cached_property
     def start_unix_ns(self) -> int:
@@ -114,61 +114,61 @@ class Reader:
         for entry in self.tick_chunks:
             try:
                 content = self._content(entry)
-                if is_ticks(content):
-                    return self._ticks.start_ns(content)
+                if holds_ticks(content):
+                    return self._tick_layout.start_ns(content)
             except DamagedChunk:
                 continue
         return int(self.header["created_unix_ns"])
 
     @property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[ChunkEntry]:
         """All chunks, in the order of the file."""
         return self._entries
 
-    def chunk(self, entry: Entry) -> Ticks | list[Message] | None:
+    def chunk(self, entry: ChunkEntry) -> Ticks | list[Message] | None:
         """What a chunk holds: its ticks or its messages of the slow topics; None where it is damaged."""
         try:
             content = self._content(entry)
-            if is_ticks(content):
-                return self._ticks.ticks(content, self.columns)
-            return self._checked(split_messages(content))
+            if holds_ticks(content):
+                return self._tick_layout.parse_ticks(content, self.columns)
+            return self._valid_messages(split_messages(content))
         except DamagedChunk as reason:
-            self._leave_out(entry, reason)
+            self._report_chunk(entry, reason)
             return None
 
     @property
-    def tick_chunks(self) -> list[Entry]:
+    def tick_chunks(self) -> list[ChunkEntry]:
         """The chunks that may hold ticks."""
         return [entry for entry in self._entries if may_hold(entry, format.TICKS)]
 
-    def chunks_between(self, start_s: float, end_s: float) -> list[Entry] | None:
+    def chunks_between(self, start_s: float, end_s: float) -> list[ChunkEntry] | None:
         """The chunks that may hold ticks due between two times, in s since the start; None stands for all of them."""
         if start_s <= 0.0 and math.isinf(end_s):
             return None
         start_ns, end_ns = start_s * 1e9 + self.start_unix_ns, end_s * 1e9 + self.start_unix_ns
         return [entry for entry in self.tick_chunks if overlaps(entry, start_ns, end_ns)]
 
-    def blocks(self, names: Sequence[str] | None = None, entries: Iterable[Entry] | None = None) -> Iterator[Rows]:
+    def blocks(self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None) -> Iterator[Rows]:
         """Arrays (n, columns) float64 of consecutive ticks in order; only the columns `names`, if given.
 
         `entries` restricts it to some of `tick_chunks`. Decompression runs ahead in threads.
         """
-        columns = self._known(self.columns if names is None else names)
-        account = Account(self.first_tick, self.totals, self._repeated_before)
-        for entry, future in self._ahead(self.tick_chunks if entries is None else entries, columns):
+        columns = self._require_columns(self.columns if names is None else names)
+        account = TickAccount(self.first_tick, self.totals, self._end_of_repetition)
+        for entry, future in self._decompress_ahead(self.tick_chunks if entries is None else entries, columns):
             try:
                 ticks = future.result()
                 if ticks is not None and (ticks := account.add(ticks)) is not None:
                     yield ticks.rows
             except DamagedChunk as reason:
-                self._leave_out(entry, reason)
+                self._report_chunk(entry, reason)
         if entries is None:
-            self._close(account)
+            self._check_count(account)
 
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
         """The snapshots of the law behind tick `before`, in order, each verified by its digest."""
         for message in self._messages(format.LAW):
-            tick, data = tick_of(message), message.payload[DIGEST_BYTES:]
+            tick, data = snapshot_tick(message), message.payload[DIGEST_BYTES:]
             if not self.owns(tick):
                 continue
             if tick > before:
@@ -179,19 +179,19 @@ class Reader:
 
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Each chunk in the order of the file: either its ticks or its messages of the slow topics."""
-        account = Account(self.first_tick, self.totals)
+        account = TickAccount(self.first_tick, self.totals)
         for entry in self._entries:
             try:
                 content = self._content(entry)
-                if is_ticks(content):
-                    ticks = self._ticks.ticks(content, self.columns)
+                if holds_ticks(content):
+                    ticks = self._tick_layout.parse_ticks(content, self.columns)
                     account.add(ticks)
                     yield ticks.rows, []
                 else:
-                    yield None, self._checked(split_messages(content))
+                    yield None, self._valid_messages(split_messages(content))
             except DamagedChunk as reason:
-                self._leave_out(entry, reason)
-        self._close(account)
+                self._report_chunk(entry, reason)
+        self._check_count(account)
 
     @property
     def events(self) -> list[Event]:
@@ -201,27 +201,29 @@ class Reader:
     @cached_property
     def _events(self) -> list[Event]:
         """All events that stand in the file, repeated ones too."""
-        return [event_from(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
+        return [parse_event(message.payload, self.header["axes"]) for message in self._messages(format.EVENTS)]
 
     @cached_property
     def overview(self) -> Intervals:
         """Of what was left out by intention (n, columns, 3), in order; see `rtloop.recording.file.topics.overview`."""
-        intervals = self.intervals_of(self._messages(format.OVERVIEW))
-        is_plausible = plausible(intervals)
+        intervals = self.overview_intervals(self._messages(format.OVERVIEW))
+        is_plausible = are_plausible(intervals)
         if not is_plausible.all():
             self._report("an overview is about no ticks, or about some that another one is about")
         return intervals[is_plausible]
 
-    def intervals_of(self, messages: Iterable[Message]) -> Intervals:
+    def overview_intervals(self, messages: Iterable[Message]) -> Intervals:
         """What those of `/overview` among messages of this recording say."""
-        return self._overview.intervals([message.payload for message in messages if message.channel == format.OVERVIEW])
+        return self._overview_layout.parse_intervals(
+            [message.payload for message in messages if message.channel == format.OVERVIEW]
+        )
 
     @cached_property
-    def skipped(self) -> list[Range]:
+    def skipped_ranges(self) -> list[Range]:
         """The ticks that were left out by intention: first one, how many."""
         return [
             (max(first, self.first_tick), first + count - max(first, self.first_tick))
-            for first, count in ranges(self.overview)
+            for first, count in tick_ranges(self.overview)
             if first + count > self.first_tick
         ]
 
@@ -231,69 +233,71 @@ class Reader:
         final_events = [event for event in self._events if event["kind"] in FINAL]
         return final_events[-1]["what"] if final_events else None
 
-    def _known(self, names: Sequence[str]) -> Sequence[str]:
+    def _require_columns(self, names: Sequence[str]) -> Sequence[str]:
         unknown = [name for name in names if name not in self.columns]
         if unknown:
             raise RecordingError(f"{self.path}: no signal {unknown[0]!r}; there are {', '.join(self.columns)}")
         return names
 
-    def _content(self, entry: Entry) -> bytes:
+    def _content(self, entry: ChunkEntry) -> bytes:
         return self._layout.content(entry)
 
-    def _ahead(self, entries: Iterable[Entry], names: Sequence[str]) -> Iterator[tuple[Entry, Future[Ticks | None]]]:
+    def _decompress_ahead(
+        self, entries: Iterable[ChunkEntry], names: Sequence[str]
+    ) -> Iterator[tuple[ChunkEntry, Future[Ticks | None]]]:
         """The entries with what comes of decompressing them."""
-        queue: deque[tuple[Entry, Future[Ticks | None]]] = deque()
+        queue: deque[tuple[ChunkEntry, Future[Ticks | None]]] = deque()
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
-                queue.append((entry, pool.submit(self._ticks_of, entry, names)))
+                queue.append((entry, pool.submit(self._read_ticks, entry, names)))
                 if len(queue) >= AHEAD:
                     yield queue.popleft()
             while queue:
                 yield queue.popleft()
 
-    def _ticks_of(self, entry: Entry, names: Sequence[str]) -> Ticks | None:
+    def _read_ticks(self, entry: ChunkEntry, names: Sequence[str]) -> Ticks | None:
         """The ticks of a chunk; None if it holds something else. Raises DamagedChunk."""
         content = self._content(entry)
-        return self._ticks.ticks(content, names) if is_ticks(content) else None
+        return self._tick_layout.parse_ticks(content, names) if holds_ticks(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
         """The messages of one of the slow topics; what is wrong with the others in their chunks is reported too."""
         for entry in self._entries:
-            if may_tell(entry, channel):
-                yield from (message for message in self._slow(entry) if message.channel == channel)
+            if may_hold_slow(entry, channel):
+                yield from (message for message in self._slow_messages(entry) if message.channel == channel)
 
-    def _slow(self, entry: Entry) -> list[Message]:
+    def _slow_messages(self, entry: ChunkEntry) -> list[Message]:
         """The messages of the slow topics in a chunk."""
         try:
             content = self._content(entry)
-            return [] if is_ticks(content) else self._checked(split_messages(content))
+            return [] if holds_ticks(content) else self._valid_messages(split_messages(content))
         except DamagedChunk as reason:
-            self._leave_out(entry, reason)
+            self._report_chunk(entry, reason)
             return []
 
-    def _checked(self, messages: list[Message]) -> list[Message]:
+    def _valid_messages(self, messages: list[Message]) -> list[Message]:
         """Those of the messages that say something; of the others it is reported what is wrong."""
         valid = []
         for message in messages:
             try:
                 if message.channel == format.EVENTS:
-                    event_from(message.payload, self.header["axes"])
+                    parse_event(message.payload, self.header["axes"])
                 elif message.channel == format.LAW:
                     _require_digest(message)
                 elif message.channel == format.OVERVIEW:
-                    self._overview.require(message.payload)
+                    self._overview_layout.require_overview(message.payload)
                 valid.append(message)
             except ValueError as reason:
                 is_event = message.channel == format.EVENTS
                 self._report(f"an event is malformed: {reason}" if is_event else str(reason))
         return valid
 
-    def _leave_out(self, entry: Entry, reason: DamagedChunk) -> None:
+    def _report_chunk(self, entry: ChunkEntry, reason: DamagedChunk) -> None:
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
-    def _close(self, account: Account) -> None:
-        if account.shortage and not self.left_out:
-            self._report(account.shortage)
+    def _check_count(self, account: TickAccount) -> None:
+        if account.shortage_problem and not self.left_out:
+            self._report(account.shortage_problem)
 
     def _report(self, problem: str) -> None:
         if not self.tolerant:
@@ -303,12 +307,12 @@ class Reader:
                 problems.append(problem)
 
 
-def tick_of(snapshot: Message) -> int:
+def snapshot_tick(snapshot: Message) -> int:
     """The tick that a message of `/law` was taken at."""
     return int.from_bytes(snapshot.payload[DIGEST_BYTES : DIGEST_BYTES + 8], "little")
 
 
 def _require_digest(snapshot: Message) -> None:
     digest, data = snapshot.payload[:DIGEST_BYTES], snapshot.payload[DIGEST_BYTES:]
-    if hashlib.sha256(data).digest() != digest or len(data) < 8 or tick_of(snapshot) > LARGEST:
-        raise Malformed("a snapshot of the law is damaged")
+    if hashlib.sha256(data).digest() != digest or len(data) < 8 or snapshot_tick(snapshot) > LARGEST:
+        raise MalformedText("a snapshot of the law is damaged")

@@ -15,14 +15,14 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
-from rtloop.errors import LOW_SPACE, OutputError, writing
-from rtloop.recording.file.mcap.chunkfile import ChunkFile, Content
+from rtloop.errors import LOW_SPACE, OutputError, output_errors
+from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile
 from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
-from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, declared, ranges
+from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, overview_records, tick_ranges
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Writer:
@@ -47,16 +47,16 @@ class Writer:
     ) -> None:
         self.path = path
         self.start_unix_ns = log_time
-        self.ticks = self.skipped = 0
+        self.ticks = self.ticks_skipped = 0
         """Written, and summed up in overviews."""
-        self._skipped: list[int] = []
+        self._skipped_counts: list[int] = []
         self._columns: list[str] = header["columns"]
         self._message_index, self._min_free_bytes = message_index, min_free_bytes
-        self._blank = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
+        self._template = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
         self._check_space(room_bytes)
         repeated = [*format.schemas(self._columns), *format.channels()]
         if header.get("around"):
-            repeated += declared(self._columns)
+            repeated += overview_records(self._columns)
         self._file = ChunkFile(path, Header(format.PROFILE, format.LIBRARY), repeated, suffix)
         try:
             self._write_header(header, log_time, repeated)
@@ -79,9 +79,9 @@ class Writer:
         """About what the end of the file will take."""
         return self._file.end_bytes
 
-    def is_there(self) -> bool:
+    def is_in_place(self) -> bool:
         """Whether the unfinished file still lies under its name."""
-        return self._file.is_there()
+        return self._file.is_in_place()
 
     def write(self, messages: Sequence[Message], rows: np.ndarray[Any, Any]) -> None:
         """Messages of the slow topics and ticks: both, or neither."""
@@ -91,49 +91,49 @@ class Writer:
         except OutputError:
             if messages:
                 with contextlib.suppress(OutputError):
-                    self._drop_last()
+                    self._drop_last_chunk()
             raise
 
     def write_ticks(self, rows: np.ndarray[Any, Any]) -> None:
         """Rows (n, columns) float64 of consecutive ticks, as one chunk if n is at most `format.chunk_rows`."""
-        for start in range(0, len(rows), len(self._blank)):
-            self._write_chunk(rows[start : start + len(self._blank)])
+        for start in range(0, len(rows), len(self._template)):
+            self._write_chunk(rows[start : start + len(self._template)])
 
     def _write_chunk(self, rows: np.ndarray[Any, Any]) -> None:
-        self._check()
+        self._check_writable()
         count = len(rows)
-        records = self._blank[:count]
+        records = self._template[:count]
         format.fill_ticks(records, self._columns, rows, self.start_unix_ns)
         times, index = records["_log_time"], {}
         if self._message_index:
             offsets = np.arange(count) * records.dtype.itemsize
             index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
         data = records.view(np.uint8).data
-        self._file.append(Content(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
+        self._file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
         self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Messages of the slow topics as one chunk, with an index by topic."""
         if messages:
-            self._check()
-            self._file.append(_content(messages))
+            self._check_writable()
+            self._file.append_chunk(_pack_messages(messages))
             if any(message.channel == format.OVERVIEW for message in messages):
-                self._note_skipped(messages)
+                self._count_skipped(messages)
 
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
         """Messages of the slow topics and what is left out (n, columns, 3): both, or neither."""
-        overview = OverviewLayout(self._columns).messages(intervals, self.start_unix_ns)
+        overview = OverviewLayout(self._columns).make_messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])
 
-    def finish(self, final: Callable[[int], Message], *, whole: bool = False) -> None:
+    def finish(self, final_message: Callable[[int], Message], *, require_all: bool = False) -> None:
         """Add the message `final(ticks written)`, the index and the end; then give the file its name.
 
         Where that does not fit on the disk, the last chunks make room for it; with `whole` OutputError is raised.
         """
         max_chunks = len(self._file)
-        while not self._end_fits(final, whole):
+        while not self._try_write_end(final_message, require_all):
             while len(self._file) >= max_chunks:
-                self._drop_last()
+                self._drop_last_chunk()
             max_chunks -= 1
         self._file.publish()
 
@@ -145,25 +145,25 @@ class Writer:
         """Give up the file and remove it."""
         self._file.discard()
 
-    def _note_skipped(self, messages: Sequence[Message]) -> None:
+    def _count_skipped(self, messages: Sequence[Message]) -> None:
         payloads = [message.payload for message in messages if message.channel == format.OVERVIEW]
-        count = sum(count for _, count in ranges(OverviewLayout(self._columns).intervals(payloads)))
-        self._skipped.append(count)
-        self.skipped += count
+        count = sum(count for _, count in tick_ranges(OverviewLayout(self._columns).parse_intervals(payloads)))
+        self._skipped_counts.append(count)
+        self.ticks_skipped += count
 
-    def _drop_last(self) -> None:
+    def _drop_last_chunk(self) -> None:
         """Take the last chunk off the file, and its ticks off the counts."""
-        counts = self._file.drop_last()
+        counts = self._file.drop_last_chunk()
         self.ticks -= counts.get(format.TICKS, 0)
         if counts.get(format.OVERVIEW):
-            self.skipped -= self._skipped.pop()
+            self.ticks_skipped -= self._skipped_counts.pop()
 
-    def _end_fits(self, final: Callable[[int], Message], whole: bool) -> bool:
+    def _try_write_end(self, final_message: Callable[[int], Message], require_all: bool) -> bool:
         try:
-            self._file.append(_content([final(self.ticks)]))
+            self._file.append_chunk(_pack_messages([final_message(self.ticks)]))
             self._file.write_end()
         except OutputError as error:
-            if whole or error.number not in FULL or len(self._file) <= 1:
+            if require_all or error.number not in DISK_FULL_ERRORS or len(self._file) <= 1:
                 raise
             return False
         return True
@@ -172,10 +172,10 @@ class Writer:
         digest = hashlib.sha256(header.get("configuration", "").encode()).hexdigest()
         payload = json.dumps({**header, "configuration_sha256": digest}).encode()
         message = Message(format.CONFIGURATION, log_time, payload)
-        self._file.append(_content([message], pack_records(repeated)))
+        self._file.append_chunk(_pack_messages([message], pack_records(repeated)))
 
-    def _check(self) -> None:
-        if not self.is_there():
+    def _check_writable(self) -> None:
+        if not self.is_in_place():
             raise OutputError(f"{self.part}: was removed, or its folder was, while it was written", errno.ENOENT)
         self._check_space()
 
@@ -183,7 +183,7 @@ class Writer:
         required_bytes = self._min_free_bytes + room_bytes
         if required_bytes == 0:
             return
-        with writing(self.path):
+        with output_errors(self.path):
             status = os.statvfs(self.path.parent)
         free_bytes = status.f_bavail * status.f_frsize
         if free_bytes >= required_bytes:
@@ -194,15 +194,15 @@ class Writer:
         raise OutputError(f"{self.path}: {free_bytes >> 20} MiB are free, {requirement}", LOW_SPACE)
 
 
-def _content(messages: Sequence[Message], before: bytes = b"") -> Content:
+def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") -> ChunkContent:
     """A chunk of `before` (records) and the messages, each in the index of its channel."""
-    records, index_entries = bytearray(before), {}
+    records, index_entries = bytearray(leading_records), {}
     for message in messages:
         times, offsets = index_entries.setdefault(message.channel, ([], []))
         times.append(message.log_time)
         offsets.append(len(records))
         records += pack_message(*message)
-    return Content(
+    return ChunkContent(
         bytes(records),
         min(message.log_time for message in messages),
         max(message.log_time for message in messages),

@@ -18,35 +18,35 @@ from typing import Any
 from rtloop.hil.trusted import open_file
 from rtloop.law.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER
-from rtloop.laws.limited.first import try_first
-from rtloop.laws.registry import BUILT_IN, LawReference, kinds, law_class, layout_of, reference
+from rtloop.laws.limited.first import try_limited
+from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_layout
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 
 
 @dataclass(frozen=True)
-class Trust:
+class TrustedLaws:
     """What may be run: laws from files that the user named, and the texts in the recording."""
 
     files: tuple[LawReference, ...] = ()
     recorded: bool = False
 
 
-NOTHING = Trust()
+NO_TRUST = TrustedLaws()
 MAX_TEXT_BYTES = 1 << 20
 IMPORT = re.compile(r"^(from|import) rtloop\b", re.MULTILINE)
 """In the text of every law."""
 
 
-def recorded_laws(recording: Recording, trust: Trust = NOTHING) -> tuple[LawReference, ...]:
+def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[LawReference, ...]:
     """The laws that the recorded loop knew. Raises RecordingError for one that is not here, or not as it was recorded,
     and where this version lays out their records otherwise.
     """
     require_law(recording)
     described = recording.header.get("law", {}).get("laws")
     entries = [entry for entry in described if isinstance(entry, dict)] if isinstance(described, list) else []
-    laws = tuple(_law(entry, recording, trust) for entry in entries)
-    if recording.header.get("law", {}).get("sha256") != layout_of(laws).description()["sha256"]:
+    laws = tuple(_recorded_law(entry, recording, trust) for entry in entries)
+    if recording.header.get("law", {}).get("sha256") != law_layout(laws).description()["sha256"]:
         version = recording.header.get("versions", {}).get("rtloop", "unknown")
         raise RecordingError(
             f"{recording.paths[0]}: recorded by rtloop {version}, whose law is laid out differently; replay it with "
@@ -64,9 +64,9 @@ def require_law(recording: Recording) -> None:
         )
 
 
-def _law(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:
+def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
     """A law for any number of axes is taken for as many as it had."""
-    law, axes = _named(entry, recording, trust), entry.get("axes")
+    law, axes = _find_law(entry, recording, trust), entry.get("axes")
     if law_class(law).axes != ANY_NUMBER:
         return law
     if not isinstance(axes, int) or not 2 <= axes <= MAX_COUPLED:
@@ -74,14 +74,14 @@ def _law(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawRef
     return replace(law, axes=axes)
 
 
-def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawReference:
+def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
     location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
         if name not in BUILT_IN:
             raise RecordingError(f"{location}: is not one of this version's, {', '.join(BUILT_IN)}")
         return LawReference(name)
-    for law in (*trust.files, *_installed(name)):
+    for law in (*trust.files, *_installed_laws(name)):
         if law.kind == name and law.sha256 == digest:
             return law
     law = LawReference(name, str(text), str(recording.paths[0]))
@@ -90,14 +90,15 @@ def _named(entry: Mapping[str, Any], recording: Recording, trust: Trust) -> LawR
     except ValueError as error:
         if not trust.recorded:
             raise RecordingError(
-                f"{location}: is not installed here as it ran there (sha256 {str(digest)[:12]}…), and {error}; --law FILE "
+                f"{location}: is not installed here as it ran there (sha256 {str(digest)[:12]}…), and {error}; "
+                "--law FILE "
                 "names the file, and --trust-recorded-law runs the text that the recording holds"
             ) from None
     if law.sha256 != digest:
         raise RecordingError(f"{location}: its recorded text is not the one that ran: the sha256 differs")
-    try_first(law.file, law_class, law)
+    try_limited(law.file, law_class, law)
     try:
-        layout_of([law])
+        law_layout([law])
     except (ValueError, KeyError) as error:
         raise RecordingError(f"{location}: {error}") from None
     return law
@@ -119,11 +120,11 @@ def _in_place(name: str, digest: str, file: Any) -> LawReference:
     return law
 
 
-def _installed(name: str) -> tuple[LawReference, ...]:
+def _installed_laws(name: str) -> tuple[LawReference, ...]:
     if name in BUILT_IN or name not in kinds():
         return ()
-    try_first(f"law {name!r}", reference, name)
+    try_limited(f"law {name!r}", find_law, name)
     try:
-        return (reference(name),)
+        return (find_law(name),)
     except ValueError:
         return ()

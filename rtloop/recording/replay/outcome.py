@@ -11,19 +11,19 @@ import numpy as np
 from rtloop import signals
 from rtloop.recording.replay.rerun import Rows
 from rtloop.recording.views.steps import StepMetrics, step_metrics
-from rtloop.signals import PER_AXIS, TRIP_MASK, Mode
+from rtloop.signals import AXIS_SIGNALS, TRIP_MASK, Mode
 
-JUDGED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
+COMPARED_SIGNALS = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 STEP_ANALYSIS_TICKS = 3_000_000
 """Steps are judged over at most so many ticks from the beginning: they are kept in memory."""
 
 
-class Differences:
+class SignalDifferences:
     """Largest and root mean square difference of what the law computes; ticks where one is not finite are left out."""
 
     def __init__(self, axes: Sequence[str]) -> None:
-        self._columns = [signals.axis_column(axis, signal) for axis in range(len(axes)) for signal in JUDGED]
-        self._names = [f"{axis}_{PER_AXIS[signal].name}" for axis in axes for signal in JUDGED]
+        self._columns = [signals.axis_column(axis, signal) for axis in range(len(axes)) for signal in COMPARED_SIGNALS]
+        self._names = [f"{axis}_{AXIS_SIGNALS[signal].name}" for axis in axes for signal in COMPARED_SIGNALS]
         size = len(self._columns)
         self._largest, self._at_tick = np.zeros(size), np.zeros(size, np.int64)
         self._square_sum, self._count = np.zeros(size), np.zeros(size, np.int64)
@@ -55,7 +55,7 @@ class Differences:
         }
 
 
-class Performance:
+class TrackingPerformance:
     """Tracking error over closed-loop ticks, largest drive and steps of every axis."""
 
     def __init__(self, axes: Sequence[str], rate_hz: float) -> None:
@@ -63,7 +63,7 @@ class Performance:
         self._square_sum, self._count = np.zeros(len(axes)), 0
         self._drive_v, self._error_um = np.zeros(len(axes)), np.zeros(len(axes))
         self._traces: list[Rows] = []
-        self._kept = 0
+        self._trace_ticks = 0
         self.trip: dict[str, Any] | None = None
 
     def add(self, rows: Rows) -> None:
@@ -78,12 +78,12 @@ class Performance:
         if len(errors):
             self._error_um = np.maximum(self._error_um, np.abs(errors).max(axis=0))
         self._drive_v = np.fmax(self._drive_v, np.abs(drives).max(axis=0))
-        if self._kept < STEP_ANALYSIS_TICKS:
+        if self._trace_ticks < STEP_ANALYSIS_TICKS:
             columns = [
                 signals.axis_column(a, signal) for a in self._axes for signal in (signals.REFERENCE, signals.POSITION)
             ]
             self._traces.append(rows[:, columns].copy())
-            self._kept += len(rows)
+            self._trace_ticks += len(rows)
         self.trip = self.trip or first_trip(rows)
 
     def report(self) -> list[dict[str, Any]]:

@@ -16,48 +16,48 @@ import numpy as np
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.memory import LawMemory
-from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import LawReference, layout_of
+from rtloop.laws.binding import bind_functions
+from rtloop.laws.registry import LawReference, law_layout
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Snapshot
-from rtloop.recording.file.topics.checked import extras_of
-from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_of
-from rtloop.recording.file.topics.overview import uncovered
+from rtloop.recording.file.topics.checked import header_extras
+from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_from_event
+from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.load import Recording
-from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
-from rtloop.recording.replay.rerun import Rerun, Rows, Tape
+from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
+from rtloop.recording.replay.rerun import RecordedInputs, Rerun, Rows
 from rtloop.recording.replay.snapshots import first_difference
-from rtloop.recording.replay.verdict import MEASURED, ReplayReport, not_judged
+from rtloop.recording.replay.verdict import MEASURED_COLUMNS, ReplayReport, unjudged_contents
 from rtloop.signals import Flag
 
-FEW_PERIODS, RATE_TOLERANCE = 50, 0.05
+MIN_RATE_PERIODS, RATE_TOLERANCE = 50, 0.05
 """Over fewer periods no rate is compared; a card's own clock may be a little off."""
 LAW_COMMANDS = (Kind.SET_MODE, Kind.RESET_TRIP, Kind.STOP)
-OBEYED = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW)}
+LAW_COMMAND_NAMES = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW)}
 Progress = Callable[[int], None]
 
 
-def replay(recording: Recording, progress: Progress | None = None, trust: Trust = NOTHING) -> ReplayReport:
+def replay(recording: Recording, progress: Progress | None = None, trust: TrustedLaws = NO_TRUST) -> ReplayReport:
     """Replay up to the first difference. Raises RecordingError for a recording of another layout, or without a law."""
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         return _Replay(recording, laws, snapshots, progress).run()
 
 
-def law_of(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference]) -> LawMemory:
+def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawReference]) -> LawMemory:
     """Coefficients and state, which the kernels can work on. Raises RecordingError where they cannot."""
-    layout = layout_of(laws)
+    layout = law_layout(laws)
     try:
-        _, *law = layout.split(snapshot.data, len(recording.header["axes"]))
+        _, *law = layout.split_snapshot(snapshot.data, len(recording.header["axes"]))
         coefficients, axes, state = law
-        return LawMemory(layout, functions_of(laws), coefficients, axes, state, extras_of(recording.header))
+        return LawMemory(layout, bind_functions(laws), coefficients, axes, state, header_extras(recording.header))
     except ValueError as error:
         raise RecordingError(f"{recording.paths[0]}: snapshot of the law at tick {snapshot.tick}: {error}") from None
 
 
 def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> np.ndarray[Any, Any]:
     """The commands that took effect, as a schedule; those for references are not needed, whose samples are inputs."""
-    commands = [message_of(event, recording.header["axes"]) for event in recording.events]
+    commands = [message_from_event(event, recording.header["axes"]) for event in recording.events]
     law_commands = [command for command in commands if command is not None and command["kind"][0] in kinds]
     schedule = np.concatenate([np.zeros(0, MESSAGE), *law_commands])
     schedule["values"][schedule["kind"] == Kind.SET_MODE, 2] = 0.0  # what was held is among the recorded references
@@ -68,7 +68,7 @@ def misplaced_command(events: Sequence[Event]) -> int | None:
     """Tick of the first command that stands in the file for the second time, or behind one of a later tick."""
     last_tick, executed_keys = 0, set()
     for event in events:
-        if event["kind"] not in OBEYED:
+        if event["kind"] not in LAW_COMMAND_NAMES:
             continue
         details = event["what"]
         key = (event["tick"], event["kind"], event["axis"], details["identity"], *map(float, details["values"]))
@@ -79,7 +79,7 @@ def misplaced_command(events: Sequence[Event]) -> int | None:
     return None
 
 
-def consecutive(rows: Rows) -> list[Rows]:
+def split_at_gaps(rows: Rows) -> list[Rows]:
     """The rows, split where ticks are missing."""
     ticks = rows[:, signals.TICK]
     if ticks[-1] - ticks[0] == len(rows) - 1:  # the usual case; the ticks themselves are compared later
@@ -98,135 +98,137 @@ class _Replay:
         self._laws = laws
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
         self._commands = recorded_commands(recording, (*LAW_COMMANDS, Kind.LOAD_LAW))
-        self._next: Snapshot | None = next(snapshots, None)
+        self._next_snapshot: Snapshot | None = next(snapshots, None)
         self._rerun: Rerun | None = None
-        self._report = ReplayReport(problems=recording.problems, not_judged=not_judged(recording.header))
-        self._found = 0
+        self._report = ReplayReport(problems=recording.problems, not_judged=unjudged_contents(recording.header))
+        self._tick_count = 0
         gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
         self._gaps = gaps
         if (tick := misplaced_command(recording.events)) is not None:
-            self._report.pass_over(tick, None, "a command stands there twice, or behind a later one")
+            self._report.add_unverified(tick, None, "a command stands there twice, or behind a later one")
 
     def run(self) -> ReplayReport:
         """Replay all blocks, up to the first difference."""
         expected = self._recording.extents[0].first_tick
         with closing(self._recording.blocks()) as blocks:
             for block in blocks:
-                for rows in consecutive(block):
+                for rows in split_at_gaps(block):
                     first = int(rows[0, signals.TICK])
-                    self._pass_gap(expected, first)
+                    self._account_gap(expected, first)
                     expected = first + len(rows)
-                    self._consume(rows)
-                    self._found += len(rows)
+                    self._replay_rows(rows)
+                    self._tick_count += len(rows)
                 if self._report.first_difference:
                     first_unverified = self._report.first_difference["tick"] + 1
-                    self._report.pass_over(first_unverified, None, "behind the first difference")
-                    self._pass_left_out()
+                    self._report.add_unverified(first_unverified, None, "behind the first difference")
+                    self._report_unreadable()
                     return self._report
                 if self._progress:
                     self._progress(self._report.ticks)
         if not self._report.ticks:
             path = self._recording.paths[0]
             raise RecordingError(f"{path}: holds no tick after a snapshot of the law to replay from")
-        self._end(expected)
+        self._check_totals(expected)
         return self._report
 
-    def _pass_gap(self, expected: int, first: int) -> None:
+    def _account_gap(self, expected: int, first: int) -> None:
         """Go on at a tick behind the expected one; that nothing was recorded between is the recorder's word alone."""
         if first == expected:
             return
         self._rerun = None
-        missing = uncovered(expected, first, self._recording.skipped)
+        missing = uncovered_ranges(expected, first, self._recording.skipped)
         self._report.skipped += first - expected - sum(count for _, count in missing)
         for begin, count in missing:
             self._report.gaps.append({"first_tick": begin, "count": count})
-            if uncovered(begin, begin + count, sorted((gap["first_tick"], gap["count"]) for gap in self._gaps)):
-                self._report.pass_over(begin, count, "not in the recording")
+            if uncovered_ranges(begin, begin + count, sorted((gap["first_tick"], gap["count"]) for gap in self._gaps)):
+                self._report.add_unverified(begin, count, "not in the recording")
 
-    def _pass_left_out(self) -> None:
+    def _report_unreadable(self) -> None:
         for problem in self._recording.left_out:
-            self._report.pass_over(None, None, problem)
+            self._report.add_unverified(None, None, problem)
 
-    def _end(self, expected: int) -> None:
+    def _check_totals(self, expected: int) -> None:
         """Hold what was found against what the files say that they hold."""
         extents = self._recording.extents
         last = extents[-1].totals
-        for snapshot in [] if self._next is None else [self._next, *self._snapshots]:
+        for snapshot in [] if self._next_snapshot is None else [self._next_snapshot, *self._snapshots]:
             if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
-                self._report.pass_over(None, None, f"a snapshot of the law at tick {snapshot.tick}, behind the end")
-        self._pass_left_out()
+                self._report.add_unverified(
+                    None, None, f"a snapshot of the law at tick {snapshot.tick}, behind the end"
+                )
+        self._report_unreadable()
         if last is None:
-            self._report.pass_over(expected, None, "the recording states no end; `rtloop recover` completes it")
+            self._report.add_unverified(expected, None, "the recording states no end; `rtloop recover` completes it")
             return
         ticks_logged = sum(extent.totals["ticks_logged"] - extent.repeated for extent in extents if extent.totals)
         if (
-            self._found == ticks_logged and last["result"] != RECOVERED
+            self._tick_count == ticks_logged and last["result"] != RECOVERED
         ):  # what its disk had no room for was never recorded
             self._gaps.append({"first_tick": expected, "count": last["ticks_executed"] - expected})
-        self._pass_gap(expected, last["ticks_executed"])
+        self._account_gap(expected, last["ticks_executed"])
 
-    def _consume(self, rows: Rows) -> None:
+    def _replay_rows(self, rows: Rows) -> None:
         """Replay consecutive rows, in stretches that end where a snapshot lies."""
         while len(rows) and not self._report.first_difference:
             tick = int(rows[0, signals.TICK])
-            snapshot = self._meet_snapshot(tick)
-            until = tick + len(rows) if self._next is None else self._next.tick
+            snapshot = self._take_snapshot(tick)
+            until = tick + len(rows) if self._next_snapshot is None else self._next_snapshot.tick
             count = min(len(rows), until - tick)
             if self._rerun is None:
-                self._report.pass_over(tick, count, "no snapshot of the law to start from stands before them")
+                self._report.add_unverified(tick, count, "no snapshot of the law to start from stands before them")
             else:
-                count = min(count, self._rerun.room(tick))
+                count = min(count, self._rerun.max_ticks(tick))
                 self._compare(self._rerun, rows[:count])
                 if snapshot is not None:
                     self._compare_snapshot(self._rerun, snapshot)
             rows = rows[count:]
 
-    def _meet_snapshot(self, tick: int) -> Snapshot | None:
+    def _take_snapshot(self, tick: int) -> Snapshot | None:
         """At a snapshot start from it, or return it to be compared with one of the rerun's own."""
-        while self._next is not None and self._next.tick < tick:
-            self._next = next(self._snapshots, None)
-        if self._next is None or self._next.tick != tick:
+        while self._next_snapshot is not None and self._next_snapshot.tick < tick:
+            self._next_snapshot = next(self._snapshots, None)
+        if self._next_snapshot is None or self._next_snapshot.tick != tick:
             return None
-        snapshot, self._next = self._next, next(self._snapshots, None)
-        law = law_of(snapshot, self._recording, self._laws)
+        snapshot, self._next_snapshot = self._next_snapshot, next(self._snapshots, None)
+        law = snapshot_law(snapshot, self._recording, self._laws)
         if self._rerun is None:
-            self._start(snapshot.tick, law)
+            self._start_rerun(snapshot.tick, law)
             return None
         self._rerun.expect_snapshot(snapshot.data)
         return snapshot
 
     def _compare_snapshot(self, rerun: Rerun, snapshot: Snapshot) -> None:
         """Coefficients and state after the commands of a tick; a tick whose outputs differ was reported already."""
-        replayed, recorded = rerun.snapshot()[8:], snapshot.data[8:]
+        replayed, recorded = rerun.newest_snapshot()[8:], snapshot.data[8:]
         self._report.snapshots += 1
         if replayed != recorded and not self._report.first_difference:
-            self._differs(
+            self._record_difference(
                 snapshot.tick, *first_difference(recorded, replayed, self._recording.header["axes"], rerun.law)
             )
 
-    def _start(self, tick: int, law: LawMemory) -> None:
+    def _start_rerun(self, tick: int, law: LawMemory) -> None:
         header = self._recording.header
         later_commands = self._commands[self._commands["tick"] > tick]
         self._report.stretches += 1
-        self._rerun = Rerun(header, Tape(header), self._laws, law, later_commands, tick)
+        self._rerun = Rerun(header, RecordedInputs(header), self._laws, law, later_commands, tick)
 
     def _compare(self, rerun: Rerun, recorded: Rows) -> None:
         self._compare_rate(recorded)
         replayed = rerun.execute(recorded)
         count = len(replayed)
-        same = _same(recorded[:count], replayed)
+        same = _equal_values(recorded[:count], replayed)
         if self._report.first_difference:
             return
         if same.all():
             self._report.ticks += count
             if count < len(recorded):
-                self._differs(int(recorded[count, signals.TICK]), "end of the run", None, None)
+                self._record_difference(int(recorded[count, signals.TICK]), "end of the run", None, None)
             return
         row = int(np.argmin(same.all(axis=1)))
         column = int(np.argmin(same[row]))
         self._report.ticks += row + 1
         values = float(recorded[row, column]), float(replayed[row, column])
-        self._differs(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
+        self._record_difference(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
 
     def _compare_rate(self, recorded: Rows) -> None:
         """The deadlines, whatever clock made them, follow the rate."""
@@ -235,18 +237,21 @@ class _Replay:
             recorded[-1, signals.DEADLINE] - recorded[0, signals.DEADLINE],
             self._recording.header["rate_hz"],
         )
-        if periods >= FEW_PERIODS and not 1 - RATE_TOLERANCE < span_ns * 1e-9 * rate_hz / periods < 1 + RATE_TOLERANCE:
-            self._differs(int(recorded[0, signals.TICK]), "rate_hz", rate_hz, 1e9 * periods / span_ns)
+        if (
+            periods >= MIN_RATE_PERIODS
+            and not 1 - RATE_TOLERANCE < span_ns * 1e-9 * rate_hz / periods < 1 + RATE_TOLERANCE
+        ):
+            self._record_difference(int(recorded[0, signals.TICK]), "rate_hz", rate_hz, 1e9 * periods / span_ns)
 
-    def _differs(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
+    def _record_difference(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
         self._report.first_difference = {"tick": tick, "signal": signal, **values}
 
 
-def _same(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
+def _equal_values(recorded: Rows, replayed: Rows) -> np.ndarray[Any, Any]:
     """Which values are equal in bytes; what was measured counts as equal."""
     is_equal = recorded.view(np.uint64) == replayed.view(np.uint64)
-    is_equal[:, MEASURED] = True
+    is_equal[:, MEASURED_COLUMNS] = True
     flags = recorded[:, signals.FLAGS]
     with np.errstate(invalid="ignore"):
         measured_flags = flags.astype(np.int64) & int(Flag.OVERRUN)

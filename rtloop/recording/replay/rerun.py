@@ -17,7 +17,7 @@ from rtloop.engine.plan import Pacing, Plan
 from rtloop.law.memory import LawMemory
 from rtloop.law.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
-from rtloop.recording.file.topics.checked import extra_channels_of, extras_of
+from rtloop.recording.file.topics.checked import header_extra_channels, header_extras
 from rtloop.signals import Flag, Mode
 
 SLICE_TICKS = 2048
@@ -28,7 +28,7 @@ TICK_BYTES = 8
 Rows = np.ndarray[Any, Any]
 
 
-class Source(Protocol):
+class InputSource(Protocol):
     """Where a rerun's inputs come from."""
 
     facts: Facts
@@ -45,7 +45,7 @@ class Source(Protocol):
         ...
 
 
-class Tape:
+class RecordedInputs:
     """Recorded inputs, times, driver status and observed signals, through the playback driver."""
 
     enable_input: str | None = "enable"
@@ -53,8 +53,8 @@ class Tape:
     def __init__(self, header: Mapping[str, Any]) -> None:
         axes, observed = header["axes"], tuple(header["observed"])
         channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
-        self._extras = extras_of(header)
-        self.extra_channels = {name: f"extra {name}" for name in extra_channels_of(header)}
+        self._extras = header_extras(header)
+        self.extra_channels = {name: f"extra {name}" for name in header_extra_channels(header)}
         input_channels = tuple(Channel(self.extra_channels[name]) for name in self._extras.inputs)
         output_channels = tuple(Channel(self.extra_channels[output.name]) for output in self._extras.outputs)
         inputs = (*channels[0], Channel("enable"), *input_channels)
@@ -100,14 +100,14 @@ class Rerun:
     def __init__(
         self,
         header: Mapping[str, Any],
-        source: Source,
+        source: InputSource,
         laws: Sequence[LawReference],
         law: LawMemory,
         commands: np.ndarray[Any, Any],
         first_tick: int,
     ) -> None:
         self.law, self._source = law, source
-        plan = _plan(header, source, laws, law, commands)
+        plan = _rerun_plan(header, source, laws, law, commands)
         self._block = SharedBlock.create(plan.sizes._replace(rate_hz=SMALLEST_RING_HZ))
         self._slots = self._block["ticks_slots"]
         self._context = clock_context(header["rate_hz"])
@@ -117,7 +117,7 @@ class Rerun:
         self._assembly = Assembly(plan, self._block, source.facts, source.pointers(), clock, law)
         self._assembly.loop.next_snapshot = self._assembly.loop.snapshot_ticks = NEVER
 
-    def room(self, tick: int) -> int:
+    def max_ticks(self, tick: int) -> int:
         """Ticks from `tick` on that one call can execute."""
         return min(SLICE_TICKS, len(self._slots) - tick % len(self._slots))
 
@@ -140,7 +140,7 @@ class Rerun:
         self._block["staged"][:size] = np.frombuffer(recorded, np.uint8, size, TICK_BYTES)
         self._assembly.loop.next_snapshot = 0
 
-    def snapshot(self) -> bytes:
+    def newest_snapshot(self) -> bytes:
         """The newest snapshot that was taken."""
         ring = self._block.ring("snapshots")
         return ring.slots[(int(ring.head[0]) - 1) % len(ring.marks)].tobytes()
@@ -157,9 +157,9 @@ class Rerun:
             generators["start_tick"][axis] = generators["held_until"][axis] = first_tick
 
 
-def _plan(
+def _rerun_plan(
     header: Mapping[str, Any],
-    source: Source,
+    source: InputSource,
     laws: Sequence[LawReference],
     law: LawMemory,
     commands: np.ndarray[Any, Any],
@@ -180,7 +180,7 @@ def _plan(
         table=np.zeros(2 * SLICE_TICKS * len(axes)),
         schedule=commands,
         observed=source.facts.observed,
-        extras=extras_of(header),
+        extras=header_extras(header),
         extra_channels=source.extra_channels,
         enable_input=source.enable_input,
     )

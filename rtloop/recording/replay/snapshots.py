@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from rtloop.law.layout import LOOP_STATE, Records
-from rtloop.law.memory import LawMemory, Which, fields
+from rtloop.law.memory import LawMemory, RecordKind, field_tables
 
 
 def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:
     """Field and both values where the law's bytes (those of a snapshot behind its tick) first differ."""
-    for name, dtype, start in _values(axes, law):
+    for name, dtype, start in _snapshot_fields(axes, law):
         parts = [data[start : start + dtype.itemsize] for data in (recorded, replayed)]
         if parts[0] != parts[1]:
             values = [np.frombuffer(part, dtype.base) for part in parts]
@@ -28,12 +28,12 @@ def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law:
     return "law, bytes that belong to no field", None, None
 
 
-def _values(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[Any], int]]:
+def _snapshot_fields(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[Any], int]]:
     """Name, type and offset of every field, in the order of a snapshot."""
     offset = 0
-    tables: tuple[tuple[Which, Records], ...] = (("coefficients", law.coefficients), ("state", law.axes))
+    tables: tuple[tuple[RecordKind, Records], ...] = (("coefficients", law.coefficients), ("state", law.axes))
     for record_kind, records in tables:
-        for axis, axis_fields in zip(axes, fields(law.layout, law.coefficients, record_kind), strict=True):
+        for axis, axis_fields in zip(axes, field_tables(law.layout, law.coefficients, record_kind), strict=True):
             for name, dtype, start in axis_fields:
                 yield f"law.{axis}.{name}", dtype, offset + start
             offset += records.itemsize

@@ -8,7 +8,7 @@ from typing import Any
 
 from rtloop import signals
 
-MEASURED = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
+MEASURED_COLUMNS = (signals.LATENESS, signals.READ, signals.LAW, signals.WRITE, signals.EXEC)
 """Columns that a clock made and that no output depends on; so is the flag OVERRUN."""
 
 
@@ -40,14 +40,14 @@ class ReplayReport:
         """Recorded ticks that were not compared, as far as their number is known."""
         return sum(entry["count"] or 0 for entry in self.not_verified)
 
-    def pass_over(self, first_tick: int | None, count: int | None, why: str) -> None:
+    def add_unverified(self, first_tick: int | None, count: int | None, reason: str) -> None:
         """Note what is not verified; what follows on the same for the same reason is one."""
         if self.not_verified and first_tick is not None and count is not None:
             last = self.not_verified[-1]
-            if last["why"] == why and last["count"] and last["first_tick"] + last["count"] == first_tick:
+            if last["why"] == reason and last["count"] and last["first_tick"] + last["count"] == first_tick:
                 last["count"] += count
                 return
-        self.not_verified.append({"first_tick": first_tick, "count": count, "why": why})
+        self.not_verified.append({"first_tick": first_tick, "count": count, "why": reason})
 
     def as_dict(self) -> dict[str, Any]:
         """The object of `rtloop replay --json`."""
@@ -66,10 +66,11 @@ class ReplayReport:
         }
 
 
-def not_judged(header: Mapping[str, Any]) -> list[str]:
+def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
     """What no replay can judge: nothing that the law computes depends on it."""
     return [
-        f"measured times: {', '.join(signals.COMMON[column].name for column in MEASURED)}, flag OVERRUN, rate_hz, host",
+        f"measured times: {', '.join(signals.COMMON_SIGNALS[column].name for column in MEASURED_COLUMNS)}, flag "
+        "OVERRUN, rate_hz, host",
         "inputs as far as no output depends on them: adc_v, reference_um, feed_um, deadline_ns, periods_missed, "
         "sample_age_us, enable_v",
         f"observed signals: {', '.join(header['observed']) or 'there are none'}",

@@ -16,28 +16,28 @@ from rtloop.drivers.base import Driver, Pointers
 from rtloop.law.law import set_mode
 from rtloop.law.layout import Records
 from rtloop.law.memory import LawMemory
-from rtloop.laws.binding import functions_of
-from rtloop.laws.registry import LawReference, layout_of
+from rtloop.laws.binding import bind_functions
+from rtloop.laws.registry import LawReference, law_layout
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.file.topics.checked import extra_channels_of, extras_of
+from rtloop.recording.file.topics.checked import header_extra_channels, header_extras
 from rtloop.recording.load import Recording
-from rtloop.recording.replay.laws import NOTHING, Trust, recorded_laws
-from rtloop.recording.replay.outcome import Differences, Performance
-from rtloop.recording.replay.replay import LAW_COMMANDS, consecutive, law_of, recorded_commands
-from rtloop.recording.replay.rerun import Rerun, Rows, Source, Tape
+from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
+from rtloop.recording.replay.outcome import SignalDifferences, TrackingPerformance
+from rtloop.recording.replay.replay import LAW_COMMANDS, recorded_commands, snapshot_law, split_at_gaps
+from rtloop.recording.replay.rerun import InputSource, RecordedInputs, Rerun, Rows
 from rtloop.signals import Mode
 
 Progress = Callable[[int], None]
 
 
-class Law(NamedTuple):
+class LawWithCoefficients(NamedTuple):
     """Laws that a loop knows, and the coefficients of its axes."""
 
     laws: tuple[LawReference, ...]
     coefficients: Records
 
 
-class Rig:
+class RigInputs:
     """A simulated rig as a source of inputs: it answers what the law commands, whatever was recorded."""
 
     enable_input: str | None = None
@@ -54,46 +54,50 @@ class Rig:
         """Nothing: a rig has no need of what was recorded."""
 
 
-def recorded_law(recording: Recording, trust: Trust = NOTHING) -> Law:
+def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:
     """The law of the first snapshot. Raises RecordingError where there is none that can be used."""
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
         first = next(snapshots, None)
     if first is None:
         raise RecordingError(f"{recording.paths[0]}: holds no snapshot of the law")
-    return Law(laws, law_of(first, recording, laws).coefficients)
+    return LawWithCoefficients(laws, snapshot_law(first, recording, laws).coefficients)
 
 
-def other_law(recording: Recording, law: Law, progress: Progress | None = None) -> dict[str, Any]:
+def compare_law(recording: Recording, law: LawWithCoefficients, progress: Progress | None = None) -> dict[str, Any]:
     """How the outputs of another law differ from the recorded ones, on the recorded inputs.
 
     {ticks, signals: {name: {max, at_tick, rms}}, trips: [{tick, causes}]}. Raises RecordingError.
     """
-    differences = Differences(recording.header["axes"])
+    differences = SignalDifferences(recording.header["axes"])
     ticks = 0
-    with closing(_pairs(recording, law, Tape(recording.header))) as pairs:
+    with closing(_execute_recording(recording, law, RecordedInputs(recording.header))) as pairs:
         for recorded, replayed in pairs:
             differences.add(recorded, replayed)
             ticks += len(replayed)
-            _tell(progress, ticks)
+            _report_ticks(progress, ticks)
     return {"ticks": ticks, "problems": recording.problems, **differences.report()}
 
 
-def resimulate(recording: Recording, law: Law, driver: Driver, progress: Progress | None = None) -> dict[str, Any]:
+def resimulate(
+    recording: Recording, law: LawWithCoefficients, driver: Driver, progress: Progress | None = None
+) -> dict[str, Any]:
     """How well a law follows the recorded reference on a simulated rig, beside what was recorded.
 
     {ticks, axes: [{name, recorded: {…}, resimulated: {…}}]}. Raises RecordingError.
     """
     axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
-    before, after = (Performance(axes, rate_hz) for _ in range(2))
+    before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))
     ticks = 0
     try:
-        with closing(_pairs(recording, law, Rig(driver, extra_channels_of(recording.header)))) as pairs:
+        with closing(
+            _execute_recording(recording, law, RigInputs(driver, header_extra_channels(recording.header)))
+        ) as pairs:
             for recorded, replayed in pairs:
                 before.add(recorded)
                 after.add(replayed)
                 ticks += len(replayed)
-                _tell(progress, ticks)
+                _report_ticks(progress, ticks)
     finally:
         driver.close()
     axis_reports = zip(axes, before.report(), after.report(), strict=True)
@@ -105,17 +109,19 @@ def resimulate(recording: Recording, law: Law, driver: Driver, progress: Progres
     }
 
 
-def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Rows, Rows]]:
+def _execute_recording(
+    recording: Recording, law: LawWithCoefficients, source: InputSource
+) -> Generator[tuple[Rows, Rows]]:
     """Recorded rows and what came of executing them, stretch by stretch, up to the end of either."""
     commands, rerun = recorded_commands(recording, LAW_COMMANDS), None
     with closing(recording.blocks()) as blocks:
-        for rows in (rows for block in blocks for rows in consecutive(block)):
+        for rows in (rows for block in blocks for rows in split_at_gaps(block)):
             while len(rows):
                 tick = int(rows[0, signals.TICK])
                 if rerun is None:
-                    memory = _at_rest(recording, law, Mode(int(rows[0, signals.MODE])))
+                    memory = _law_at_rest(recording, law, Mode(int(rows[0, signals.MODE])))
                     rerun = Rerun(recording.header, source, law.laws, memory, commands[commands["tick"] >= tick], tick)
-                count = min(len(rows), rerun.room(tick))
+                count = min(len(rows), rerun.max_ticks(tick))
                 replayed = rerun.execute(rows[:count])
                 yield rows[: len(replayed)], replayed
                 if len(replayed) < count:
@@ -125,13 +131,13 @@ def _pairs(recording: Recording, law: Law, source: Source) -> Generator[tuple[Ro
         raise RecordingError(f"{recording.paths[0]}: holds no tick")
 
 
-def _at_rest(recording: Recording, law: Law, mode: Mode) -> LawMemory:
-    extras = extras_of(recording.header)
-    memory = LawMemory.at_rest(layout_of(law.laws), functions_of(law.laws), law.coefficients, extras)
+def _law_at_rest(recording: Recording, law: LawWithCoefficients, mode: Mode) -> LawMemory:
+    extras = header_extras(recording.header)
+    memory = LawMemory.create_at_rest(law_layout(law.laws), bind_functions(law.laws), law.coefficients, extras)
     set_mode(memory.law, int(mode), True)
     return memory
 
 
-def _tell(progress: Progress | None, ticks: int) -> None:
+def _report_ticks(progress: Progress | None, ticks: int) -> None:
     if progress:
         progress(ticks)

@@ -12,17 +12,17 @@ import numpy as np
 
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.topics.events import FINAL
-from rtloop.recording.load import Recording, unit_of
+from rtloop.recording.load import Recording, signal_unit
 from rtloop.signals import DEADLINE
 
-Progress = Callable[[int], None]
-BEYOND_DRAWING = 1e30
+ReportTicks = Callable[[int], None]
+MAX_DRAWN_VALUE = 1e30
 """What is larger is left out of a picture, as is what is no number; a single-precision page holds the rest."""
-BAD = ("tripped", "driver_failed", "gap")
-OF_AN_AXIS = (("reference_um", "position_um"), ("error_um",), ("drive_v",))
+FAULT_KINDS = ("tripped", "driver_failed", "gap")
+AXIS_PANELS = (("reference_um", "position_um"), ("error_um",), ("drive_v",))
 """What is drawn together of each axis."""
 TIMING = ("exec_us", "lateness_us")
-MOST_OTHERS = 8
+MAX_OTHER_SIGNALS = 8
 """Signals under names of their own that are drawn of an imported recording."""
 
 
@@ -34,7 +34,7 @@ class Band(NamedTuple):
     high: Any
 
     @property
-    def thin(self) -> bool:
+    def is_line(self) -> bool:
         """Whether both extremes are the same everywhere."""
         return np.array_equal(self.low, self.high, equal_nan=True)
 
@@ -62,14 +62,14 @@ def read_bands(
     start_s: float,
     end_s: float,
     points: int,
-    progress: Progress | None = None,
+    progress: ReportTicks | None = None,
 ) -> dict[str, Band]:
     """Bands of the signals between two times; every tick where there are at most `points`, else about so many.
 
     Raises RecordingError where there is no tick.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
-    overview_band = _overview(recording, names, start_s, end_s, points)
+    overview_band = _overview_band(recording, names, start_s, end_s, points)
     if count == 0 and not len(overview_band[0]):
         until = "" if end_s == np.inf else f" before {end_s:g} s"
         raise RecordingError(f"{recording.paths[0]}: holds no tick from {start_s:g} s on{until}")
@@ -79,7 +79,7 @@ def read_bands(
     for rows in recording.between(["deadline_ns", *names], start_s, end_s):
         edges = np.arange(0, len(rows), ticks_per_point)
         times.append(rows[edges, 0] * 1e-9)
-        values = np.where(np.abs(rows[:, 1:]) < BEYOND_DRAWING, rows[:, 1:], np.nan)
+        values = np.where(np.abs(rows[:, 1:]) < MAX_DRAWN_VALUE, rows[:, 1:], np.nan)
         lows.append(np.fmin.reduceat(values, edges))
         highs.append(np.fmax.reduceat(values, edges))
         tick_count += len(rows)
@@ -92,16 +92,16 @@ def read_bands(
     return {name: Band(time_s, low[:, index], high[:, index]) for index, name in enumerate(names)}
 
 
-def panels(recording: Recording) -> list[Panel]:
+def make_panels(recording: Recording) -> list[Panel]:
     """What a picture shows, from the top. Raises RecordingError where there is nothing."""
-    axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in OF_AN_AXIS]
+    axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in AXIS_PANELS]
     axis_panels.append(
         Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "virtual time: nothing was measured")
     )
     if "imported" in recording.header:
         panel_signals = {name for panel in axis_panels for name in panel.names}
         other_names = [name for name in recording.columns[DEADLINE + 1 :] if name not in panel_signals]
-        axis_panels += [Panel(name, recording.units[name], [name]) for name in other_names[:MOST_OTHERS]]
+        axis_panels += [Panel(name, recording.units[name], [name]) for name in other_names[:MAX_OTHER_SIGNALS]]
     if not any(panel.names for panel in axis_panels):
         raise RecordingError(f"{recording.paths[0]}: holds no signal that could be drawn")
     return [panel for panel in axis_panels if panel.names]
@@ -109,18 +109,18 @@ def panels(recording: Recording) -> list[Panel]:
 
 def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
     present = [name for signal in names if (name := f"{axis}_{signal}") in recording]
-    label = axis if len(names) > 1 else f"{axis} {kind_of(names[0])}"
-    return Panel(label, unit_of(names[0]), present)
+    label = axis if len(names) > 1 else f"{axis} {signal_kind(names[0])}"
+    return Panel(label, signal_unit(names[0]), present)
 
 
-def kind_of(name: str) -> str:
+def signal_kind(name: str) -> str:
     """`position` of `x_position_um`, by which signals are drawn alike; the name itself where it is nothing known."""
     kind = name.rpartition("_")[0].rpartition("_")[2]
-    suffixes = [signal for names in (*OF_AN_AXIS, TIMING) for signal in names]
+    suffixes = [signal for names in (*AXIS_PANELS, TIMING) for signal in names]
     return kind if f"{kind}_{name.rpartition('_')[2]}" in suffixes else name
 
 
-def _overview(
+def _overview_band(
     recording: Recording, names: list[str], start_s: float, end_s: float, points: int
 ) -> tuple[Any, Any, Any]:
     """Times (n,), least and largest values (n, names) of what was left out by intention, in about so many points."""
@@ -137,14 +137,14 @@ def _overview(
         np.stack([getattr(signal_extremes, part)[in_interval] for signal_extremes in extremes], axis=1)
         for part in ("least", "most")
     )
-    low, high = (np.where(np.abs(values) < BEYOND_DRAWING, values, np.nan) for values in (low, high))
+    low, high = (np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan) for values in (low, high))
     begins_s, ends_s = overview.time_s[in_interval][edges], np.fmax.reduceat(overview.end_s[in_interval], edges)
     times_s = np.stack([begins_s, ends_s], axis=1).ravel()  # level from the beginning of each to its end
     reduced = np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
     return times_s, np.repeat(reduced[0], 2, axis=0), np.repeat(reduced[1], 2, axis=0)
 
 
-def kept_spans(recording: Recording) -> list[tuple[float, float]]:
+def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
     """From when to when each stretch lasts that was kept between others that were left out, in s since the start."""
     if not recording.skipped:
         return []
@@ -155,18 +155,18 @@ def kept_spans(recording: Recording) -> list[tuple[float, float]]:
     return [(float(a), float(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if a < b]
 
 
-def marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
+def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
     """The events between two times, without those that end a file."""
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]
         if kind not in FINAL and start_s <= time_s <= end_s:
             label = details.get("mode") or ": ".join(filter(None, [kind, ", ".join(details.get("causes", []))]))
-            events.append(Mark(time_s, label.replace("_", " "), kind in BAD))
+            events.append(Mark(time_s, label.replace("_", " "), kind in FAULT_KINDS))
     return events
 
 
-def title(recording: Recording) -> str:
+def recording_title(recording: Recording) -> str:
     """Name, rate and clock of a run."""
     header = recording.header
     clock = "paced" if header["paced"] else "imported" if "imported" in header else "virtual time"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.errors import MissingExtra
-from rtloop.recording.load import Recording, described
+from rtloop.recording.load import Recording, describe_signal
 from rtloop.recording.views.selection import Selection
 
 TIME = "time_s"
@@ -20,10 +20,10 @@ def to_pandas(recording: Recording, selection: Selection) -> Any:
         import pandas
     except ImportError:
         raise MissingExtra("a data frame needs pandas: pip install 'rtloop[data]'") from None
-    signals = _signals(recording, selection)
+    signals = _selected_signals(recording, selection)
     frame = pandas.DataFrame(signals, index=pandas.Index(signals["deadline_ns"] * 1e-9, name=TIME))
     units = {name: recording.units[name] for name in signals}
-    frame.attrs = {**_about(recording), "units": units, "events": recording.events}
+    frame.attrs = {**_recording_attributes(recording), "units": units, "events": recording.events}
     return frame
 
 
@@ -36,20 +36,22 @@ def to_xarray(recording: Recording, selection: Selection) -> Any:
         import xarray
     except ImportError:
         raise MissingExtra("a data set needs xarray: pip install 'rtloop[data]'") from None
-    signals = _signals(recording, selection)
+    signals = _selected_signals(recording, selection)
     variables = {
-        name: (TIME, values, {"units": recording.units[name], "long_name": described(name).meaning or name})
+        name: (TIME, values, {"units": recording.units[name], "long_name": describe_signal(name).meaning or name})
         for name, values in signals.items()
     }
     time = (TIME, signals["deadline_ns"] * 1e-9, {"units": "s", "long_name": "time since the start of the run"})
-    return xarray.Dataset(variables, {TIME: time}, _about(recording) | {"events": json.dumps(recording.events)})
+    return xarray.Dataset(
+        variables, {TIME: time}, _recording_attributes(recording) | {"events": json.dumps(recording.events)}
+    )
 
 
-def _signals(recording: Recording, selection: Selection) -> dict[str, Any]:
-    names = selection.names(recording)
-    blocks = list(selection.blocks(recording, names)) or [np.empty((0, len(names)))]
+def _selected_signals(recording: Recording, selection: Selection) -> dict[str, Any]:
+    names = selection.selected_names(recording)
+    blocks = list(selection.read_blocks(recording, names)) or [np.empty((0, len(names)))]
     return {name: np.concatenate([rows[:, index] for rows in blocks]) for index, name in enumerate(names)}
 
 
-def _about(recording: Recording) -> dict[str, Any]:
+def _recording_attributes(recording: Recording) -> dict[str, Any]:
     return {"recording": str(recording.paths[0]), **{key: recording.header[key] for key in ("name", "rate_hz")}}

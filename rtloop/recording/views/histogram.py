@@ -13,7 +13,7 @@ NO_TIME_US = 1e15
 CLASSES_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
-class Histogram:
+class TimeHistogram:
     """Counts of times in whole nanoseconds; beyond `LINEAR_NS` in steps of 2⁻¹² of their size."""
 
     LINEAR_NS = 1 << 20
@@ -55,7 +55,7 @@ class Histogram:
         ranks = [max(math.ceil(quantile * cumulative[-1]), 1) for quantile in quantiles]
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
-    def classes(self) -> list[dict[str, Any]]:
+    def class_counts(self) -> list[dict[str, Any]]:
         """Counts below each of CLASSES_US, and None for the rest; empty where nothing was measured."""
         edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
         small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]

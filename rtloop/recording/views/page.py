@@ -10,12 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.errors import writing
+from rtloop.errors import output_errors
 from rtloop.hil.trusted import overwrite_file
-from rtloop.recording.file.parts import Files
+from rtloop.recording.file.parts import RecordingPaths
 from rtloop.recording.load import Recording, load
-from rtloop.recording.views.bands import Band, Panel, Progress, kind_of, marks, panels, read_bands, title
-from rtloop.values import rendered
+from rtloop.recording.views.bands import (
+    Band,
+    Panel,
+    ReportTicks,
+    event_marks,
+    make_panels,
+    read_bands,
+    recording_title,
+    signal_kind,
+)
+from rtloop.values import render_page
 
 POINTS = 100_000
 """About 5 MiB of page for one axis; the page itself draws the extremes of every pixel column."""
@@ -25,56 +34,56 @@ WIDTHS = {"position": 1.5}
 
 
 def write_page(
-    files: Files | Recording,
+    files: RecordingPaths | Recording,
     output: Path | str | None = None,
     *,
     start_s: float = 0.0,
     end_s: float = np.inf,
-    progress: Progress | None = None,
+    progress: ReportTicks | None = None,
 ) -> Path:
     """Write the page, by default beside the recording. Raises RecordingError, OutputError."""
     recording = files if isinstance(files, Recording) else load(files)
     target = recording.paths[0].with_suffix(".html") if output is None else Path(output)
-    panels_drawn = panels(recording)
+    panels_drawn = make_panels(recording)
     bands = read_bands(
         recording, [name for panel in panels_drawn for name in panel.names], start_s, end_s, POINTS, progress
     )
     time_s = next(iter(bands.values())).time_s
     data = {
-        "about": _about(recording, bands),
+        "about": _page_subtitle(recording, bands),
         "problems": recording.problems,
-        "time_s": _encoded(time_s, np.float64),
-        "panels": [_panel(panel, bands) for panel in panels_drawn],
-        "events": [mark._asdict() for mark in marks(recording, float(time_s[0]), float(time_s[-1]))],
+        "time_s": _encode_base64(time_s, np.float64),
+        "panels": [_panel_data(panel, bands) for panel in panels_drawn],
+        "events": [mark._asdict() for mark in event_marks(recording, float(time_s[0]), float(time_s[-1]))],
     }
     embedded = json.dumps(data).replace("<", "\\u003c")
-    with writing(target), os.fdopen(overwrite_file(target), "w", encoding="utf-8") as file:
-        file.write(rendered(__package__, title=title(recording), data=embedded))
+    with output_errors(target), os.fdopen(overwrite_file(target), "w", encoding="utf-8") as file:
+        file.write(render_page(__package__, title=recording_title(recording), data=embedded))
     return target
 
 
-def _about(recording: Recording, bands: dict[str, Band]) -> str:
+def _page_subtitle(recording: Recording, bands: dict[str, Band]) -> str:
     host = recording.header.get("host", {})
     points = len(next(iter(bands.values())).time_s)
     point_description = (
-        "every tick" if all(band.thin for band in bands.values()) else "each with the extremes of its ticks"
+        "every tick" if all(band.is_line for band in bands.values()) else "each with the extremes of its ticks"
     )
     parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), f"{points:,} points, {point_description}"]
     return " · ".join(filter(None, parts))
 
 
-def _panel(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
-    traces = [_trace(bands[name], name) for name in panel.names]
+def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
+    traces = [_trace_data(bands[name], name) for name in panel.names]
     return {"unit": panel.unit, "empty": panel.empty, "traces": traces}
 
 
-def _trace(band: Band, name: str) -> dict[str, Any]:
-    kind, high = kind_of(name), None if band.thin else _encoded(band.high, np.float32)
+def _trace_data(band: Band, name: str) -> dict[str, Any]:
+    kind, high = signal_kind(name), None if band.is_line else _encode_base64(band.high, np.float32)
     label = "tick" if kind == "exec" else kind if name.startswith(kind) else f"{name[: name.index(f'_{kind}_')]} {kind}"
     colour, width = kind if kind in COLOURED else "other", WIDTHS.get(kind, 1.0)
-    return {"label": label, "colour": colour, "width": width, "low": _encoded(band.low, np.float32), "high": high}
+    return {"label": label, "colour": colour, "width": width, "low": _encode_base64(band.low, np.float32), "high": high}
 
 
-def _encoded(values: Any, dtype: Any) -> str:
+def _encode_base64(values: Any, dtype: Any) -> str:
     """Little-endian bytes in base64."""
     return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()

@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.errors import MissingExtra, OutputError, writing
+from rtloop.errors import MissingExtra, OutputError, output_errors
 from rtloop.hil.trusted import overwrite_file
-from rtloop.recording.file.parts import Files
+from rtloop.recording.file.parts import RecordingPaths
 from rtloop.recording.load import Recording, load
 from rtloop.recording.views.bands import (
     Band,
     Mark,
     Panel,
-    Progress,
-    kept_spans,
-    kind_of,
-    marks,
-    panels,
+    ReportTicks,
+    event_marks,
+    full_rate_spans,
+    make_panels,
     read_bands,
-    title,
+    recording_title,
+    signal_kind,
 )
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -32,20 +32,20 @@ COLOURS = {
     "reference": "0.15", "position": "tab:blue", "error": "tab:red", "drive": "tab:green",
     "exec": "0.6", "lateness": "tab:purple",
 }  # fmt: skip
-OTHER = "tab:brown"
-BENEATH = {"position": 2.0}
+OTHER_COLOUR = "tab:brown"
+WIDE_LINES = {"position": 2.0}
 """Width in points, where it is not 0.8, of what other lines shall be seen on."""
-KEPT = "gold"
+FULL_RATE_COLOUR = "gold"
 """Behind what is recorded at the full rate, where the rest is an overview."""
 
 
 def plot(
-    files: Files | Recording,
+    files: RecordingPaths | Recording,
     output: Path | str | None = None,
     *,
     start_s: float = 0.0,
     end_s: float = np.inf,
-    progress: Progress | None = None,
+    progress: ReportTicks | None = None,
 ) -> Path:
     """Write a picture of the time from `start_s` to `end_s`, by default a PNG beside the recording.
 
@@ -62,34 +62,36 @@ def plot(
         raise OutputError(f"{target}: no picture ends in {target.suffix!r}; possible are {', '.join(FORMATS)}")
     recording = files if isinstance(files, Recording) else load(files)
     target = target or recording.paths[0].with_suffix(FORMATS[0])
-    panels_drawn = panels(recording)
+    panels_drawn = make_panels(recording)
     bands = read_bands(
         recording, [name for panel in panels_drawn for name in panel.names], start_s, end_s, POINTS, progress
     )
     time_s = next(iter(bands.values())).time_s
     figure = Figure(figsize=(12, 2.0 + 2.1 * len(panels_drawn)), layout="constrained")
     FigureCanvasAgg(figure)
-    _draw(figure, panels_drawn, bands, marks(recording, time_s[0], time_s[-1]))
-    for begin, end in kept_spans(recording):
+    _draw(figure, panels_drawn, bands, event_marks(recording, time_s[0], time_s[-1]))
+    for begin, end in full_rate_spans(recording):
         if begin <= time_s[-1] and end >= time_s[0]:
             for panel in figure.axes:
-                panel.axvspan(max(begin, time_s[0]), min(end, time_s[-1]), color=KEPT, alpha=0.25, linewidth=0)
-    figure.suptitle(title(recording), fontsize=11, parse_math=False)
-    with writing(target), os.fdopen(overwrite_file(target), "wb") as file:
+                panel.axvspan(
+                    max(begin, time_s[0]), min(end, time_s[-1]), color=FULL_RATE_COLOUR, alpha=0.25, linewidth=0
+                )
+    figure.suptitle(recording_title(recording), fontsize=11, parse_math=False)
+    with output_errors(target), os.fdopen(overwrite_file(target), "wb") as file:
         figure.savefig(file, format=target.suffix[1:], dpi=110)
     return target
 
 
-def _draw(figure: Any, drawn: list[Panel], bands: dict[str, Band], events: list[Mark]) -> None:
-    plots = list(np.ravel(figure.subplots(len(drawn), 1, sharex=True)))
-    for subplot, panel in zip(plots, drawn, strict=True):
+def _draw(figure: Any, panels: list[Panel], bands: dict[str, Band], events: list[Mark]) -> None:
+    plots = list(np.ravel(figure.subplots(len(panels), 1, sharex=True)))
+    for subplot, panel in zip(plots, panels, strict=True):
         if panel.empty and all(np.isnan(bands[name].high).all() for name in panel.names):
             subplot.text(0.5, 0.5, panel.empty, transform=subplot.transAxes, ha="center")
-            subplot.plot([], [], label=kind_of(panel.names[-1]))
+            subplot.plot([], [], label=signal_kind(panel.names[-1]))
             subplot.set_yticks([])
         else:
             for name in panel.names:
-                _trace(subplot, bands[name], kind_of(name))
+                _draw_trace(subplot, bands[name], signal_kind(name))
             subplot.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
         subplot.grid(visible=True, alpha=0.3)
         subplot.margins(x=0)
@@ -98,13 +100,13 @@ def _draw(figure: Any, drawn: list[Panel], bands: dict[str, Band], events: list[
     _mark_events(plots, events)
 
 
-def _trace(place: Any, band: Band, kind: str) -> None:
-    color = COLOURS.get(kind, OTHER)
-    line = {"color": color, "linewidth": BENEATH.get(kind, 0.8), "zorder": 1.9 if kind in BENEATH else 2.0}
-    place.plot(band.time_s, band.low, label=kind, **line)
-    if not band.thin:
-        place.plot(band.time_s, band.high, **line)
-        place.fill_between(band.time_s, band.low, band.high, color=color, alpha=0.5, linewidth=0)
+def _draw_trace(subplot: Any, band: Band, kind: str) -> None:
+    color = COLOURS.get(kind, OTHER_COLOUR)
+    line = {"color": color, "linewidth": WIDE_LINES.get(kind, 0.8), "zorder": 1.9 if kind in WIDE_LINES else 2.0}
+    subplot.plot(band.time_s, band.low, label=kind, **line)
+    if not band.is_line:
+        subplot.plot(band.time_s, band.high, **line)
+        subplot.fill_between(band.time_s, band.low, band.high, color=color, alpha=0.5, linewidth=0)
 
 
 def _mark_events(panels: list[Any], events: list[Mark]) -> None:

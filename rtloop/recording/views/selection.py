@@ -10,9 +10,9 @@ from fnmatch import fnmatchcase
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Rows
 from rtloop.recording.load import Recording
-from rtloop.signals import COMMON, DEADLINE, TICK
+from rtloop.signals import COMMON_SIGNALS, DEADLINE, TICK
 
-ALWAYS = (COMMON[TICK].name, COMMON[DEADLINE].name)
+REQUIRED_SIGNALS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
 """Without them nobody knows which ticks a file holds."""
 
 
@@ -25,7 +25,7 @@ class Selection:
     end_s: float = math.inf
     every: int = 1
 
-    def names(self, recording: Recording) -> tuple[str, ...]:
+    def selected_names(self, recording: Recording) -> tuple[str, ...]:
         """The signals that are meant, in the recording's order, with ALWAYS. Raises RecordingError for one unknown."""
         if not self.signals:
             return recording.columns
@@ -33,10 +33,10 @@ class Selection:
             if not any(fnmatchcase(name, pattern) for name in recording.columns):
                 available = ", ".join(recording.columns)
                 raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; there are {available}")
-        patterns = (*ALWAYS, *self.signals)
+        patterns = (*REQUIRED_SIGNALS, *self.signals)
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
-    def blocks(self, recording: Recording, names: Sequence[str]) -> Generator[Rows]:
+    def read_blocks(self, recording: Recording, names: Sequence[str]) -> Generator[Rows]:
         """Arrays (n, names) of the ticks that are meant. Raises RecordingError where a stretch holds none."""
         is_everything = self.start_s <= 0.0 and math.isinf(self.end_s)
         columns = ["tick", *names]
@@ -54,4 +54,4 @@ class Selection:
             raise RecordingError(f"{recording.paths[0]}: holds no tick from {self.start_s:g} s on{until}")
 
 
-ALL = Selection()
+ALL_SIGNALS = Selection()

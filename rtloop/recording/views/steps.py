@@ -40,7 +40,7 @@ def step_metrics(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> StepMetrics | None:
     """Metrics of a piecewise constant reference (n,) and its position (n,); None where there are no such steps."""
-    table = every_step(reference_um, position_um, rate_hz)
+    table = measure_steps(reference_um, position_um, rate_hz)
     if table is None:
         return None
     unreached = int(np.count_nonzero(np.isinf(table[:, 1])))
@@ -49,7 +49,7 @@ def step_metrics(
     return StepMetrics(len(table), unreached, *pairs)
 
 
-def every_step(
+def measure_steps(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> npt.NDArray[np.float64] | None:
     """Overshoot %, settling time ms, static error % of each step, (steps, 3); None where there are no such steps.
@@ -65,11 +65,11 @@ def every_step(
     for start, end in zip(starts, ends, strict=True):
         if end - start >= SMALLEST_DWELL_TICKS:
             height = reference_um[start] - reference_um[start - 1]
-            rows.append(_one_step(position_um[start:end], reference_um[start], height, rate_hz))
+            rows.append(_measure_step(position_um[start:end], reference_um[start], height, rate_hz))
     return np.array(rows) if rows else None
 
 
-def _one_step(
+def _measure_step(
     position_um: npt.NDArray[np.float64], level_um: float, height_um: float, rate_hz: float
 ) -> tuple[float, float, float]:
     """Overshoot %, settling time ms, static error %."""

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.recording.file.parts import Files, Parts, absent_parts, find_files
+from rtloop.recording.file.parts import RecordingPaths, RunReaders, find_files, missing_parts
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
-from rtloop.recording.file.topics.overview import LEAST, MOST, uncovered
-from rtloop.recording.views.histogram import Histogram
+from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, uncovered_ranges
+from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.signals import DEADLINE, Flag, Mode
 
-MEASURED = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
-COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED)
-LIMITED = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
+MEASURED_TIMES = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
+COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED_TIMES)
+LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
 BATCH_ROWS = 1 << 18
 """More than any chunk holds."""
 
@@ -42,7 +42,7 @@ class AxisSummary:
 
 
 @dataclass(frozen=True)
-class Range:
+class ValueRange:
     """Least and largest value of a signal; None where it has no number."""
 
     name: str
@@ -52,7 +52,7 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Trip:
+class TripSummary:
     """Of an axis, or of all."""
 
     tick: int
@@ -101,9 +101,9 @@ class Summary:
     axes: list[AxisSummary]
     imported: dict[str, Any] | None
     """Of which file, and how, where the signals are another program's."""
-    ranges: list[Range]
+    ranges: list[ValueRange]
     """Of each of those signals."""
-    trips: list[Trip]
+    trips: list[TripSummary]
     commands: dict[str, int]
     """By whom, the most first."""
     events: int
@@ -115,22 +115,22 @@ class Summary:
         return asdict(self)
 
 
-class AxisSums:
+class AxisTotals:
     """Tracking error over closed-loop ticks and the largest drive of one axis."""
 
     def __init__(self, name: str, settled_within_um: float | None) -> None:
         self.name, self._band_um = name, settled_within_um
-        self._square_sum, self._count, self._settled, self._drive = 0.0, 0, 0, 0.0
+        self._square_sum, self._count, self._settled_ticks, self._drive = 0.0, 0, 0, 0.0
 
-    def add(self, column: dict[str, np.ndarray[Any, Any]], closed: Any) -> None:
+    def add(self, column: dict[str, np.ndarray[Any, Any]], is_closed_loop: Any) -> None:
         """Count a block; `closed` says which ticks ran in closed loop. Imported signals may lack either column."""
         error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
-        if error_um is not None and closed is not None:
-            errors = error_um[closed]
+        if error_um is not None and is_closed_loop is not None:
+            errors = error_um[is_closed_loop]
             self._square_sum += float(errors @ errors)
             self._count += len(errors)
             if self._band_um is not None:
-                self._settled += int(np.count_nonzero(np.abs(errors) <= self._band_um))
+                self._settled_ticks += int(np.count_nonzero(np.abs(errors) <= self._band_um))
         if drive_v is not None:
             self._drive = max(self._drive, float(np.abs(drive_v).max()))
 
@@ -138,44 +138,44 @@ class AxisSums:
         """What came of it, in a recording with these columns."""
         rms_um = math.sqrt(self._square_sum / self._count) if self._count else None
         drive_v = self._drive if f"{self.name}_drive_v" in columns else None
-        settled = 100 * self._settled / self._count if self._count and self._band_um is not None else None
+        settled = 100 * self._settled_ticks / self._count if self._count and self._band_um is not None else None
         return AxisSummary(self.name, rms_um, drive_v, self._band_um, settled)
 
 
-class Extremes:
+class SignalExtremes:
     """The least and the largest number of each signal."""
 
     def __init__(self, units: dict[str, str]) -> None:
         self._units = units
-        self._found = {name: (math.inf, -math.inf) for name in units}
+        self._extremes = {name: (math.inf, -math.inf) for name in units}
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
         """Count a block; NaN is no number."""
-        for name, (minimum, maximum) in self._found.items():
+        for name, (minimum, maximum) in self._extremes.items():
             low, high = np.fmin.reduce(column[name]), np.fmax.reduce(column[name])
-            self._found[name] = float(np.fmin(minimum, low)), float(np.fmax(maximum, high))
+            self._extremes[name] = float(np.fmin(minimum, low)), float(np.fmax(maximum, high))
 
-    def summary(self) -> list[Range]:
+    def summary(self) -> list[ValueRange]:
         """What came of it."""
         return [
-            Range(name, self._units[name], *(extremes if extremes[0] <= extremes[1] else (None, None)))
-            for name, extremes in self._found.items()
+            ValueRange(name, self._units[name], *(extremes if extremes[0] <= extremes[1] else (None, None)))
+            for name, extremes in self._extremes.items()
         ]
 
 
-class Totals:
+class RecordingTotals:
     """What is summed up over the ticks of a recording."""
 
     def __init__(self, bands_um: dict[str, float | None], imported_units: dict[str, str]) -> None:
         """`bands_um`: by axis, what `settled_within_um` its configuration states."""
         self.ticks, self.overruns, self.periods_missed = 0, 0, 0
         self.closed_ticks, self.saturated_ticks = 0, 0
-        self.limited = dict.fromkeys(LIMITED, 0)
+        self.limited_ticks = dict.fromkeys(LIMIT_FLAGS, 0)
         self.first: tuple[float, float] | None = None
         self.last = (0.0, 0.0)
-        self.histograms = {name: Histogram() for name in MEASURED}
-        self.axes = [AxisSums(name, band_um) for name, band_um in bands_um.items()]
-        self.extremes = Extremes(imported_units)
+        self.histograms = {name: TimeHistogram() for name in MEASURED_TIMES}
+        self.axes = [AxisTotals(name, band_um) for name, band_um in bands_um.items()]
+        self.extremes = SignalExtremes(imported_units)
 
     def add(self, column: dict[str, np.ndarray[Any, Any]]) -> None:
         """A block of consecutive ticks, by column."""
@@ -186,8 +186,8 @@ class Totals:
             self.periods_missed += int(column["periods_missed"].sum())
         flags = column["flags"].astype(np.int64) if "flags" in column else np.zeros(0, np.int64)
         self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
-        for name, flag in LIMITED.items():
-            self.limited[name] += int(np.count_nonzero(flags & flag))
+        for name, flag in LIMIT_FLAGS.items():
+            self.limited_ticks[name] += int(np.count_nonzero(flags & flag))
         for name in self.histograms.keys() & column.keys():
             self.histograms[name].add(column[name])
         is_closed_loop = column["mode"] == Mode.CLOSED_LOOP if "mode" in column else None
@@ -202,7 +202,7 @@ class Totals:
             self.extremes.add(column)
 
     @property
-    def executed(self) -> int:
+    def ticks_spanned(self) -> int:
         """Ticks from the first to the last, whether they are in the recording or not."""
         return int(self.last[0] - self.first[0]) if self.first else 0
 
@@ -212,48 +212,51 @@ class Totals:
         return (self.last[1] - self.first[1]) / 1e9 if self.first else 0.0
 
 
-def summarise(path: Files, progress: Progress | None = None) -> Summary:
+def summarise(path: RecordingPaths, progress: Progress | None = None) -> Summary:
     """Tolerant of damage, which it names; a rotated run is summed up as one.
 
     Raises RecordingError.
     """
-    with Parts(find_files(path)) as readers:
-        totals = _sum_up(readers, progress)
+    with RunReaders(find_files(path)) as readers:
+        totals = _sum_ticks(readers, progress)
         for reader in readers:
             deque(reader.snapshots(), maxlen=0)  # read for what is wrong with them
-        return _report(readers, totals)
+        return _make_summary(readers, totals)
 
 
-def _seamless(end: dict[str, Any] | None) -> bool:
+def _is_seamless(end: dict[str, Any] | None) -> bool:
     """Whether a file leaves nothing out: it was finished, or its recorder was replaced and the next file goes on."""
     return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
 
 
-def _overview_span_s(readers: Sequence[Reader], totals: Totals) -> float:
+def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> float:
     """From the first deadline to the last where ticks were left out by intention; 0 where none were."""
     deadlines = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
     if not deadlines or totals.first is None:
         return 0.0
-    first, last = deadlines[0][0, LEAST], deadlines[-1][-1, MOST]
+    first, last = deadlines[0][0, MINIMUM], deadlines[-1][-1, MAXIMUM]
     return float(max(last, totals.last[1]) - min(first, totals.first[1])) / 1e9
 
 
-def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
+def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary:
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
     end_totals = ends[-1]
     executed = end_totals["ticks_executed"] if end_totals else int(totals.last[0]) + 1 if totals.first else 0
-    begin, skipped = header.get("first_tick", 0), [tick_range for reader in readers for tick_range in reader.skipped]
+    begin, skipped = (
+        header.get("first_tick", 0),
+        [tick_range for reader in readers for tick_range in reader.skipped_ranges],
+    )
     executed = max([executed, *(first + count for first, count in skipped)])
     ticks_skipped = sum(count for _, count in skipped)
     lost = executed - begin - totals.ticks - ticks_skipped
-    problems = [*absent_parts(readers), *(problem for reader in readers for problem in reader.problems)]
+    problems = [*missing_parts(readers), *(problem for reader in readers for problem in reader.problems)]
     is_complete = (
-        bool(end_totals and end_totals["complete"]) and all(map(_seamless, ends)) and lost == 0 and not problems
+        bool(end_totals and end_totals["complete"]) and all(map(_is_seamless, ends)) and lost == 0 and not problems
     )
     reports = {name: histogram.report() for name, histogram in totals.histograms.items()}
-    phases = {name: reports[name] for name in MEASURED[2:]}
+    phases = {name: reports[name] for name in MEASURED_TIMES[2:]}
     size_bytes = sum(reader.size_bytes for reader in readers)
     return Summary(
         recording=str(readers[0].path),
@@ -264,18 +267,18 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         ticks_logged=totals.ticks,
         ticks_lost=lost,
         around=header.get("around"),
-        stretches=len(uncovered(begin, executed, skipped)),
+        stretches=len(uncovered_ranges(begin, executed, skipped)),
         ticks_skipped=ticks_skipped,
         periods_missed=totals.periods_missed,
         rate_hz=rate_hz,
-        achieved_rate_hz=totals.executed / totals.span_s if totals.span_s else None,
+        achieved_rate_hz=totals.ticks_spanned / totals.span_s if totals.span_s else None,
         duration_s=max(totals.span_s, _overview_span_s(readers, totals)) + 1 / rate_hz if totals.ticks else 0.0,
         paced=header["paced"],
         overruns=totals.overruns,
-        ticks_limited=totals.limited,
+        ticks_limited=totals.limited_ticks,
         saturated_percent=100 * totals.saturated_ticks / totals.closed_ticks if totals.closed_ticks else None,
         lateness_us=reports["lateness_us"],
-        lateness_histogram=totals.histograms["lateness_us"].classes(),
+        lateness_histogram=totals.histograms["lateness_us"].class_counts(),
         exec_us=reports["exec_us"],
         phases={name: None if report is None else report["p50"] for name, report in phases.items()},
         complete=is_complete,
@@ -288,7 +291,7 @@ def _report(readers: Sequence[Reader], totals: Totals) -> Summary:
         imported=header.get("imported"),
         ranges=totals.extremes.summary(),
         trips=[
-            Trip(event["tick"], event["what"]["causes"], event["what"].get("reason"))
+            TripSummary(event["tick"], event["what"]["causes"], event["what"].get("reason"))
             for event in events
             if event["kind"] == "tripped"
         ],
@@ -310,9 +313,9 @@ def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
     return bands_um
 
 
-def _sum_up(readers: Sequence[Reader], progress: Progress | None) -> Totals:
+def _sum_ticks(readers: Sequence[Reader], progress: Progress | None) -> RecordingTotals:
     header, axes = readers[0].header, readers[0].header["axes"]
-    totals = Totals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
+    totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v"))]
     if "imported" in header:
         names = [*readers[0].columns]

@@ -187,7 +187,7 @@ def application(service: Service) -> Starlette:
         supervisor, live, identity = service.supervisor, service.live, request.query_params.get("identity", "")
         if not (identity.isascii() and identity.isdigit() and len(identity) < 19):
             return refused(422, "identity: that of a command, a number, is needed")
-        name = None if supervisor is None else supervisor.names.of(int(identity))
+        name = None if supervisor is None else supervisor.names.requester(int(identity))
         return JSONResponse({"name": name, "change": None if live is None else live.change_of(int(identity))})
 
     async def get_metrics(_: Request) -> Response:

@@ -13,7 +13,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 
 from rtloop.errors import ConfigError
-from rtloop.recording.file.topics.events import OPERATOR, name_fault
+from rtloop.recording.file.topics.events import OPERATOR, name_problem
 from rtloop.service.api.bodies import LockBody
 from rtloop.service.api.refusals import refusal
 from rtloop.service.desk import NOBODY, Asker, asked_by
@@ -31,7 +31,7 @@ def asker_name(connection: HTTPConnection) -> str:
     names = query.get("as", [OPERATOR])
     if len(names) > 1:
         raise ConfigError("request", [f"as: {len(names)} names; one is allowed"])
-    if fault := name_fault(names[0]):
+    if fault := name_problem(names[0]):
         raise ConfigError("request", [f"as: {fault}"])
     return names[0]
 

@@ -9,7 +9,7 @@ from typing import Any
 import anyio.to_thread
 from anyio import CapacityLimiter
 
-from rtloop.values import counted
+from rtloop.values import count_text
 
 RETRY = "try again"
 
@@ -41,7 +41,7 @@ class Lanes:
         """`action` in a thread, when it is its turn. Raises Busy, and what the action raises."""
         limit = lane.value[1]
         if self._there[lane] >= limit:
-            raise Busy(f"{counted(limit, 'request')} of this kind wait already; {RETRY}")
+            raise Busy(f"{count_text(limit, 'request')} of this kind wait already; {RETRY}")
         self._there[lane] += 1
         try:
             return await anyio.to_thread.run_sync(action, *arguments, limiter=self._limiters[lane])

@@ -26,7 +26,7 @@ def figures_limited(configuration: Configuration, number: int, least_step_ms: fl
 
 def expect_changes() -> None:
     """Have the process ready before it is needed."""
-    PROCESS.expect(prepare)
+    PROCESS.prepare_ahead(prepare)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError, RtloopError
-from rtloop.laws.limited.first import must_be_limited, try_first
+from rtloop.laws.limited.first import needs_limited_process, try_limited
 from rtloop.service.changing.building import figures_limited, prepare_limited
 from rtloop.service.changing.changes import Change, Changes
 from rtloop.service.changing.differences import differences
@@ -196,8 +196,8 @@ class LiveLaw:
         """An axis with the laws that the loop has loaded. Raises ConfigError."""
         configuration = self.prepared.configuration
         library = Library(configuration.folder, configuration.laws)
-        if must_be_limited(configuration.laws):
-            try_first("change", partial(AxisOptions.model_validate, context={"library": library}), raw)
+        if needs_limited_process(configuration.laws):
+            try_limited("change", partial(AxisOptions.model_validate, context={"library": library}), raw)
         try:
             return AxisOptions.model_validate(raw, context={"library": library})
         except ValidationError as error:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.loop_analysis import LoopAnalysis
-from rtloop.analysis.perturbation import changes, until_unstable
+from rtloop.analysis.perturbation import plant_changes, stability_range
 from rtloop.analysis.step_response import step_response
 from rtloop.configuration.cautions import tracking_problem
 from rtloop.configuration.checks import AxisCheck
@@ -57,10 +57,10 @@ def figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) -> Figu
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
     """Of the model's resonance, downwards and upwards; None where it has none."""
-    resonance = None if check.plant is None else changes(check.plant).get("resonance")
+    resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:
         return None
-    down, up = until_unstable(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
+    down, up = stability_range(lambda moved: check.loop(moved, check.delay_ticks), check.plant, resonance)
     return [-(resonance.down if down is None else down), resonance.up if up is None else up]
 
 

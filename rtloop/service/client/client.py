@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from rtloop.errors import HostRefused, LoopFault, RtloopError, UnavailableError
-from rtloop.hil.trusted import Untrusted, owners
+from rtloop.errors import HostRefusal, LoopFault, RtloopError, UnavailableError
+from rtloop.hil.trusted import UntrustedPath, trusted_owners
 from rtloop.supervision.paths import refusal
 
 TIMEOUT_S = 20.0
@@ -38,8 +38,8 @@ class _UnixConnection(http.client.HTTPConnection):
 def _connected(path: Path) -> socket.socket:
     """A connection to who serves there: we, root, or whom root gave the folder to. Raises OSError, HostRefused."""
     try:
-        believed = owners(path.parent)
-    except Untrusted as error:
+        believed = trusted_owners(path.parent)
+    except UntrustedPath as error:
         raise refusal(error) from None
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -52,7 +52,7 @@ def _connected(path: Path) -> socket.socket:
         )
         owner = path.lstat().st_uid
         if server not in believed or owner != server:
-            raise HostRefused(f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner")
+            raise HostRefusal(f"{path}: served by user {server} on a socket of user {owner}, not of its folder's owner")
         return connection
     except BaseException:
         connection.close()

@@ -9,8 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.learning import GROWN, Learning, learning, periods, rms, untaught
-from rtloop.analysis.perturbation import around
+from rtloop.analysis.learning import (
+    MAX_ERROR_GROWTH,
+    LearningGains,
+    cycle_periods,
+    learning_gains,
+    rms,
+    unlearned_table,
+)
+from rtloop.analysis.perturbation import plants_around
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.hil.modal import Real
@@ -74,7 +81,7 @@ def learn(
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
     ticks = asked.wanted_um.size
-    settle, judged = periods(ticks, rate_hz)
+    settle, judged = cycle_periods(ticks, rate_hz)
     if (took_s := (asked.cycles + 1) * (settle + judged) * ticks / rate_hz) > LONGEST_S:
         raise _unsuitable(f"{asked.cycles} cycles take {took_s:.0f} s; at most {LONGEST_S:g} s are allowed")
     teacher = _teacher(live, number, asked)
@@ -129,30 +136,30 @@ class _Tried:
         return self.tables[self.number]
 
 
-def _taught(player: Player, teacher: Learning, asked: Asked, settle: int, judged: int, tried: _Tried) -> str:
+def _taught(player: Player, teacher: LearningGains, asked: Asked, settle: int, judged: int, tried: _Tried) -> str:
     """Cycle after cycle; why it ended."""
-    table = untaught(asked.wanted_um)
+    table = unlearned_table(asked.wanted_um)
     for cycle in range(asked.cycles + 1):
         error_um = _error(player, asked.wanted_um, table, settle, judged)
         tried.note(table, error_um)
-        if tried.cycles[-1].rms_um > GROWN * tried.cycles[tried.number].rms_um:
+        if tried.cycles[-1].rms_um > MAX_ERROR_GROWTH * tried.cycles[tried.number].rms_um:
             return f"the error grew in cycle {cycle}: back to cycle {tried.number}"
-        table = teacher.improved(table, error_um)
+        table = teacher.improve(table, error_um)
     return f"after {asked.cycles} cycles"
 
 
-def _teacher(live: LiveLaw, number: int, asked: Asked) -> Learning:
+def _teacher(live: LiveLaw, number: int, asked: Asked) -> LearningGains:
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     loops = []
     if options.model is not None and len(configuration.together(number)) == 1:
-        for name, plant in around(options.model.transfer(), asked.resonance_percent):
+        for name, plant in plants_around(options.model.transfer(), asked.resonance_percent):
             loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
             loops += [] if loop is None else [(name, loop)]
     if not loops:
         raise _unsuitable(f"axis {options.name!r}: no model of a loop of its own; what is learned follows from that")
     try:
-        return learning(loops, asked.wanted_um.size)
+        return learning_gains(loops, asked.wanted_um.size)
     except ValueError as error:
         raise _unsuitable(f"axis {options.name!r}: {error}") from None
 

@@ -18,9 +18,9 @@ import numpy as np
 
 from rtloop import signals
 from rtloop.analysis.measured import excitation
-from rtloop.analysis.measured.measurement import IN_STEP, Measurement, measurement
-from rtloop.analysis.measured.multisine import HIGHEST_PART, Grid, grid, played
-from rtloop.analysis.measured.response import Signals
+from rtloop.analysis.measured.measurement import TICK_DRIVEN, LoopMeasurement, measure_loop
+from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, excitation_sequence, make_grid
+from rtloop.analysis.measured.response import PeriodSignals
 from rtloop.analysis.perturbation import resonance_hz
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.errors import ConfigError
@@ -55,7 +55,7 @@ class Results:
     def __init__(self) -> None:
         self._figures: deque[dict[str, Any]] = deque(maxlen=KEPT)
 
-    def note(self, found: Measurement) -> None:
+    def note(self, found: LoopMeasurement) -> None:
         """Another one."""
         self._figures.append({"unix_time_s": round(time.time(), 3)} | found.figures())
 
@@ -88,7 +88,7 @@ class Asked:
     0: do not."""
 
 
-def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> Measurement:
+def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> LoopMeasurement:
     """Measure the loop of an axis about the reference that it holds.
 
     Raises ConfigError for what can be granted in no state, Refused for what this one does not allow, and where the
@@ -115,7 +115,7 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
     with run.about_the_reference(asked.amplitude_um):
         found = run.approach(lines, asked.amplitude_um, periods)
     try:
-        answer = measurement(found, rate_hz, near_hz, model, options.prefilter.command_taps)
+        answer = measure_loop(found, rate_hz, near_hz, model, options.prefilter.command_taps)
         if not asked.gain_um:
             return answer
         return replace(answer, gain=measure_gain(player, options.limits, asked.gain_um))
@@ -123,13 +123,13 @@ def measure(supervisor: Supervisor, live: LiveLaw, axis: str, asked: Asked) -> M
         raise Refused(f"response: {error}") from None
 
 
-def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> Grid:
+def _grid(asked: Asked, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
     shortest_s = SHORTEST_OF_A_MODE_S if asked.resonance_only else SHORTEST_S
     wanted_s = LINES_OF_A_MODE / half_width_hz if half_width_hz else SHORTEST_S
     period_s = asked.period_s or min(max(wanted_s, shortest_s), LONGEST_S, max(asked.duration_s / 3, shortest_s))
     from_hz, to_hz = asked.from_hz or LOWEST_LINES / period_s, asked.to_hz or HIGHEST_PART * rate_hz
     try:
-        return grid(rate_hz, period_s, from_hz, to_hz, near_hz)
+        return make_grid(rate_hz, period_s, from_hz, to_hz, near_hz)
     except ValueError as error:
         raise ConfigError("request", [f"response: {error}"]) from None
 
@@ -155,13 +155,13 @@ class _Run:
         with player.coming_back():
             yield
 
-    def approach(self, lines: Grid, amplitude_um: float, periods: int) -> dict[str, Real]:
+    def approach(self, lines: LineGrid, amplitude_um: float, periods: int) -> dict[str, Real]:
         """Signals of the largest multisine that keeps within the amplitude; what goes further is taken back."""
-        period = excitation.first(lines, amplitude_um)
-        aims, tries = [*excitation.AIMS], TRIES
+        period = excitation.first_period(lines, amplitude_um)
+        aims, tries = [*excitation.AMPLITUDE_RATIOS], TRIES
         found = self.play(period, FIRST_PERIODS)
         while aims:
-            another = excitation.shaped(lines, period, self._whole(lines, found), amplitude_um, aims[0])
+            another = excitation.shape_period(lines, period, self._whole(lines, found), amplitude_um, aims[0])
             try:
                 found = self.play(another, FIRST_PERIODS if len(aims) > 1 else periods)
             except _TooFar:
@@ -177,15 +177,15 @@ class _Run:
     def play(self, period: Real, periods: int) -> dict[str, Real]:
         """Signals of all ticks of one period to settle and `periods` more, and of the fade behind them."""
         player = self._player
-        samples = played(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
+        samples = excitation_sequence(period, periods, player.hold_um, round(FADE_S * player.rate_hz))
         rows = player.played(samples, self._judge)
         found = {name: player.column(rows, signal) for name, signal in NAMES.items()}
-        return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != IN_STEP else {})
+        return found | ({"periods_missed": rows[:, signals.PERIODS_MISSED]} if self._driver != TICK_DRIVEN else {})
 
-    def _whole(self, lines: Grid, found: dict[str, Real]) -> Signals:
+    def _whole(self, lines: LineGrid, found: dict[str, Real]) -> PeriodSignals:
         """The whole periods behind the one to settle."""
         parts = (found[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
-        return Signals(
+        return PeriodSignals(
             *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in parts)
         )
 

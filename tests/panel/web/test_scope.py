@@ -18,10 +18,10 @@ from rtloop.panel.views.scope import Scope
 from rtloop.panel.views.timing import Timing
 from rtloop.panel.views.wishes import read_wishes, wish_of
 from rtloop.panel.views.xy import extremes
-from rtloop.signals import Signal, columns
+from rtloop.signals import Signal, column_names
 from tests.panel.web.browser import unpacked
 
-NAMES = columns(["x"], [])
+NAMES = column_names(["x"], [])
 LOOP = Description(
     "lab", 1000.0, tuple(Signal(name, "", "") for name in NAMES), Path("b"), Path("r"), {"axis": [{"name": "x"}]}
 )

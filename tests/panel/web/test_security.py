@@ -21,7 +21,7 @@ import pytest
 from starlette.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from rtloop.errors import HostRefused, OutputError
+from rtloop.errors import HostRefusal, OutputError
 from rtloop.panel.web.live import MAX_STREAMS
 from rtloop.panel.web.rates import MAX_CLIENTS, Rate, Rates, client_of
 from rtloop.panel.web.security import MAX_SESSIONS, Sessions, host_name
@@ -343,7 +343,7 @@ def test_a_token_that_another_user_laid_is_not_believed():
 
 def test_a_token_is_no_pipe(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe", 0o600)
-    with pytest.raises(HostRefused, match="not a regular file"):
+    with pytest.raises(HostRefusal, match="not a regular file"):
         token_of(tmp_path / "pipe")
 
 

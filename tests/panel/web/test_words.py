@@ -8,7 +8,7 @@ import pytest
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.law.reference import Generator
 from rtloop.panel.views.words import InForce, words
-from rtloop.recording.file.topics.events import event_of
+from rtloop.recording.file.topics.events import event_from_message
 from rtloop.signals import Flag, Mode
 
 
@@ -34,7 +34,7 @@ def test_what_an_event_is_about(kind: Kind, values: tuple[float, ...], said: str
     record = np.zeros((), MESSAGE)
     record["kind"] = kind
     record["values"][: len(values)] = values
-    assert words(event_of(record, ["x"], 0)) == said  # type: ignore[arg-type]
+    assert words(event_from_message(record, ["x"], 0)) == said  # type: ignore[arg-type]
 
 
 def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list[str]:
@@ -44,7 +44,7 @@ def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list
     for record, (kind, values) in zip(records, messages, strict=True):
         record["kind"] = kind
         record["values"][: len(values)] = values
-    return [in_force.change(event_of(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
+    return [in_force.change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
 
 
 def test_a_change_names_its_before_and_its_after() -> None:
@@ -76,6 +76,6 @@ def test_a_reference_in_volts_is_told_in_volts_and_none_is_told_that_nobody_know
 def test_a_change_of_a_law_is_told_as_the_service_told_it() -> None:
     record = np.zeros((), MESSAGE)
     record["kind"] = Kind.LOAD_LAW
-    event = event_of(record, ["x"], 0)  # type: ignore[arg-type]
+    event = event_from_message(record, ["x"], 0)  # type: ignore[arg-type]
     event["what"]["change"] = "controller.gain 0.016 → 0.012"
     assert words(event) == "controller.gain 0.016 → 0.012"

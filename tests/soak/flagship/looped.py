@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from rtloop.analysis.closed_loop import Loop, discrete_loop
-from rtloop.analysis.perturbation import Change, maker, until_unstable, with_resonance_shifted
+from rtloop.analysis.perturbation import PlantChange, loop_builder, shift_resonance, stability_range
 from rtloop.configuration.file import Configuration
-from rtloop.design.robust.certificate import DRAWN, SWEPT, certified
+from rtloop.design.robust.certificate import RANDOM_PLANTS, SWEEP_POINTS, certify
 from rtloop.design.robust.scenarios import Family
-from rtloop.design.robust.search import walls_of
-from rtloop.design.verification.simulated import REST_S, SETTLES_S
+from rtloop.design.robust.search import design_walls
+from rtloop.design.verification.simulated import REST_S, SETTLING_S
 from rtloop.experiments.lockin import tone
 from rtloop.hil.modal import Real
 from rtloop.hil.options import DisturbanceOptions
@@ -32,9 +32,9 @@ def family_loops(controller: DiscreteController, family: Family) -> list[Loop]:
     """On the model, then in every scenario that is certified."""
     scenarios = [
         family.nominal,
-        *family.corners(),
-        *family.swept(SWEPT),
-        *family.drawn(DRAWN, specification().robust.seed),
+        *family.corner_scenarios(),
+        *family.sweep_scenarios(SWEEP_POINTS),
+        *family.random_scenarios(RANDOM_PLANTS, specification().robust.seed),
     ]
     return [discrete_loop(controller, family.plant(one), one.delay_ticks) for one in dict.fromkeys(scenarios)]
 
@@ -66,7 +66,7 @@ def linear_rows(paper: Configuration, ours: Configuration) -> tuple[list[Row], d
     family = Family(design.plant.transfer(), 0, design.scenarios, PERIOD_S)
     for name, one in (("paper", paper), ("ours", ours)):
         linear = controller_of(one)
-        proofs[name] = certified(linear, family, walls_of(design), design.robust.seed)
+        proofs[name] = certify(linear, family, design_walls(design), design.robust.seed)
         others = family_loops(linear, family)
         model, ringing[name] = others[0], slowest_ringing_ms(others)
         held[name] = held_up_to_hz([model]), held_up_to_hz(others)
@@ -79,9 +79,11 @@ def linear_rows(paper: Configuration, ours: Configuration) -> tuple[list[Row], d
             "sensitivity_band": (sensitivities.min(axis=0), sensitivities.max(axis=0)),
             "stable": len(sensitivities), "of": len(others),
         }  # fmt: skip
-    limits = until_unstable(maker(controller_of(paper)), TRUTH.model, Change(with_resonance_shifted, 12.0, 12.0, 0.25))
-    ours_limits = until_unstable(maker(controller_of(ours)), TRUTH.model,
-                                 Change(with_resonance_shifted, 45.0, 45.0, 0.25))  # fmt: skip
+    limits = stability_range(
+        loop_builder(controller_of(paper)), TRUTH.model, PlantChange(shift_resonance, 12.0, 12.0, 0.25)
+    )
+    ours_limits = stability_range(loop_builder(controller_of(ours)), TRUTH.model,
+                                 PlantChange(shift_resonance, 45.0, 45.0, 0.25))  # fmt: skip
     return [
         Row("slowest resonance mode in every scenario", "ms", 1.5, proofs["paper"].decay_ms.value,
             proofs["ours"].decay_ms.value, note=f"{proofs['ours'].plants} plants: {proofs['ours'].decay_ms.scenario}"),
@@ -109,8 +111,8 @@ def at_rest(configuration: Configuration, name: str) -> float:
     """rms in nm about the mean, over places of the range, of one signal."""
     squares = []
     for place_um in PLACES_UM:
-        run = bench(configuration).run("x", (place_um,), SETTLES_S + REST_S)
-        squares.append(run[name][round(SETTLES_S * RATE_HZ) :].var())
+        run = bench(configuration).run("x", (place_um,), SETTLING_S + REST_S)
+        squares.append(run[name][round(SETTLING_S * RATE_HZ) :].var())
     return 1e3 * float(np.sqrt(np.mean(squares)))
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 from rtloop.configuration.axis import ModelOptions
-from rtloop.design.robust.search import robust_controller
+from rtloop.design.robust.search import find_robust_controller
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions
-from rtloop.linear.discretise import discretise
+from rtloop.linear.discretise import discretise_controller
 from tests.soak.flagship.looped import family_loops, slowest_ringing_ms
 from tests.soak.flagship.stage import PERIOD_S, specification
 from tests.soak.flagship.stepped import Say
@@ -25,8 +25,11 @@ def rows(say: Say) -> list[Row]:
     for hz, damping, delay_ticks in RIGS:
         name = f"{hz:g} Hz, damping {damping:g}, {1 + delay_ticks} samples of delay"
         try:
-            made = robust_controller(asked(hz, damping, delay_ticks))
-            proof, loops = made.certificate, family_loops(discretise(made.controller, PERIOD_S, "matched"), made.family)
+            made = find_robust_controller(asked(hz, damping, delay_ticks))
+            proof, loops = (
+                made.certificate,
+                family_loops(discretise_controller(made.controller, PERIOD_S, "matched"), made.family),
+            )
             decay_ms, ringing_ms, peak, why = (
                 proof.decay_ms.value,
                 slowest_ringing_ms(loops),

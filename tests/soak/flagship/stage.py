@@ -14,12 +14,12 @@ from rtloop.configuration.file import Configuration, load
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.programme import Taps
 from rtloop.design.robust.scenarios import Family, Scenario
-from rtloop.design.robust.shape import Subject, shaped
-from rtloop.design.robust.subject import subject_of
+from rtloop.design.robust.shape import Subject, design_taps
+from rtloop.design.robust.subject import build_subject
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.simulated import LIMITED, POINTS, between_ticks
+from rtloop.design.verification.simulated import LIMIT_FLAGS, POINTS, intersample_positions
 from rtloop.hil.modal import Real
 from rtloop.hil.options import DynamicsOptions, RigOptions
 from rtloop.hil.rig import zeros_poles_gain
@@ -123,7 +123,7 @@ def bench(
 def steps(on: Bench, dwell_s: float = DWELL_S) -> Steps:
     """Eight of them, each judged by itself."""
     run = on.run("x", LEVELS_UM, dwell_s)
-    position, reference = between_ticks(on.rig, run, "x", RATE_HZ), np.repeat(run["x_reference_um"], POINTS)
+    position, reference = intersample_positions(on.rig, run, "x", RATE_HZ), np.repeat(run["x_reference_um"], POINTS)
     starts = np.flatnonzero(np.diff(reference)) + 1
     rows = []
     for start, end in zip(starts, [*starts[1:], reference.size], strict=True):
@@ -134,20 +134,20 @@ def steps(on: Bench, dwell_s: float = DWELL_S) -> Steps:
     ever = int(np.bitwise_or.reduce(run["flags"].astype(np.int64)))
     return Steps(
         np.array(rows), float(np.abs(run["x_drive_v"]).max()),
-        tuple(name for flag, name in LIMITED.items() if ever & flag), tuple(trip_causes(ever)),
+        tuple(name for flag, name in LIMIT_FLAGS.items() if ever & flag), tuple(trip_causes(ever)),
     )  # fmt: skip
 
 
 def trace(on: Bench, height_um: float) -> tuple[Real, Real]:
     """Time since it in ms, and the position in µm, between ticks too, of one step from rest."""
     run = on.run("x", (0.0, height_um), DWELL_S)
-    position = between_ticks(on.rig, run, "x", RATE_HZ)[round(DWELL_S * RATE_HZ) * POINTS :]
+    position = intersample_positions(on.rig, run, "x", RATE_HZ)[round(DWELL_S * RATE_HZ) * POINTS :]
     return np.arange(position.size) / np.float64(POINTS * RATE_HZ / 1e3), position
 
 
 def subject(configuration: Configuration) -> Subject:
     """What taps of it are made for, by its specification."""
-    return subject_of(configuration.axes[0], check_of(configuration), specification())
+    return build_subject(configuration.axes[0], check_of(configuration), specification())
 
 
 def taps_for(
@@ -156,7 +156,7 @@ def taps_for(
     """Both rows, for a resonance within so much of a plant's. Raises NoDesign."""
     scenarios = ScenarioOptions(resonance_percent=within_percent, damping=(1.0,), gain_percent=0.0)
     options = about.options.model_copy(update={"settling_ms": settling_ms, "scenarios": scenarios})
-    return shaped(replace(about, plant=plant, overshoot=overshoot, options=options)).taps
+    return design_taps(replace(about, plant=plant, overshoot=overshoot, options=options)).taps
 
 
 def written(configuration_name: str, truth_percent: float, folder: Path, gain_percent: float = 0.0) -> Path:

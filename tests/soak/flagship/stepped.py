@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.analysis.closed_loop import discrete_loop
-from rtloop.analysis.measured.measurement import measurement
-from rtloop.analysis.perturbation import resonance_hz, with_resonance_shifted
+from rtloop.analysis.measured.measurement import measure_loop
+from rtloop.analysis.perturbation import resonance_hz, shift_resonance
 from rtloop.configuration.file import Configuration
 from rtloop.design.robust.options import ScenarioOptions
 from rtloop.design.robust.scenarios import Family
@@ -118,7 +118,7 @@ def over_shift(paper: Configuration, ours: Configuration, say: Say) -> tuple[lis
     for percent in RETUNED:
         seen = measured_percent(ours, percent)
         errors.append(abs(seen - percent))
-        taps = taps_for(about, with_resonance_shifted(about.plant, seen), RETUNED_WITHIN, RETUNED_OVERSHOOT)
+        taps = taps_for(about, shift_resonance(about.plant, seen), RETUNED_WITHIN, RETUNED_OVERSHOOT)
         retuned = with_taps(ours, taps)
         found["retuned"][percent] = steps(bench(retuned, shifted(percent)))
         if percent in TRACED:
@@ -153,7 +153,7 @@ def measured_percent(configuration: Configuration, truth_percent: float) -> floa
     signals = {name: recorded[f"x_{name}"] for name in ("reference_um", "error_um", "command_um", "position_um")}
     model_hz = resonance_hz(axis.model.transfer())
     assert model_hz is not None
-    mode = measurement(
+    mode = measure_loop(
         signals,
         RATE_HZ,
         model_hz[0],
@@ -166,7 +166,7 @@ def measured_percent(configuration: Configuration, truth_percent: float) -> floa
 
 def drawn(loops: Mapping[str, Configuration], draws: int, seed: int, say: Say) -> tuple[list[Row], dict[str, Real]]:
     """The same rigs for every loop: settling in ms, overshoot of 40 µm and of 10 µm in %, (draws, 3) each."""
-    scenarios = [*Family(TRUTH.model, 0, DRAWN, PERIOD_S).drawn(draws, seed)]
+    scenarios = [*Family(TRUTH.model, 0, DRAWN, PERIOD_S).random_scenarios(draws, seed)]
     found, unstable = {}, {}
     for name, one in loops.items():
         linear, rows = controller_of(one), list[tuple[float, ...]]()

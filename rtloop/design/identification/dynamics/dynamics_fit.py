@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.inverse_hold import held_from
+from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
 from rtloop.design.identification.dynamics.residuals import ResidualTests
 from rtloop.hil.modal import Complex, Real
-from rtloop.linear.realisation import system_of
+from rtloop.linear.realisation import modal_realisation
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain
 
-FASTEST = 14.0
+FASTEST_DECAY = 14.0
 """e^−14 is less than a millionth: a mode that is left with that by the next tick is over there."""
 
 
@@ -64,24 +64,24 @@ class DynamicsFit:
     """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""
 
 
-def transfer_of(model: Innovations) -> Transfer:
+def continuous_transfer(model: Innovations) -> Transfer:
     """D(s) of a sampled model, with D(0) = 1."""
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
-    rates, residues = _within_reach(rates, discrete.residues / model.static_gain, model.period_s)
-    modal = held_from(rates, residues, discrete.direct, model.period_s)
-    zeros, leading = zeros_and_gain(system_of(modal))
+    rates, residues = _limit_fast_rates(rates, discrete.residues / model.static_gain, model.period_s)
+    modal = continuous_modal(rates, residues, discrete.direct, model.period_s)
+    zeros, leading = zeros_and_gain(modal_realisation(modal))
     transfer = Transfer.from_zpk(zeros, rates, leading)
     return Transfer.from_zpk(zeros, rates, leading / transfer.dc_gain)
 
 
-def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
+def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
     """Poles with their standard deviations, for |s| and −Re s/|s|, from the covariance of `model.pack(noise=noise)`.
 
     A mode that is over within a tick stands at FASTEST, as in `transfer_of`, and its standard deviation is infinite.
     """
     modes, i = [], 0
-    for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
+    for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
         size, width = abs(rate), 2 if rate.imag != 0 else 1
         block = covariance[i : i + width, i : i + width]
         size_gradient = np.array([rate.real, rate.imag][:width]) / size
@@ -91,8 +91,8 @@ def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode
             float(np.sqrt(max(gradient @ block @ gradient, 0.0))) for gradient in (size_gradient, damping_gradient)
         )
         damping = -rate.real / size
-        if rate.real * model.period_s < -FASTEST:
-            size, size_std, damping, damping_std = FASTEST / model.period_s, np.inf, 1.0, np.inf
+        if rate.real * model.period_s < -FASTEST_DECAY:
+            size, size_std, damping, damping_std = FASTEST_DECAY / model.period_s, np.inf, 1.0, np.inf
         modes.append(Mode(size / (2 * np.pi), size_std / (2 * np.pi), damping, damping_std, float(share)))
         i += (3 if noise else 2) * width
     return tuple(sorted(modes, key=lambda mode: mode.frequency_hz))
@@ -101,7 +101,7 @@ def modes_of(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
     """Standard deviation of `model.static_gain`, from the covariance of `model.pack(noise=noise)`."""
     slopes: list[float] = []
-    for rate, residue, image in zip(model.rates, model.residues, model.images, strict=True):
+    for rate, residue, image in zip(model.rates, model.residues, model.z_poles, strict=True):
         by_rate, by_residue = residue * model.period_s * image / (1 - image) ** 2, 1 / (1 - image)
         for slope in (by_rate, by_residue, *([0.0] if noise else [])):
             slopes += [2 * slope.real, -2 * slope.imag] if rate.imag != 0 else [slope.real]
@@ -110,12 +110,12 @@ def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> flo
     return float(np.sqrt(max(gradient @ part @ gradient, 0.0)))
 
 
-def _within_reach(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
+def _limit_fast_rates(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
     """Rates (n,) and residues (m, n) with what died away within a tick dying away FASTEST times in it, D(0) kept.
 
     A delay by a part of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """
     limited: Complex = rates.copy()
-    limited.real = np.maximum(rates.real, -FASTEST / period_s)
+    limited.real = np.maximum(rates.real, -FASTEST_DECAY / period_s)
     gain_ratio = np.expm1(limited * period_s) / np.expm1(rates * period_s)
     return limited, residues * gain_ratio

@@ -17,19 +17,25 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
-from rtloop.design.identification.dynamics.prediction_error import WORTH, Excitation, models_at_gap, refined, rms_error
+from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged_rows
+from rtloop.design.identification.dynamics.prediction_error import (
+    LEAST_IMPROVEMENT,
+    Excitation,
+    fit_models_at_gap,
+    refine,
+    rms_error,
+)
 from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.hil.modal import Real
 
 MOST_TICKS = 5
 LEAST_SHARE = 0.25
 """Of all changes of the input, squared, that each part of a recording must hold to fit by, or to judge by."""
-NEEDED = 30.0
+SIGNIFICANT_GROWTH = 30.0
 """A first coefficient without which the sum of squared errors grows by so many variances is there."""
 
 
-def delayed(run: Excitation, ticks: int) -> Excitation:
+def delay_input(run: Excitation, ticks: int) -> Excitation:
     """The recording with its input `ticks` samples later; at rest before it."""
     return replace(run, input=np.concatenate([np.zeros(ticks), run.input[: run.input.size - ticks]]))
 
@@ -41,46 +47,47 @@ class Candidate(NamedTuple):
     ticks: int
     model: Innovations
     rms_um: float
-    independent: bool
+    is_independent: bool
 
 
-def identified_delay(run: Excitation, orders: Sequence[int]) -> int:
+def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
     """Samples of delay, 0 to MOST_TICKS; without a second part to judge by, as the fit itself tells."""
-    delays = _possible(run)
+    delays = _possible_delays(run)
     if len(delays) == 1:
         return delays[0]
-    start = held_out_from(run)
+    start = held_out_start(run)
     candidates = [
-        _candidate(ticks, model, delayed(run, ticks), start)
+        _judge_candidate(ticks, model, delay_input(run, ticks), start)
         for ticks in delays
-        for model in models_at_gap(first_part(delayed(run, ticks), start), orders)
+        for model in fit_models_at_gap(fitted_part(delay_input(run, ticks), start), orders)
     ]
     if not candidates:
         return delays[-1]
     return min(
-        simplest(candidates), key=lambda candidate: _refitted_rms_um(candidate.model, delayed(run, candidate.ticks))
+        simplest_candidates(candidates),
+        key=lambda candidate: _refitted_rms_um(candidate.model, delay_input(run, candidate.ticks)),
     ).ticks
 
 
-def simplest(candidates: Sequence[Candidate]) -> list[Candidate]:
+def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Those of the fewest poles among the candidates that predict as well as the best one.
 
     A candidate whose errors follow from the input counts only where there is no other.
     """
-    eligible = [candidate for candidate in candidates if candidate.independent] or candidates
-    limit_um = min(candidate.rms_um for candidate in eligible) * (1 + WORTH)
+    eligible = [candidate for candidate in candidates if candidate.is_independent] or candidates
+    limit_um = min(candidate.rms_um for candidate in eligible) * (1 + LEAST_IMPROVEMENT)
     predictive = [candidate for candidate in eligible if candidate.rms_um <= limit_um]
     fewest_poles = min(candidate.model.order for candidate in predictive)
     return [candidate for candidate in predictive if candidate.model.order == fewest_poles]
 
 
-def _candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
+def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
     """Judge a model that was fitted to the samples before `start`; `run` has its input `ticks` samples later."""
     errors = model.errors(run.input, run.position_um)
     if errors is None:
         return Candidate(ticks, model, np.inf, False)
     tests = residual_tests(run.input[:start], errors[:start], model.pack(noise=True).size)
-    return Candidate(ticks, model, float(np.sqrt(np.mean(errors[start or 0 :] ** 2))), tests.independent)
+    return Candidate(ticks, model, float(np.sqrt(np.mean(errors[start or 0 :] ** 2))), tests.is_independent)
 
 
 def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
@@ -88,16 +95,16 @@ def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
 
     Models with equally many unknowns are in the order of Akaike's criterion.
     """
-    fitted = refined(model, run)
+    fitted = refine(model, run)
     return np.inf if fitted is None else rms_error(fitted, run)
 
 
-def first_part(run: Excitation, start: int | None) -> Excitation:
+def fitted_part(run: Excitation, start: int | None) -> Excitation:
     """Everything before the part to judge by."""
     return replace(run, input=run.input[:start], position_um=run.position_um[:start])
 
 
-def held_out_from(run: Excitation) -> int | None:
+def held_out_start(run: Excitation) -> int | None:
     """The first sample of the part to judge by; None where the changes of the input cannot be parted in two.
 
     It begins with the first change that has half of all changes before it, or else at least LEAST_SHARE of them.
@@ -111,14 +118,14 @@ def held_out_from(run: Excitation) -> int | None:
     return None
 
 
-def _possible(run: Excitation) -> Sequence[int]:
+def _possible_delays(run: Excitation) -> Sequence[int]:
     """0 to the first delay that leaves out a coefficient which is there."""
-    regressors = np.vstack([*lagged((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
+    regressors = np.vstack([*lagged_rows((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
     errors = [
         _squared_error(np.delete(regressors, range(ARX_ORDER, ARX_ORDER + ticks), axis=0), run.position_um)
         for ticks in range(MOST_TICKS + 1)
     ]
-    limit = errors[0] * (1 + NEEDED / run.input.size)
+    limit = errors[0] * (1 + SIGNIFICANT_GROWTH / run.input.size)
     return [ticks for ticks in range(MOST_TICKS + 1) if errors[ticks] <= limit]
 
 

@@ -19,21 +19,26 @@ import numpy as np
 from rtloop.design.identification.dynamics.dynamics_fit import (
     Candidate,
     DynamicsFit,
-    modes_of,
+    continuous_transfer,
+    estimate_modes,
     static_gain_std,
-    transfer_of,
 )
 from rtloop.design.identification.dynamics.estimate_covariance import estimate_covariance
-from rtloop.design.identification.dynamics.identify_delay import delayed, first_part, held_out_from, identified_delay
+from rtloop.design.identification.dynamics.identify_delay import (
+    delay_input,
+    fitted_part,
+    held_out_start,
+    identify_delay,
+)
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.measured_levels import with_measured_levels
 from rtloop.design.identification.dynamics.prediction_error import (
     LARGEST_ORDER,
-    WORTH,
+    LEAST_IMPROVEMENT,
     Excitation,
     excited_order,
-    fitted_models,
-    refined,
+    fit_models,
+    refine,
     rms_error,
 )
 from rtloop.design.identification.dynamics.residuals import residual_tests
@@ -41,7 +46,7 @@ from rtloop.design.identification.measured import UnsuitableData
 
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
-LEAST_EXCITED = 4
+LEAST_EXCITED_POLES = 4
 """Poles that the input must be able to tell apart where the order is searched for."""
 
 
@@ -64,36 +69,37 @@ def identify_dynamics(
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation': another recording is needed to validate on")
     excited_poles = excited_order(run)
-    needed_poles = order or LEAST_EXCITED
+    needed_poles = order or LEAST_EXCITED_POLES
     if excited_poles < needed_poles:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the input can tell {excited_poles} poles apart, {needed_poles} are asked for; "
+            f"{run.name}: too little excitation: the input can tell {excited_poles} poles apart, {needed_poles} are "
+            "asked for; "
             "a step or a chirp over all frequencies of interest would help"
         )
     recording, corrected = with_measured_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)
     if delay_ticks is None:
-        delay_ticks = identified_delay(recording, orders)
+        delay_ticks = identify_delay(recording, orders)
     recording, validation = (
-        delayed(recording, delay_ticks),
-        [delayed(other_run, delay_ticks) for other_run in validation],
+        delay_input(recording, delay_ticks),
+        [delay_input(other_run, delay_ticks) for other_run in validation],
     )
-    start = held_out_from(recording) if criterion == "held-out" else None
-    models = fitted_models(first_part(recording, start), orders)
+    start = held_out_start(recording) if criterion == "held-out" else None
+    models = fit_models(fitted_part(recording, start), orders)
     if not models:
         raise UnsuitableData(
             f"{run.name}: no stable model of order {list(orders)} explains it; another order is needed"
         )
-    models = _settled_within(models, recording)
-    candidates = [_candidate(model, recording, start, validation) for model in models]
+    models = _require_settled(models, recording)
+    candidates = [_score_model(model, recording, start, validation) for model in models]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
-    model = models[_chosen(candidates, score, by_aic=criterion != "validation" and start is None)]
-    if start is not None and (refitted := refined(model, recording)) and _has_settled(refitted, recording):
+    model = models[_choose_order_index(candidates, score, by_aic=criterion != "validation" and start is None)]
+    if start is not None and (refitted := refine(model, recording)) and _has_settled(refitted, recording):
         model = refitted
-    return _described(model, recording, tuple(candidates), delay_ticks, corrected)
+    return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected)
 
 
-def _settled_within(fitted: Sequence[Innovations], run: Excitation) -> list[Innovations]:
+def _require_settled(fitted: Sequence[Innovations], run: Excitation) -> list[Innovations]:
     """The models whose time constants are all shorter than the run. Raises UnsuitableData where there is none.
 
     A longer one stands for drift, creep or what the model of the hysteresis misses, and most of D(0) may lie in it.
@@ -115,7 +121,7 @@ def _has_settled(model: Innovations, run: Excitation) -> bool:
     return float(np.abs(model.rates).min()) * run.input.size * run.period_s >= 1
 
 
-def _candidate(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
+def _score_model(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
     rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size
     return Candidate(
@@ -125,32 +131,32 @@ def _candidate(model: Innovations, run: Excitation, start: int | None, validatio
 
 def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
     """Of the free-running output, each run with an offset of its own; NaN without runs."""
-    errors = [run.position_um - model.output(run.input) for run in runs]
+    errors = [run.position_um - model.simulate_output(run.input) for run in runs]
     return float(np.sqrt(np.mean(np.concatenate([part - part.mean() for part in errors]) ** 2))) if errors else np.nan
 
 
-def _chosen(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
+def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
     """Index of the smallest order that is within WORTH of the best, and no worse by AIC than any smaller one."""
-    limit = min(map(score, candidates)) * (1 + WORTH)
+    limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):
         if score(candidate) <= limit and (not by_aic or candidate.aic <= min(c.aic for c in candidates[: i + 1])):
             return i
     return int(np.argmin([score(candidate) for candidate in candidates]))
 
 
-def _described(
+def _build_fit(
     model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
 ) -> DynamicsFit:
     errors = model.errors(run.input, run.position_um)
     assert errors is not None
-    output_error_um = run.position_um - model.output(run.input)
+    output_error_um = run.position_um - model.simulate_output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)
-    covariance = estimate_covariance(model, run, errors, white=tests.white)
+    covariance = estimate_covariance(model, run, errors, white=tests.is_white)
     return DynamicsFit(
-        transfer_of(model),
+        continuous_transfer(model),
         model.static_gain,
         static_gain_std(model, covariance, noise=True),
-        modes_of(model, covariance, noise=True),
+        estimate_modes(model, covariance, noise=True),
         float(np.sqrt(np.mean(errors**2))),
         100 * (1 - float(np.std(output_error_um) / np.std(run.position_um))),
         tests,

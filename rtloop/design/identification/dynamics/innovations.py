@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter, sosfilt, zpk2sos
 
-from rtloop.hil.modal import Complex, Modal, Real
+from rtloop.hil.modal import Complex, ModalSystem, Real
 
 
 @dataclass(frozen=True)
@@ -38,31 +38,34 @@ class Innovations:
         return int(np.where(self.rates.imag != 0, 2, 1).sum())
 
     @property
-    def images(self) -> Complex:
+    def z_poles(self) -> Complex:
         """λ (m,)."""
         return np.exp(self.rates * self.period_s)
 
     @property
     def static_gain(self) -> float:
         """G at z = 1, output per input at rest."""
-        return float((_weights(self) * self.residues / (1 - self.images)).sum().real)
+        return float((_pair_weights(self) * self.residues / (1 - self.z_poles)).sum().real)
 
-    def discrete(self) -> Modal:
+    def discrete(self) -> ModalSystem:
         """G as a sum over all modes in z, conjugates included."""
         pairs = self.rates.imag != 0
-        poles = np.concatenate([self.images, self.images[pairs].conj()])
+        poles = np.concatenate([self.z_poles, self.z_poles[pairs].conj()])
         residues = np.concatenate([self.residues, self.residues[pairs].conj()])
-        return Modal(poles, residues[None, :], np.zeros(1))
+        return ModalSystem(poles, residues[None, :], np.zeros(1))
 
-    def output(self, u: Real) -> Real:
+    def simulate_output(self, u: Real) -> Real:
         """G u + offset, without noise, shape of `u`."""
-        return self.offset + (_weights(self)[:, None] * self.residues[:, None] * _modes(self, u)).sum(axis=0).real
+        return (
+            self.offset
+            + (_pair_weights(self)[:, None] * self.residues[:, None] * _mode_responses(self, u)).sum(axis=0).real
+        )
 
     def predictor_poles(self) -> Complex:
         """Roots of C (n,): the poles of H⁻¹, which must lie inside the unit circle."""
         blocks, columns, rows = np.zeros((self.order, self.order)), np.zeros(self.order), np.zeros(self.order)
         i = 0
-        for rate, image, gain in zip(self.rates, self.images, self.noise_gains, strict=True):
+        for rate, image, gain in zip(self.rates, self.z_poles, self.noise_gains, strict=True):
             blocks[i, i], columns[i], rows[i] = image.real, gain.real, 1.0
             if rate.imag:
                 blocks[i : i + 2, i : i + 2] = [[image.real, -image.imag], [image.imag, image.real]]
@@ -75,34 +78,34 @@ class Innovations:
         """H⁻¹ applied to each of `signals` (k, samples); `poles` (n,) are the predictor's."""
         if not self.order or not np.any(self.noise_gains):
             return signals
-        zeros = np.concatenate([self.images, self.images[self.rates.imag != 0].conj()])
+        zeros = np.concatenate([self.z_poles, self.z_poles[self.rates.imag != 0].conj()])
         return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
         """ε (samples,); None where the predictor is unstable, or numbers are none."""
-        if not np.all(np.isfinite([*self.images, *self.noise_gains])):
+        if not np.all(np.isfinite([*self.z_poles, *self.noise_gains])):
             return None
         poles = self.predictor_poles()
         if np.any(np.abs(poles) >= 1):
             return None
-        return self.whiten(y - self.output(u), poles)
+        return self.whiten(y - self.simulate_output(u), poles)
 
     def sensitivities(self, u: Real, errors: Real, *, noise: bool) -> Real:
         """dε by each unknown, (unknowns, samples), in the order of `pack`."""
-        through_input = _modes(self, u)
-        through_noise = _modes(self, errors) if noise else through_input
+        through_input = _mode_responses(self, u)
+        through_noise = _mode_responses(self, errors) if noise else through_input
         rows: list[Real] = []
-        for i, image in enumerate(self.images):
-            pole_response = self.residues[i] * _mode(image, through_input[i])
+        for i, image in enumerate(self.z_poles):
+            pole_response = self.residues[i] * _mode_response(image, through_input[i])
             if noise:
-                pole_response = pole_response + self.noise_gains[i] * _mode(image, through_noise[i])
+                pole_response = pole_response + self.noise_gains[i] * _mode_response(image, through_noise[i])
             gradients = [
                 self.period_s * image * pole_response,
                 through_input[i],
                 *([through_noise[i]] if noise else []),
             ]
             pair = self.rates[i].imag != 0
-            rows += [row for part in gradients for row in (_both(part) if pair else [part.real])]
+            rows += [row for part in gradients for row in (_pair_gradient(part) if pair else [part.real])]
         rows.append(np.ones(u.size))
         return -self.whiten(np.array(rows), self.predictor_poles())
 
@@ -126,20 +129,20 @@ class Innovations:
         return Innovations(self.period_s, columns[0], columns[1], gains, float(values[-1]))
 
 
-def _weights(model: Innovations) -> Real:
+def _pair_weights(model: Innovations) -> Real:
     """2 for a pair, whose conjugate is left out, 1 for a real mode."""
     return np.where(model.rates.imag != 0, 2.0, 1.0)
 
 
-def _modes(model: Innovations, signal: Real) -> Complex:
+def _mode_responses(model: Innovations, signal: Real) -> Complex:
     """Each mode's response 1/(z − λ) to `signal`, (m, samples)."""
-    return np.array([_mode(image, signal) for image in model.images]).reshape(model.rates.size, signal.size)
+    return np.array([_mode_response(image, signal) for image in model.z_poles]).reshape(model.rates.size, signal.size)
 
 
-def _mode(image: complex, signal: Real | Complex) -> Complex:
+def _mode_response(image: complex, signal: Real | Complex) -> Complex:
     return np.asarray(lfilter([0.0, 1.0], [1.0, -image], signal), dtype=complex)
 
 
-def _both(part: Complex) -> list[Real]:
+def _pair_gradient(part: Complex) -> list[Real]:
     """Dependence of 2 Re(w·part) on real and imaginary part of w."""
     return [2 * part.real, -2 * part.imag]

@@ -23,20 +23,25 @@ import numpy.typing as npt
 from scipy.signal import oaconvolve
 
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.prediction_error import Excitation, Kept, descended, has_counterpart
+from rtloop.design.identification.dynamics.prediction_error import (
+    Excitation,
+    SampleSelection,
+    has_continuous_form,
+    minimise_errors,
+)
 from rtloop.hil.modal import Real
 
 NOISE_ORDER = 150
 """Of A_n at most: light noise near a slow mode takes many samples to tell."""
-STEPS, HALVINGS = 12, 12
-FURTHEST = 0.3
+MOST_STEPS, MOST_HALVINGS = 12, 12
+LARGEST_MOVE = 0.3
 """Of its own size: so far a pole moves at once."""
-NEAR = 0.03
+LAST_STEP = 0.03
 """A step by less than this part of the standard deviations is the last."""
 
 
 @dataclass(frozen=True)
-class Instrumented:
+class InstrumentedRecording:
     """A recording and the part û (samples,) of its input that follows from outside."""
 
     run: Excitation
@@ -50,45 +55,49 @@ class Estimate:
 
     model: Innovations
     covariance: Real
-    settled: bool
+    is_settled: bool
 
 
-def estimated(start: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate | None:
+def estimate_plant(
+    start: Innovations, data: InstrumentedRecording, whitening: Real, kept: SampleSelection
+) -> Estimate | None:
     """The model next to `start` by the samples `kept`, which all have their past; None where there is none that decays.
 
     Where no steps lead from `start` to Σ ψ ε = 0, they begin anew from the two-stage method's model.
     """
-    if (first_estimate := settled(start, data, whitening, kept)).settled:
+    if (first_estimate := iterate_estimate(start, data, whitening, kept)).is_settled:
         return first_estimate
-    driven, x = whitened(data.driven, whitening), whitened(data.run.position_um, whitening)
-    two_stage = descended(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
-    return settled(two_stage, data, whitening, kept) if _decays(two_stage) else None
+    driven, x = whiten(data.driven, whitening), whiten(data.run.position_um, whitening)
+    two_stage = minimise_errors(start, replace(data.run, input=driven, position_um=x), noise=False, kept=kept)
+    return iterate_estimate(two_stage, data, whitening, kept) if _is_decaying(two_stage) else None
 
 
-def settled(first: Innovations, data: Instrumented, whitening: Real, kept: Kept) -> Estimate:
+def iterate_estimate(
+    first: Innovations, data: InstrumentedRecording, whitening: Real, kept: SampleSelection
+) -> Estimate:
     """From `first` to where Σ ψ ε = 0, or `first` where the steps do not settle."""
-    u, driven, x = (whitened(signal, whitening) for signal in (data.run.input, data.driven, data.run.position_um))
-    step, initial_covariance = _step(first, u, driven, x, kept)
-    unsettled = Estimate(first, initial_covariance, settled=False)
+    u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven, data.run.position_um))
+    step, initial_covariance = _newton_step(first, u, driven, x, kept)
+    unsettled = Estimate(first, initial_covariance, is_settled=False)
     model = first
-    for _ in range(STEPS):
-        model = _moved(model, step)
-        if not _decays(model):
+    for _ in range(MOST_STEPS):
+        model = _bounded_update(model, step)
+        if not _is_decaying(model):
             return unsettled
-        step, covariance = _step(model, u, driven, x, kept)
-        if np.all(np.abs(step) <= NEAR * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
-            return Estimate(model, covariance, settled=True)
+        step, covariance = _newton_step(model, u, driven, x, kept)
+        if np.all(np.abs(step) <= LAST_STEP * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
+            return Estimate(model, covariance, is_settled=True)
     return unsettled
 
 
-def left_by(model: Innovations, run: Excitation) -> Real:
+def residual_noise(model: Innovations, run: Excitation) -> Real:
     """x − G u − x₀ (samples,): noise, where the model is right. x₀, and an offset, are those that leave least."""
-    error = run.position_um - model.output(run.input)
-    decays = _ringing(model, error.size)
+    error = run.position_um - model.simulate_output(run.input)
+    decays = _free_decays(model, error.size)
     return error - np.linalg.lstsq(decays.T, error, rcond=None)[0] @ decays
 
 
-def whitening_of(noise: Real, most: int = NOISE_ORDER) -> Real:
+def fit_whitening(noise: Real, most: int = NOISE_ORDER) -> Real:
     """A_n (NOISE_ORDER + 1,), of the order up to `most` that Akaike's criterion takes (Levinson's recursion)."""
     spectrum = np.fft.rfft(noise - noise.mean(), 2 * noise.size)
     autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: NOISE_ORDER + 1] / noise.size
@@ -103,18 +112,18 @@ def whitening_of(noise: Real, most: int = NOISE_ORDER) -> Real:
     return best
 
 
-def whitened(signals: Real, whitening: Real) -> Real:
+def whiten(signals: Real, whitening: Real) -> Real:
     """A_n applied to (…, samples), as if they were at rest before: the first NOISE_ORDER samples lack their past."""
     taps = whitening.reshape((1,) * (signals.ndim - 1) + (-1,))
     return np.asarray(oaconvolve(signals, taps, axes=-1), dtype=float)[..., : signals.shape[-1]]
 
 
-def with_past(samples: int) -> npt.NDArray[np.bool_]:
+def past_mask(samples: int) -> npt.NDArray[np.bool_]:
     """(samples,): which of the whitened ones have their past."""
     return np.arange(samples) >= NOISE_ORDER
 
 
-def _ringing(model: Innovations, samples: int) -> Real:
+def _free_decays(model: Innovations, samples: int) -> Real:
     """A constant, and the free decays of all modes."""
     rows = [np.ones(samples)]
     for rate in model.rates:
@@ -123,19 +132,19 @@ def _ringing(model: Innovations, samples: int) -> Real:
     return np.array(rows)
 
 
-def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tuple[Real, Real]:
+def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, kept: SampleSelection) -> tuple[Real, Real]:
     """Towards Σ ψ ε = 0, without the offset, and the covariance of where it leads.
 
     All signals are whitened and whole: one that is cut begins with a jump, which rings in ψ and not in the position.
     """
-    decays, zeros = _ringing(model, u.size)[:, kept], np.zeros_like(u)
+    decays, zeros = _free_decays(model, u.size)[:, kept], np.zeros_like(u)
     slopes, instruments = (
         np.vstack([-model.sensitivities(signal, zeros, noise=False)[:-1][:, kept], decays]) for signal in (u, driven)
     )
     scale = np.linalg.norm(instruments, axis=1)
     scale[scale == 0] = 1.0
     slopes, instruments = slopes / scale[:, None], instruments / scale[:, None]
-    residual = (x - replace(model, offset=0.0).output(u))[kept]
+    residual = (x - replace(model, offset=0.0).simulate_output(u))[kept]
     inverse = np.linalg.pinv(instruments @ slopes.T, rcond=1e-13)
     step = inverse @ (instruments @ residual)
     variance = float(np.sum((residual - step @ slopes) ** 2)) / max(residual.size - step.size - NOISE_ORDER, 1)
@@ -145,15 +154,15 @@ def _step(model: Innovations, u: Real, driven: Real, x: Real, kept: Kept) -> tup
     return (step / scale)[:count], covariance[:count, :count]
 
 
-def _decays(model: Innovations) -> bool:
-    return bool(np.all(model.rates.real < 0)) and has_counterpart(model)
+def _is_decaying(model: Innovations) -> bool:
+    return bool(np.all(model.rates.real < 0)) and has_continuous_form(model)
 
 
-def _moved(model: Innovations, step: Real) -> Innovations:
+def _bounded_update(model: Innovations, step: Real) -> Innovations:
     """By `step`, or by a part of it where all of it moves a pole beyond FURTHEST, or to where it does not decay."""
     updated = model
-    for halvings in range(HALVINGS):
+    for halvings in range(MOST_HALVINGS):
         updated = model.unpack(model.pack(noise=False) + np.append(step, 0.0) / 2**halvings, noise=False)
-        if _decays(updated) and np.all(np.abs(updated.rates - model.rates) <= FURTHEST * np.abs(model.rates)):
+        if _is_decaying(updated) and np.all(np.abs(updated.rates - model.rates) <= LARGEST_MOVE * np.abs(model.rates)):
             break
     return updated

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.hil.modal import Complex, Modal, Real
+from rtloop.hil.modal import Complex, ModalSystem, Real
 
 
-def held_from(rates: Complex, residues: Complex, direct: Real, period_s: float) -> Modal:
+def continuous_modal(rates: Complex, residues: Complex, direct: Real, period_s: float) -> ModalSystem:
     """The sum in s with poles `rates` (n,) whose zero-order hold has `residues` (m, n): r_s = r_z s/(e^sT − 1)."""
     x = rates * period_s
     hold_factor = np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
-    return Modal(rates, residues / (period_s * hold_factor), direct)
+    return ModalSystem(rates, residues / (period_s * hold_factor), direct)

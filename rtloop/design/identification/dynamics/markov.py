@@ -20,27 +20,27 @@ from rtloop.hil.modal import Complex, Real
 
 ARX_ORDER = 40
 HANKEL_ROWS = 150
-CLEAR, LIKELY = 8.0, 3.0
+CLEAR_FALL, LIKELY_FALL = 8.0, 3.0
 """Noise makes singular values that fall slowly; what stands so much above the next is a mode, or most likely one."""
-SMALLEST_IMAGE = 1e-3
+SMALLEST_Z_POLE = 1e-3
 """Poles in z nearer to 0 are a delay, which has no rate."""
 
 
 def impulse_response(u: Real, y: Real, length: int, order: int = ARX_ORDER) -> Real:
     """g_1 … g_length of y = Σ g_i u_k−i, by least squares of an ARX model of order `order`, from rest."""
-    columns = np.vstack([lagged((y, u), order), np.ones(y.size)]).T
+    columns = np.vstack([lagged_rows((y, u), order), np.ones(y.size)]).T
     solution, *_ = np.linalg.lstsq(columns, y, rcond=1e-12)
     pulse = np.zeros(length + 1)
     pulse[0] = 1.0
     return np.asarray(lfilter([0.0, *solution[order:-1]], [1.0, *-solution[:order]], pulse), dtype=float)[1:]
 
 
-def lagged(signals: Sequence[Real], most: int) -> Real:
+def lagged_rows(signals: Sequence[Real], most: int) -> Real:
     """Each signal 1 … `most` samples late, (signals × most, samples), at rest before the first sample."""
     return np.array([np.concatenate([np.zeros(i), signal[:-i]]) for signal in signals for i in range(1, most + 1)])
 
 
-class Guesses:
+class ModeGuesses:
     """Models of any order from one impulse response `g` (k,), k ≥ 2·rows."""
 
     def __init__(self, g: Real, period_s: float) -> None:
@@ -58,7 +58,7 @@ class Guesses:
     def model(self, order: int) -> Innovations | None:
         """`order` modes without noise model; None where a mode has no continuous counterpart or does not decay."""
         z_poles = self._images(order)
-        if np.any((z_poles.imag == 0) & (z_poles.real < SMALLEST_IMAGE)) or np.any(np.abs(z_poles) < SMALLEST_IMAGE):
+        if np.any((z_poles.imag == 0) & (z_poles.real < SMALLEST_Z_POLE)) or np.any(np.abs(z_poles) < SMALLEST_Z_POLE):
             return None
         z_poles = z_poles[z_poles.imag >= 0]
         z_poles = np.where(np.abs(z_poles) >= 1, z_poles * (0.9999 / np.abs(z_poles)), z_poles)
@@ -72,7 +72,7 @@ class Guesses:
         return np.linalg.eigvals(np.linalg.lstsq(observability[:-1], observability[1:], rcond=None)[0]).astype(complex)
 
 
-def with_residues(model: Innovations, u: Real, y: Real) -> Innovations:
+def fit_residues(model: Innovations, u: Real, y: Real) -> Innovations:
     """The model with residues and offset that fit best, its rates as they are."""
     rows = -model.sensitivities(u, np.zeros_like(u), noise=False)
     values, solved = model.pack(noise=False), []

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import noise_of
+from rtloop.design.identification.measured import noise_std
 from rtloop.hil.modal import Real
 
 SHORTEST_TAIL = 50
@@ -43,7 +43,7 @@ def with_measured_levels(run: Excitation) -> CorrectedLevels:
     if len(holds) < 3 or min(hold.stop - hold.start for hold in holds) < 2 * SHORTEST_TAIL:
         return unchanged
     tails = [run.position_um[(hold.start + hold.stop) // 2 : hold.stop] for hold in holds]
-    noise_um = noise_of(run.position_um)
+    noise_um = noise_std(run.position_um)
     if not all(_is_settled(tail, noise_um) for tail in tails):
         return unchanged
     durations = np.array([hold.stop - hold.start for hold in holds])

@@ -15,10 +15,10 @@ import numpy as np
 from rtloop.hil.modal import Complex, Real
 
 DAMPINGS = (0.01, 0.05, 0.25, 0.8)
-APART = 2.0
+GRID_SPACING = 2.0
 """Grid points of a pair, relative to its width: a light mode between two points farther apart is not seen."""
-REAL, ZOOMED, ZOOMS = 90, 9, 2
-HIGHEST = 0.9
+REAL_POINTS, ZOOM_POINTS, ZOOMS = 90, 9, 2
+HIGHEST_SHARE = 0.9
 """Of half the sampling rate."""
 RESOLUTION_HZ = 0.25
 """Lines of long recordings are summed over so much."""
@@ -30,61 +30,61 @@ PARAMETERS = {True: 4, False: 2}
 class Spectra:
     """Of what is left (samples,) and of the input (samples,), whitened alike."""
 
-    def __init__(self, left: Real, driven: Real, period_s: float) -> None:
-        size = 1 << (2 * left.size - 1).bit_length()
+    def __init__(self, residual: Real, driven: Real, period_s: float) -> None:
+        size = 1 << (2 * residual.size - 1).bit_length()
         spectrum = np.fft.rfft(driven, size)
         block_size = max(1, int(RESOLUTION_HZ * size * period_s))
-        self._power = _blocks(np.abs(spectrum) ** 2, block_size)
-        self._cross = _blocks(np.conj(spectrum) * np.fft.rfft(left, size), block_size)
+        self._power = _block_sums(np.abs(spectrum) ** 2, block_size)
+        self._cross = _block_sums(np.conj(spectrum) * np.fft.rfft(residual, size), block_size)
         middles = block_size * np.arange(self._power.size) + (block_size - 1) / 2
-        self._back: Complex = np.exp(-2j * np.pi * middles / size)
+        self._delay_factors: Complex = np.exp(-2j * np.pi * middles / size)
         self._period_s = period_s
-        self._variance = float(np.sum(left**2)) * size / 2 / left.size
-        self._slowest = 2 * np.pi * LEAST_PERIODS / (left.size * period_s)
+        self._variance = float(np.sum(residual**2)) * size / 2 / residual.size
+        self._slowest = 2 * np.pi * LEAST_PERIODS / (residual.size * period_s)
 
-    def mode(self, *, pair_allowed: bool) -> complex:
+    def best_mode(self, *, pair_allowed: bool) -> complex:
         """The rate s of the best mode; a pair's with positive imaginary part where one is allowed and worth it."""
-        top = HIGHEST * np.pi / self._period_s
-        real_gain, real = self._best((-np.geomspace(self._slowest, top, REAL)).astype(complex))
+        top = HIGHEST_SHARE * np.pi / self._period_s
+        real_gain, real = self._best_rate((-np.geomspace(self._slowest, top, REAL_POINTS)).astype(complex))
         if not pair_allowed:
             return real
-        pair_gain, pair = max((self._pair(damping, top) for damping in DAMPINGS), key=lambda scored: scored[0])
+        pair_gain, pair = max((self._best_pair(damping, top) for damping in DAMPINGS), key=lambda scored: scored[0])
         gains = {True: pair_gain, False: real_gain}
-        return pair if self._worth(gains, pair=True) >= self._worth(gains, pair=False) else real
+        return pair if self._net_gain(gains, pair=True) >= self._net_gain(gains, pair=False) else real
 
-    def _pair(self, damping: float, top: float) -> tuple[float, complex]:
+    def _best_pair(self, damping: float, top: float) -> tuple[float, complex]:
         """The best near this damping: each has its own, because from a broad pair no way leads to a light one."""
-        count = int(np.log(top / self._slowest) / np.log1p(APART * damping)) + 2
-        gain, pair = self._best(_pairs(np.geomspace(self._slowest, top, count), np.array([damping])))
-        step = 1 + APART * damping
+        count = int(np.log(top / self._slowest) / np.log1p(GRID_SPACING * damping)) + 2
+        gain, pair = self._best_rate(_pair_rates(np.geomspace(self._slowest, top, count), np.array([damping])))
+        step = 1 + GRID_SPACING * damping
         for _ in range(ZOOMS):
-            near = abs(pair) * np.geomspace(1 / step, step, ZOOMED)
+            near = abs(pair) * np.geomspace(1 / step, step, ZOOM_POINTS)
             dampings = -pair.real / abs(pair) * np.geomspace(0.4, 2.5, 5)
             gain, pair = max(
-                (gain, pair), self._best(_pairs(near, dampings[dampings < 1])), key=lambda scored: scored[0]
+                (gain, pair), self._best_rate(_pair_rates(near, dampings[dampings < 1])), key=lambda scored: scored[0]
             )
-            step **= 2 / (ZOOMED - 1)
+            step **= 2 / (ZOOM_POINTS - 1)
         return gain, pair
 
-    def _worth(self, gains: dict[bool, float], *, pair: bool) -> float:
+    def _net_gain(self, gains: dict[bool, float], *, pair: bool) -> float:
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
-    def _best(self, rates: Complex) -> tuple[float, complex]:
-        return max(((self._explained(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
+    def _best_rate(self, rates: Complex) -> tuple[float, complex]:
+        return max(((self._explained_energy(rate), complex(rate)) for rate in rates), key=lambda scored: scored[0])
 
-    def _explained(self, rate: complex) -> float:
+    def _explained_energy(self, rate: complex) -> float:
         """Energy of e that the best residues of this mode explain."""
         image = np.exp(rate * self._period_s)
         if rate.imag == 0:
-            mode_response = self._back / (1 - image.real * self._back)
+            mode_response = self._delay_factors / (1 - image.real * self._delay_factors)
             return float(
                 (np.conj(mode_response) @ self._cross).real ** 2 / ((np.abs(mode_response) ** 2) @ self._power)
             )
-        mode_response = 1 / (1 - 2 * image.real * self._back + abs(image) ** 2 * self._back**2)
+        mode_response = 1 / (1 - 2 * image.real * self._delay_factors + abs(image) ** 2 * self._delay_factors**2)
         weight = np.abs(mode_response) ** 2 * self._power
-        weighted_cross = np.conj(mode_response * self._back) * self._cross
-        auto_energy, cross_energy = weight.sum(), weight @ self._back.real
-        right_side = np.array([weighted_cross.sum().real, (weighted_cross @ np.conj(self._back)).real])
+        weighted_cross = np.conj(mode_response * self._delay_factors) * self._cross
+        auto_energy, cross_energy = weight.sum(), weight @ self._delay_factors.real
+        right_side = np.array([weighted_cross.sum().real, (weighted_cross @ np.conj(self._delay_factors)).real])
         return float(
             right_side
             @ np.linalg.solve(
@@ -93,10 +93,10 @@ class Spectra:
         )
 
 
-def _pairs(sizes: Real, dampings: Real) -> Complex:
+def _pair_rates(sizes: Real, dampings: Real) -> Complex:
     return np.outer(sizes, -dampings + 1j * np.sqrt(1 - dampings**2)).ravel()
 
 
-def _blocks(lines: Any, together: int) -> Any:
+def _block_sums(lines: Any, together: int) -> Any:
     """Sums of so many lines in turn."""
     return np.add.reduceat(lines, np.arange(0, lines.size, together))

@@ -15,49 +15,53 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.signal import lfilter
 
-from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged
+from rtloop.design.identification.dynamics.markov import ARX_ORDER, lagged_rows
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.hil.modal import Real
 
 RIDGE = 1e-12
 """Of the regressors' mean square: references that move little leave directions open."""
-LARGEST_IMAGE = 0.9999
+LARGEST_Z_POLE = 0.9999
 
 
 @dataclass(frozen=True)
 class LoopExcitation(Excitation):
     """Input and position in a closed loop, not from rest, and `outside` (k, samples): what moves it from outside."""
 
-    outside: Real
+    external: Real
 
 
-def from_rest(run: LoopExcitation) -> LoopExcitation:
+def shift_to_zero(run: LoopExcitation) -> LoopExcitation:
     """With every signal beginning at 0."""
     return replace(
         run,
         input=run.input - run.input[0],
         position_um=run.position_um - run.position_um[0],
-        outside=run.outside - run.outside[:, :1],
+        outside=run.external - run.external[:, :1],
     )
 
 
-def from_outside(run: LoopExcitation) -> Real:
+def driven_input(run: LoopExcitation) -> Real:
     """û (samples,) of a recording whose signals begin at 0."""
-    moving = [signal for signal in run.outside if np.ptp(signal) > 0]
-    regressors = np.vstack([lagged((run.input,), ARX_ORDER), moving, lagged(moving, ARX_ORDER)])
+    moving = [signal for signal in run.external if np.ptp(signal) > 0]
+    regressors = np.vstack([lagged_rows((run.input,), ARX_ORDER), moving, lagged_rows(moving, ARX_ORDER)])
     scale = np.sqrt(np.mean(regressors**2, axis=1)) + 1e-300
     regressors /= scale[:, None]
     normal = regressors @ regressors.T
     normal[np.diag_indices_from(normal)] += RIDGE * run.input.size
     coefficients = solve(normal, regressors @ run.input, assume_a="pos") / scale
     driven = coefficients[ARX_ORDER:] @ (regressors[ARX_ORDER:] * scale[ARX_ORDER:, None])
-    return np.asarray(lfilter([1.0], _stable(np.concatenate([[1.0], -coefficients[:ARX_ORDER]])), driven), dtype=float)
+    return np.asarray(
+        lfilter([1.0], _stabilise(np.concatenate([[1.0], -coefficients[:ARX_ORDER]])), driven), dtype=float
+    )
 
 
-def _stable(polynomial: Real) -> Real:
+def _stabilise(polynomial: Real) -> Real:
     """With the roots that do not decay drawn back into the unit circle."""
     roots = np.roots(polynomial)
     sizes = np.abs(roots)
     if np.all(sizes < 1):
         return polynomial
-    return np.asarray(np.poly(np.where(sizes > LARGEST_IMAGE, roots * LARGEST_IMAGE / sizes, roots)).real, dtype=float)
+    return np.asarray(
+        np.poly(np.where(sizes > LARGEST_Z_POLE, roots * LARGEST_Z_POLE / sizes, roots)).real, dtype=float
+    )

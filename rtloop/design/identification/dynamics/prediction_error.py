@@ -15,28 +15,28 @@ from scipy.optimize import least_squares
 
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.markov import (
-    CLEAR,
+    CLEAR_FALL,
     HANKEL_ROWS,
-    LIKELY,
-    Guesses,
+    LIKELY_FALL,
+    ModeGuesses,
+    fit_residues,
     impulse_response,
-    with_residues,
 )
-from rtloop.design.identification.measured import noise_of
+from rtloop.design.identification.measured import noise_std
 from rtloop.hil.modal import Real
 
 LARGEST_ORDER = 14
-WORTH = 0.01
+LEAST_IMPROVEMENT = 0.01
 """A higher order must lower the rms prediction error by more than this part; noise never fits exactly equally."""
 LEAST_EXCITATION = 1e-7
 """Singular value of the lagged inputs, relative to the largest, below which a direction was not excited, whatever the
 noise."""
 ENOUGH_POLES = 9
 """An input that can tell so many apart has no gap in its spectrum, and can tell more."""
-EVALUATIONS = 20
-Kept = slice | npt.NDArray[np.bool_]
-ALL = slice(None)
-USELESS, STEEPEST = 1e6, 1e30
+MOST_EVALUATIONS = 20
+SampleSelection = slice | npt.NDArray[np.bool_]
+ALL_SAMPLES = slice(None)
+HUGE_ERROR, HUGE_SLOPE = 1e6, 1e30
 """Stand in for errors and slopes of trial models that blow up."""
 
 
@@ -50,46 +50,46 @@ class Excitation:
     period_s: float
 
 
-def fitted_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
+def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Models of increasing order, from two poles below the last clear gap of the impulse response's singular values
     until, behind the last likely one, two more in turn do not pay."""
-    guesses = _guesses(run)
-    clear, likely = guesses.gap(max(orders), CLEAR), guesses.gap(max(orders), LIKELY)
+    guesses = _mode_guesses(run)
+    clear, likely = guesses.gap(max(orders), CLEAR_FALL), guesses.gap(max(orders), LIKELY_FALL)
     models: list[Innovations] = []
     errors: list[float] = []
     for order in orders if len(orders) == 1 else [candidate for candidate in orders if candidate >= clear - 2]:
         start = guesses.model(order)
         if start is None and models and models[-1].order == order - 1:
-            start = _grown(models[-1])
-        model = start and refined(with_residues(start, run.input, run.position_um), run)
+            start = _add_fast_pole(models[-1])
+        model = start and refine(fit_residues(start, run.input, run.position_um), run)
         if model is None:
             continue
         models.append(model)
         errors.append(rms_error(model, run))
-        if order > likely and len(errors) > 4 and min(errors[-2:]) > (1 - WORTH) * min(errors[:-2]):
+        if order > likely and len(errors) > 4 and min(errors[-2:]) > (1 - LEAST_IMPROVEMENT) * min(errors[:-2]):
             break
     return models
 
 
-def models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
+def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Models of the order within `orders` that the impulse response shows, and of one pole more: a fast real pole
     hides below the gap. Empty where none is stable."""
-    guesses = _guesses(run)
-    gap_order = guesses.gap(max(orders), LIKELY) if len(orders) > 1 else orders[0]
+    guesses = _mode_guesses(run)
+    gap_order = guesses.gap(max(orders), LIKELY_FALL) if len(orders) > 1 else orders[0]
     models: list[Innovations] = []
     for order in [order for order in (gap_order, gap_order + 1) if order in orders]:
-        start = guesses.model(order) or (_grown(models[-1]) if models else None)
-        model = start and refined(with_residues(start, run.input, run.position_um), run)
+        start = guesses.model(order) or (_add_fast_pole(models[-1]) if models else None)
+        model = start and refine(fit_residues(start, run.input, run.position_um), run)
         if model is not None:
             models.append(model)
     return models
 
 
-def _guesses(run: Excitation) -> Guesses:
-    return Guesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
+def _mode_guesses(run: Excitation) -> ModeGuesses:
+    return ModeGuesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
 
 
-def _grown(model: Innovations) -> Innovations:
+def _add_fast_pole(model: Innovations) -> Innovations:
     """One fast real pole more."""
     return Innovations(
         model.period_s,
@@ -100,28 +100,36 @@ def _grown(model: Innovations) -> Innovations:
     )
 
 
-def refined(model: Innovations, run: Excitation) -> Innovations | None:
+def refine(model: Innovations, run: Excitation) -> Innovations | None:
     """The nearest least sum of squared prediction errors: first without noise model, then with; None if unstable."""
     for noise in (False, True):
-        model = descended(model, run, noise=noise)
-    return model if np.all(model.rates.real < 0) and has_counterpart(model) else None
+        model = minimise_errors(model, run, noise=noise)
+    return model if np.all(model.rates.real < 0) and has_continuous_form(model) else None
 
 
-def descended(model: Innovations, run: Excitation, *, noise: bool, kept: Kept = ALL) -> Innovations:
+def minimise_errors(
+    model: Innovations, run: Excitation, *, noise: bool, kept: SampleSelection = ALL_SAMPLES
+) -> Innovations:
     """Downhill from `model` to the least sum of squared errors of the samples `kept`, with or without noise model."""
 
     def errors(values: Real) -> Real:
         trial = model.unpack(values, noise=noise)
         if np.any(trial.rates.real >= 0) or (solution := trial.errors(run.input, run.position_um)) is None:
-            return np.full(run.input.size, USELESS)
-        return np.clip(np.nan_to_num(solution, nan=USELESS), -USELESS, USELESS)
+            return np.full(run.input.size, HUGE_ERROR)
+        return np.clip(np.nan_to_num(solution, nan=HUGE_ERROR), -HUGE_ERROR, HUGE_ERROR)
 
     def jacobian(values: Real) -> Real:
         trial = model.unpack(values, noise=noise)
         solution = trial.sensitivities(run.input, errors(values), noise=noise).T
-        return np.clip(np.nan_to_num(solution, nan=STEEPEST), -STEEPEST, STEEPEST)
+        return np.clip(np.nan_to_num(solution, nan=HUGE_SLOPE), -HUGE_SLOPE, HUGE_SLOPE)
 
-    settings: dict[str, Any] = {"x_scale": "jac", "xtol": 1e-8, "ftol": 1e-8, "gtol": 1e-15, "max_nfev": EVALUATIONS}
+    settings: dict[str, Any] = {
+        "x_scale": "jac",
+        "xtol": 1e-8,
+        "ftol": 1e-8,
+        "gtol": 1e-15,
+        "max_nfev": MOST_EVALUATIONS,
+    }
     with np.errstate(over="ignore", invalid="ignore"):
         selected_jacobian: Any = lambda values: jacobian(values)[kept]
         solution = least_squares(
@@ -130,7 +138,7 @@ def descended(model: Innovations, run: Excitation, *, noise: bool, kept: Kept = 
     return model.unpack(solution.x, noise=noise)
 
 
-def has_counterpart(model: Innovations) -> bool:
+def has_continuous_form(model: Innovations) -> bool:
     """Rates stay below half the sampling rate, so that log(z) finds them again."""
     return bool(np.all(np.abs(model.rates.imag) < np.pi / model.period_s))
 
@@ -151,6 +159,6 @@ def excited_order(run: Excitation) -> int:
     lagged = np.array([np.concatenate([np.zeros(i), run.input[: run.input.size - i]]) for i in range(lags)])
     sizes = np.linalg.svd(lagged @ lagged.T, compute_uv=False)
     gain = np.ptp(run.position_um) / max(np.ptp(run.input), 1e-300)
-    noise = noise_of(run.position_um) / max(gain, 1e-300) * np.sqrt(lags)
+    noise = noise_std(run.position_um) / max(gain, 1e-300) * np.sqrt(lags)
     poles = int((sizes > max(LEAST_EXCITATION**2 * sizes[0], noise**2)).sum()) // 2
     return poles if poles < ENOUGH_POLES else max(poles, LARGEST_ORDER)

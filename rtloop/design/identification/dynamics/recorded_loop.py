@@ -11,14 +11,14 @@ import numpy as np
 
 from rtloop.design.identification.dynamics.outside import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation
-from rtloop.design.identification.measured import UnsuitableData, axis_of
+from rtloop.design.identification.measured import UnsuitableData, select_axis
 from rtloop.hil.modal import Real
 from rtloop.recording.load import Recording, load
 from rtloop.signals import Flag, Mode
 
 State = Literal["auto", "open", "closed"]
-KNOWN = ("reference_um", "feed_um")
-NOT_AS_COMMANDED = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED | Flag.RAMPING
+EXTERNAL_SIGNALS = ("reference_um", "feed_um")
+LIMITING_FLAGS = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED | Flag.RAMPING
 
 
 @dataclass(frozen=True)
@@ -31,27 +31,28 @@ class RecordedLoop:
     start: int
     end: int
     names: tuple[str, ...]
-    outside: Real
-    limited: int | None
+    external: Real
+    first_limited_tick: int | None
     """First tick of it that did not get what the command asked for."""
 
     def excitation(self, whole: Excitation) -> LoopExcitation:
         """The stretch of a recording, with what moved it."""
         ticks = slice(self.start, self.end)
         return LoopExcitation(
-            whole.name, whole.input[ticks], whole.position_um[ticks], whole.period_s, self.outside[:, ticks]
+            whole.name, whole.input[ticks], whole.position_um[ticks], whole.period_s, self.external[:, ticks]
         )
 
     def require_commands_obeyed(self, name: str) -> None:
         """Raise UnsuitableData where the recorded command is not what the plant was given."""
-        if self.limited is not None:
+        if self.first_limited_tick is not None:
             raise UnsuitableData(
-                f"{name}: the command was limited at tick {self.limited}, and is not what the plant was given: "
+                f"{name}: the command was limited at tick {self.first_limited_tick}, and is not what the plant was "
+                "given: "
                 "--input drive, or hysteresis, takes what was"
             )
 
 
-def recorded_loop(
+def find_closed_loop(
     path: Path, axis: str | None = None, state: State = "auto", names: Sequence[str] = ()
 ) -> RecordedLoop | None:
     """None of a loop that was open: what `state` says, or else the recorded mode; without one it was open.
@@ -63,7 +64,7 @@ def recorded_loop(
     closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)
     if state == "open" or (state == "auto" and not np.any(closed)):
         return None
-    expected = tuple(names) or tuple(f"{axis_of(recording, axis, path)}_{name}" for name in KNOWN)
+    expected = tuple(names) or tuple(f"{select_axis(recording, axis, path)}_{name}" for name in EXTERNAL_SIGNALS)
     present = tuple(name for name in expected if name in recording)
     if not present or (names and len(present) < len(expected)):
         missing = ", ".join(name for name in expected if name not in recording)
@@ -72,18 +73,18 @@ def recorded_loop(
         )
     skipped = int("imported" in recording.header)
     external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]
-    start, end = _longest(closed) if np.any(closed) else (0, external.shape[1])
+    start, end = _longest_closed(closed) if np.any(closed) else (0, external.shape[1])
     return RecordedLoop(start, end, present, external, _first_limited(recording, start, end))
 
 
 def _first_limited(recording: Recording, start: int, end: int) -> int | None:
     if "flags" not in recording:
         return None
-    limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(NOT_AS_COMMANDED))
+    limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(LIMITING_FLAGS))
     return start + int(limited[0]) if limited.size else None
 
 
-def _longest(closed: Real) -> tuple[int, int]:
+def _longest_closed(closed: Real) -> tuple[int, int]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
     start, end = edges[np.argmax(np.diff(edges, axis=1))]
     return int(start), int(end)

@@ -30,12 +30,12 @@ class ResidualTests:
     cross_ratio: float
 
     @property
-    def white(self) -> bool:
+    def is_white(self) -> bool:
         """The errors do not predict each other."""
         return self.whiteness_ratio <= 1
 
     @property
-    def independent(self) -> bool:
+    def is_independent(self) -> bool:
         """The errors do not follow from the past input."""
         return self.cross_ratio <= 1
 

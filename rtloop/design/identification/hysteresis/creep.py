@@ -4,37 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.design.identification.hysteresis.identify_hysteresis import FINEST
-from rtloop.design.identification.hysteresis.stretches import CREEP_PARTS, averaged, kept, lagged
-from rtloop.design.identification.hysteresis.thresholds import placed_thresholds
-from rtloop.design.identification.measured import Measured, noise_of
+from rtloop.design.identification.hysteresis.identify_hysteresis import FINEST_PLAYS
+from rtloop.design.identification.hysteresis.stretches import CREEP_PARTS, average_recording, block_means, lagged_drive
+from rtloop.design.identification.hysteresis.thresholds import place_thresholds
+from rtloop.design.identification.measured import AxisRecording, noise_std
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
 
-EXPLAINED = 0.5
+EXPLAINED_SHARE = 0.5
 """A lag explains what is left where it halves it."""
 
 
-def creep_explains(run: Measured) -> bool:
+def is_creep_likely(run: AxisRecording) -> bool:
     """Whether plays with lags of the drive leave at most half of what plays alone do, noise aside.
 
     Of a recording from rest, whose drive has one speed, this is what it looks like and no proof: a memory that fades
     with the drive's path looks alike.
     """
-    blocks = kept(run, 1, [0.0])
-    thresholds = placed_thresholds(FINEST, float(np.abs(run.drive_v).max()), "chebyshev-from-0")
+    blocks = average_recording(run, 1, [0.0])
+    thresholds = place_thresholds(FINEST_PLAYS, float(np.abs(run.drive_v).max()), "chebyshev-from-0")
     plays = play_outputs(run.drive_v[:-1], thresholds)
-    columns = np.column_stack([averaged(plays, blocks.size), np.ones(blocks.time_s.size)])
+    columns = np.column_stack([block_means(plays, blocks.size), np.ones(blocks.time_s.size)])
     elapsed = blocks.time_s / blocks.time_s[-1]
-    lags = np.column_stack([lagged(blocks.drive_v, elapsed, 1 / part) for part in CREEP_PARTS])
-    noise = noise_of(run.position_um) ** 2 / blocks.size
+    lags = np.column_stack([lagged_drive(blocks.drive_v, elapsed, 1 / part) for part in CREEP_PARTS])
+    noise = noise_std(run.position_um) ** 2 / blocks.size
     plays_only, with_lags = (
-        max(_left(matrix, blocks.position_um) - noise, 0.0) for matrix in (columns, np.hstack([columns, lags]))
+        max(_residual_mean_square(matrix, blocks.position_um) - noise, 0.0)
+        for matrix in (columns, np.hstack([columns, lags]))
     )
-    return with_lags < EXPLAINED**2 * plays_only
+    return with_lags < EXPLAINED_SHARE**2 * plays_only
 
 
-def _left(columns: Real, position_um: Real) -> float:
+def _residual_mean_square(columns: Real, position_um: Real) -> float:
     """Mean square that the columns leave."""
     solution = np.linalg.lstsq(columns, position_um)[0]
     return float(np.mean((position_um - columns @ solution) ** 2))

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtloop.design.identification.measured import Measured, UnsuitableData
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData
 from rtloop.hysteresis.plays import turning_points
 
-REST = 0.02
+REST_SHARE = 0.02
 """A recording starts from rest where its first drive is below this part of the largest."""
 
 
-def begins_at_rest(run: Measured) -> bool:
+def begins_at_rest(run: AxisRecording) -> bool:
     """Its first drive is next to 0 V, and it holds the major loop: what `identify_hysteresis` asks for."""
     turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
-    return abs(run.drive_v[0]) <= REST * float(np.abs(run.drive_v).max()) and turns.size >= 2
+    return abs(run.drive_v[0]) <= REST_SHARE * float(np.abs(run.drive_v).max()) and turns.size >= 2
 
 
-def require_loop(run: Measured) -> None:
+def require_loop(run: AxisRecording) -> None:
     """Raise UnsuitableData for a drive that does not start at rest or makes no loop."""
     drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
-    if abs(drive[0]) > REST * largest_v:
+    if abs(drive[0]) > REST_SHARE * largest_v:
         raise UnsuitableData(
             f"{run.name}: it starts at {drive[0]:g} V, so that the actuator's memory is not known; a drive that starts "
             "at 0 V from rest, with its initial loading curve, is needed"

@@ -13,43 +13,52 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.design.identification.hysteresis.least_squares import Common, Equations, Limits, errors, fitted, own_of
+from rtloop.design.identification.hysteresis.least_squares import (
+    Equations,
+    Limits,
+    SharedGains,
+    fit_gains,
+    fit_own_gains,
+    model_errors,
+)
 from rtloop.hil.modal import Real
 
 PIECES, FOLDS = 40, 10
 """Of a stretch; there are so many fits, each time without as many of them."""
 GROUPS = 5
 """At most so many fits: more recordings than that are left out several at a time."""
-SHOWN, OTHERS = 0.95, 2
+COVERED_SHARE, LEAST_OTHERS = 0.95, 2
 """Others show a recording where so many move every play by this part of what it does."""
 
 
-def held_out(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+def held_out_errors(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
     """Errors in µm of every recording, (blocks, 2) each, by fits without it; NaN where memory is not known.
 
     First of all that is fitted, then of the plays alone, as they are written, offsets aside.
     """
-    errors_um = _piece_by_piece(recordings, limits)
+    errors_um = _errors_by_piece(recordings, limits)
     for group in range(GROUPS):
         other_recordings = [recording for i, recording in enumerate(recordings) if i % GROUPS != group]
-        covered = [i for i in range(group, len(recordings), GROUPS) if _shown(recordings[i], other_recordings)]
+        covered = [i for i in range(group, len(recordings), GROUPS) if _is_covered(recordings[i], other_recordings)]
         if covered:
-            common, _ = fitted(other_recordings, limits)
+            common, _ = fit_gains(other_recordings, limits)
             for i in covered:
-                errors_um[i] = judged(recordings[i], common)
+                errors_um[i] = unseen_errors(recordings[i], common)
     return errors_um
 
 
-def judged(one: Equations, common: Common) -> Real:
+def unseen_errors(one: Equations, common: SharedGains) -> Real:
     """Errors in µm (blocks, 2) of a recording that the model knows nothing of; NaN where memory is not known."""
-    errors_um, is_odd = np.full((one.known.size, 2), np.nan), pieces(one) % 2 == 1
+    errors_um, is_odd = np.full((one.known.size, 2), np.nan), piece_numbers(one) % 2 == 1
     for fitted_blocks in (one.known & is_odd, one.known & ~is_odd):
         judged_blocks = one.known & ~fitted_blocks
-        errors_um[judged_blocks] = _left(one.only(judged_blocks), common, own_of(one.only(fitted_blocks), common))
-    return _offsets_aside(one, errors_um)
+        errors_um[judged_blocks] = _residual_columns(
+            one.select_blocks(judged_blocks), common, fit_own_gains(one.select_blocks(fitted_blocks), common)
+        )
+    return _remove_play_offsets(one, errors_um)
 
 
-def pieces(one: Equations) -> npt.NDArray[np.intp]:
+def piece_numbers(one: Equations) -> npt.NDArray[np.intp]:
     """Number of the piece of its stretch that each block is in; −1 where memory is not known."""
     numbers = np.full(one.known.size, -1)
     for column in (one.offsets.T > 0) & one.known:
@@ -57,38 +66,43 @@ def pieces(one: Equations) -> npt.NDArray[np.intp]:
     return numbers
 
 
-def _piece_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
+def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
     errors_um = [np.full((recording.known.size, 2), np.nan) for recording in recordings]
-    folds = [np.where(recording.known, pieces(recording) % FOLDS, -1) for recording in recordings]
+    folds = [np.where(recording.known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
     for fold in range(FOLDS):
         fitted_recordings = [
-            recording.only(fold_numbers != fold) for recording, fold_numbers in zip(recordings, folds, strict=True)
+            recording.select_blocks(fold_numbers != fold)
+            for recording, fold_numbers in zip(recordings, folds, strict=True)
         ]
-        common, gains = fitted(fitted_recordings, limits)
+        common, gains = fit_gains(fitted_recordings, limits)
         for recording, fold_numbers, own_gains, error_um in zip(recordings, folds, gains, errors_um, strict=True):
-            error_um[fold_numbers == fold] = _left(recording.only(fold_numbers == fold), common, own_gains)
-    return [_offsets_aside(recording, error_um) for recording, error_um in zip(recordings, errors_um, strict=True)]
+            error_um[fold_numbers == fold] = _residual_columns(
+                recording.select_blocks(fold_numbers == fold), common, own_gains
+            )
+    return [
+        _remove_play_offsets(recording, error_um) for recording, error_um in zip(recordings, errors_um, strict=True)
+    ]
 
 
-def _left(one: Equations, common: Common, own: Real) -> Real:
-    return np.column_stack([errors(one, common, own), one.position_um - one.slopes @ common.slopes])
+def _residual_columns(one: Equations, common: SharedGains, own: Real) -> Real:
+    return np.column_stack([model_errors(one, common, own), one.position_um - one.slopes @ common.slopes])
 
 
-def _offsets_aside(one: Equations, found: Real) -> Real:
+def _remove_play_offsets(one: Equations, found: Real) -> Real:
     """The plays alone leave every stretch its offset: its mean."""
     for stretch in (one.offsets.T > 0) & one.known:
         found[stretch, 1] -= np.mean(found[stretch, 1])
     return found
 
 
-def _shown(one: Equations, others: Sequence[Equations]) -> bool:
-    if len(others) < OTHERS:
+def _is_covered(one: Equations, others: Sequence[Equations]) -> bool:
+    if len(others) < LEAST_OTHERS:
         return False
-    covered_travel = np.sort([_moved(other) for other in others], axis=0)[-OTHERS]
-    return bool(np.all(covered_travel >= SHOWN * _moved(one)))
+    covered_travel = np.sort([_play_travel(other) for other in others], axis=0)[-LEAST_OTHERS]
+    return bool(np.all(covered_travel >= COVERED_SHARE * _play_travel(one)))
 
 
-def _moved(one: Equations) -> Real:
+def _play_travel(one: Equations) -> Real:
     """How far every slope's column goes within a stretch (plays,): between them, it goes where memory is not known."""
     stretches = (one.offsets.T > 0) & one.known
     return np.max(

@@ -24,11 +24,11 @@ from scipy.optimize import lsq_linear
 from rtloop.design.identification.hysteresis.from_rest import require_loop
 from rtloop.design.identification.hysteresis.thresholds import (
     Placement,
-    placed_thresholds,
+    candidate_placements,
+    place_thresholds,
     require_ascending,
-    tried,
 )
-from rtloop.design.identification.measured import Measured, UnsuitableData, noise_of, require_rising
+from rtloop.design.identification.measured import AxisRecording, UnsuitableData, noise_std, require_rising
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output, play_outputs
@@ -40,10 +40,10 @@ BLOCKS = 20_000
 """At most so many averaged samples of each recording take part."""
 LEAST_SLOPE = 0.05
 """Of "invertible" weights: the least partial sum, as a part of the mean slope, so that the inverse stays moderate."""
-FINEST, STRUCTURE = 60, 2.5e-4
+FINEST_PLAYS, STRUCTURE_SHARE = 60, 2.5e-4
 """An actuator is no sum of plays where not even so many explain it: what they leave beside noise is more than this part
 of the range."""
-LARGEST_ERROR = 0.15
+LARGEST_RMS_SHARE = 0.15
 """rms, as a part of the range, of a fit that is given out at all; a straight line through a wide loop errs by less."""
 LEAST_DIRECTION = 1e-9
 """Smallest singular value of the scaled columns, relative to the largest, for weights that can be told apart."""
@@ -70,7 +70,7 @@ class HysteresisFit:
     least_slope_um_per_v: float
 
     @property
-    def invertible(self) -> bool:
+    def is_invertible(self) -> bool:
         """Every partial sum of the weights is above 0."""
         return bool(np.all(np.cumsum(self.model.weights) > 0))
 
@@ -81,7 +81,7 @@ class _Equations(NamedTuple):
 
 
 def identify_hysteresis(
-    runs: Sequence[Measured],
+    runs: Sequence[AxisRecording],
     count: int = 15,
     placement: Placement = "auto",
     thresholds_v: Sequence[float] | None = None,
@@ -91,50 +91,58 @@ def identify_hysteresis(
 
     "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever leaves less of the recordings.
     """
-    placements = tried(placement)
+    placements = candidate_placements(placement)
     for run in runs:
         require_loop(run)
         require_rising(run)
     largest_v = max(float(np.abs(run.drive_v).max()) for run in runs)
     if thresholds_v is not None:
-        return explaining(_fitted(runs, np.array(thresholds_v, float), "given", weights, largest_v), runs)
-    fits = [_fitted(runs, placed_thresholds(count, largest_v, rule), rule, weights, largest_v) for rule in placements]
-    return explaining(min(fits, key=lambda fit: fit.rms_error_um), runs)
+        return require_explanation(
+            _fit_at_thresholds(runs, np.array(thresholds_v, float), "given", weights, largest_v), runs
+        )
+    fits = [
+        _fit_at_thresholds(runs, place_thresholds(count, largest_v, rule), rule, weights, largest_v)
+        for rule in placements
+    ]
+    return require_explanation(min(fits, key=lambda fit: fit.rms_error_um), runs)
 
 
-def explaining(fit: HysteresisFit, runs: Sequence[Measured]) -> HysteresisFit:
+def require_explanation(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> HysteresisFit:
     """The fit of `runs`. Raises UnsuitableData for one that explains hardly anything of them."""
     error_share = fit.rms_error_um / fit.range_um
-    if error_share > LARGEST_ERROR:
+    if error_share > LARGEST_RMS_SHARE:
         raise UnsuitableData(
             f"{', '.join(run.name for run in runs)}: no sum of plays explains how the position follows the drive: the "
-            f"best errs by {100 * error_share:.0f} % of the range (rms), and {100 * LARGEST_ERROR:.0f} % are allowed. Look at "
+            f"best errs by {100 * error_share:.0f} % of the range (rms), and {100 * LARGEST_RMS_SHARE:.0f} % are "
+            "allowed. Look at "
             "position over drive: are these the axis's own signals, of one slow drive, and is the sensor's sign right?"
         )
     return fit
 
 
-def unexplained_um(runs: Sequence[Measured], fit: HysteresisFit) -> float:
+def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
     """rms in µm of what no sum of plays explains in the recordings of a fit, noise aside; 0 where that is nothing."""
     errors = fit.rms_error_um
     with suppress(UnsuitableData):  # so many cannot be told apart
-        errors = min(errors, identify_hysteresis(runs, FINEST).rms_error_um)
+        errors = min(errors, identify_hysteresis(runs, FINEST_PLAYS).rms_error_um)
     unexplained = math.sqrt(max(0.0, errors**2 - fit.noise_um**2))
-    return unexplained if unexplained > STRUCTURE * fit.range_um else 0.0
+    return unexplained if unexplained > STRUCTURE_SHARE * fit.range_um else 0.0
 
 
-def _fitted(
-    runs: Sequence[Measured], thresholds: Real, placed: str, weights: Weights, largest_v: float
+def _fit_at_thresholds(
+    runs: Sequence[AxisRecording], thresholds: Real, placed: str, weights: Weights, largest_v: float
 ) -> HysteresisFit:
     """With plays at `thresholds` in V."""
     require_ascending(thresholds)
-    _require_reached(thresholds, largest_v)
-    equations = [_equations(run, thresholds, i, len(runs)) for i, run in enumerate(runs)]
+    _require_thresholds_reached(thresholds, largest_v)
+    equations = [_build_equations(run, thresholds, i, len(runs)) for i, run in enumerate(runs)]
     columns = np.vstack([part.columns for part in equations])
     position = np.concatenate([part.position_um for part in equations])
     range_um = max(float(np.ptp(part.position_um)) for part in equations)
     least_slope = LEAST_SLOPE * range_um / max(float(np.ptp(run.drive_v)) for run in runs)
-    slopes, offsets = _solve(columns, position, thresholds.size, least_slope if weights == "invertible" else -np.inf)
+    slopes, offsets = _solve_slopes(
+        columns, position, thresholds.size, least_slope if weights == "invertible" else -np.inf
+    )
     errors = columns @ np.concatenate([slopes, offsets]) - position
     model = PlayModel(thresholds, np.diff(slopes, prepend=0.0))
     widest = max(runs, key=lambda run: float(np.ptp(run.drive_v)))
@@ -143,7 +151,7 @@ def _fitted(
         tuple(offsets.tolist()),
         float(np.sqrt(np.mean(errors**2))),
         float(np.abs(errors).max()),
-        float(np.sqrt(np.mean([noise_of(run.position_um) ** 2 / _block(run) for run in runs]))),
+        float(np.sqrt(np.mean([noise_std(run.position_um) ** 2 / _block_size(run) for run in runs]))),
         range_um,
         largest_v,
         loop_shape(widest.drive_v[:-1], widest.position_um[1:]),
@@ -154,28 +162,30 @@ def _fitted(
     )
 
 
-def _equations(run: Measured, thresholds: Real, index: int, runs: int) -> _Equations:
+def _build_equations(run: AxisRecording, thresholds: Real, index: int, runs: int) -> _Equations:
     """Averaged columns (blocks, plays + runs) and positions (blocks,); a column of ones for the run's own offset."""
     plays = play_outputs(run.drive_v[:-1], thresholds)
     plays[:, :-1] -= plays[:, 1:].copy()
     offset = np.zeros((plays.shape[0], runs))
     offset[:, index] = 1.0
-    size = _block(run)
-    return _Equations(_averaged(np.hstack([plays, offset]), size), _averaged(run.position_um[1:, None], size)[:, 0])
+    size = _block_size(run)
+    return _Equations(
+        _block_means(np.hstack([plays, offset]), size), _block_means(run.position_um[1:, None], size)[:, 0]
+    )
 
 
-def _block(run: Measured) -> int:
+def _block_size(run: AxisRecording) -> int:
     """Samples that are averaged to one."""
     return max(1, (run.drive_v.size - 1) // BLOCKS)
 
 
-def _averaged(rows: Real, size: int) -> Real:
+def _block_means(rows: Real, size: int) -> Real:
     """Means of `size` successive rows; an incomplete block at the end is left out."""
     complete = rows[: rows.shape[0] // size * size]
     return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
-def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Real, Real]:
+def _solve_slopes(columns: Real, position: Real, plays: int, least: float) -> tuple[Real, Real]:
     """Slopes ≥ `least` and offsets, by least squares. Raises UnsuitableData where they cannot be told apart."""
     scale = np.linalg.norm(columns, axis=0)
     singular_values = np.linalg.svd(columns / scale, compute_uv=False)
@@ -190,7 +200,7 @@ def _solve(columns: Real, position: Real, plays: int, least: float) -> tuple[Rea
     return solution[:plays], solution[plays:]
 
 
-def _require_reached(thresholds: Real, largest_v: float) -> None:
+def _require_thresholds_reached(thresholds: Real, largest_v: float) -> None:
     unreached = thresholds[thresholds >= largest_v]
     if unreached.size:
         raise UnsuitableData(

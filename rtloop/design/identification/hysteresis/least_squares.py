@@ -22,11 +22,11 @@ from scipy.optimize import lsq_linear
 
 from rtloop.hil.modal import Real
 
-RIDGE = 1e-3
+SLOPE_PENALTY = 1e-3
 """Error in µm rms that a difference of two slopes counts as, per µm that it makes over the drive's range."""
-STILL = 1e-2
+DRIFT_PENALTY = 1e-2
 """Error in µm rms that a µm of drift over the recording counts as."""
-FLOOR = 1e-7
+LEAST_PENALTY = 1e-7
 """Least weight of every unknown, so that one that does nothing stays 0."""
 
 
@@ -45,21 +45,21 @@ class Equations(NamedTuple):
     known: npt.NDArray[np.bool_]
 
     @property
-    def own(self) -> Real:
+    def own_columns(self) -> Real:
         """Columns of what is the recording's own."""
         return np.hstack([self.offsets, self.drift])
 
     @property
-    def own_weights(self) -> Real:
+    def own_penalties(self) -> Real:
         """What its gains count as, in µm rms per unit."""
-        return np.repeat([FLOOR, STILL], [self.offsets.shape[1], self.drift.shape[1]])
+        return np.repeat([LEAST_PENALTY, DRIFT_PENALTY], [self.offsets.shape[1], self.drift.shape[1]])
 
-    def only(self, kept: npt.NDArray[np.bool_]) -> Equations:
+    def select_blocks(self, kept: npt.NDArray[np.bool_]) -> Equations:
         """Of these blocks, a mask."""
         return Equations._make(rows[kept] for rows in self)
 
 
-class Common(NamedTuple):
+class SharedGains(NamedTuple):
     """What all recordings share: slopes in µm/V (plays,), gains of the creep (terms,)."""
 
     slopes: Real
@@ -73,15 +73,19 @@ class Limits(NamedTuple):
     drive_v: float
 
 
-def fitted(recordings: Sequence[Equations], limits: Limits) -> tuple[Common, list[Real]]:
+def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGains, list[Real]]:
     """What all share, and the gains of what is each one's own, from the blocks whose memory is known."""
-    known_blocks = [recording.only(recording.known) for recording in recordings]
+    known_blocks = [recording.select_blocks(recording.known) for recording in recordings]
     plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]
     shared = np.vstack([np.hstack([recording.slopes, recording.creep]) for recording in known_blocks])
-    columns = np.hstack([shared, np.asarray(block_diag(*(recording.own for recording in known_blocks)), np.float64)])
-    penalties = np.concatenate([np.full(plays + creep, FLOOR), *(recording.own_weights for recording in known_blocks)])
+    columns = np.hstack(
+        [shared, np.asarray(block_diag(*(recording.own_columns for recording in known_blocks)), np.float64)]
+    )
+    penalties = np.concatenate(
+        [np.full(plays + creep, LEAST_PENALTY), *(recording.own_penalties for recording in known_blocks)]
+    )
     neighbour_rows = np.zeros((plays - 1, penalties.size))
-    neighbour_rows[:, :plays] = RIDGE * limits.drive_v * np.diff(np.eye(plays), axis=0)
+    neighbour_rows[:, :plays] = SLOPE_PENALTY * limits.drive_v * np.diff(np.eye(plays), axis=0)
     penalty_rows = columns.shape[0] ** 0.5 * np.vstack([neighbour_rows, np.diag(penalties)])
     position = np.concatenate([*(recording.position_um for recording in known_blocks), np.zeros(penalty_rows.shape[0])])
     lower_bounds = np.full(penalties.size, -np.inf)
@@ -89,21 +93,23 @@ def fitted(recordings: Sequence[Equations], limits: Limits) -> tuple[Common, lis
     orthogonal, triangle = np.linalg.qr(np.vstack([columns, penalty_rows]))
     solution = lsq_linear(triangle, orthogonal.T @ position, (lower_bounds, np.inf), method="bvls").x
     gains = np.split(
-        solution, np.cumsum([plays, creep, *(recording.own_weights.size for recording in known_blocks)])[:-1]
+        solution, np.cumsum([plays, creep, *(recording.own_penalties.size for recording in known_blocks)])[:-1]
     )
-    return Common(gains[0], gains[1]), gains[2:]
+    return SharedGains(gains[0], gains[1]), gains[2:]
 
 
-def own_of(one: Equations, common: Common) -> Real:
+def fit_own_gains(one: Equations, common: SharedGains) -> Real:
     """Gains of what is a recording's own, by a model that is given."""
-    known_blocks = one.only(one.known)
-    penalty_rows = known_blocks.known.size**0.5 * np.diag(one.own_weights)
-    right_side = np.append(errors(known_blocks, common, np.zeros(one.own_weights.size)), np.zeros(one.own_weights.size))
+    known_blocks = one.select_blocks(one.known)
+    penalty_rows = known_blocks.known.size**0.5 * np.diag(one.own_penalties)
+    right_side = np.append(
+        model_errors(known_blocks, common, np.zeros(one.own_penalties.size)), np.zeros(one.own_penalties.size)
+    )
     return np.asarray(
-        np.linalg.lstsq(np.vstack([known_blocks.own, penalty_rows]), right_side, rcond=None)[0], np.float64
+        np.linalg.lstsq(np.vstack([known_blocks.own_columns, penalty_rows]), right_side, rcond=None)[0], np.float64
     )
 
 
-def errors(one: Equations, common: Common, own: Real) -> Real:
+def model_errors(one: Equations, common: SharedGains, own: Real) -> Real:
     """Measured − model in µm (blocks,)."""
-    return one.position_um - one.slopes @ common.slopes - one.creep @ common.creep - one.own @ own
+    return one.position_um - one.slopes @ common.slopes - one.creep @ common.creep - one.own_columns @ own

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from rtloop.design.identification.hysteresis.held_out import PIECES
 from rtloop.design.identification.hysteresis.least_squares import Equations
-from rtloop.design.identification.measured import Measured
+from rtloop.design.identification.measured import AxisRecording
 from rtloop.hil.modal import Real
 from rtloop.hysteresis.plays import play_outputs
-from rtloop.hysteresis.unknown_memory import known_stretches, settled_memory
+from rtloop.hysteresis.unknown_memory import covered_intervals, periodic_memory
 
 Term = Literal["drift", "creep"]
 Clock = Literal["time", "path"]
@@ -23,11 +23,11 @@ BLOCKS, LEAST_BLOCKS = 3000, 300
 """Averaged samples of all recordings together, and of each at least."""
 CREEP_PARTS = (30.0, 6.0, 1.0)
 """Creep has time constants of the longest recording's duration over these."""
-AT_ONCE = 100_000
+CHUNK_TICKS = 100_000
 """Ticks whose plays are in memory at a time."""
 
 
-class Kept(NamedTuple):
+class AveragedRecording(NamedTuple):
     """One recording, averaged over blocks: time in s since its first tick, drive in V, position in µm, the path that
     the drive has gone in V, each (blocks,).
 
@@ -48,25 +48,27 @@ class Kept(NamedTuple):
     before_v: Real | None
 
 
-def kept(run: Measured, runs: int, before_v: npt.ArrayLike | None = None) -> Kept:
+def average_recording(run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None) -> AveragedRecording:
     """One of so many recordings; a drive is beside the position of the tick that follows it."""
     most_blocks = max(LEAST_BLOCKS, BLOCKS // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
     time_s = run.seconds[:-1] - run.seconds[0]
     drive_before = None if before_v is None else np.asarray(before_v, float)
     path_v = np.cumsum(np.abs(np.diff(drive, prepend=drive[0])))
-    time_s, mean_drive, position, path_v = averaged(
+    time_s, mean_drive, position, path_v = block_means(
         np.column_stack([time_s, drive, run.position_um[1:], path_v]), size
     ).T
     if drive_before is None:
-        stretch, stroke_v = _stretches(drive, size)
+        stretch, stroke_v = _number_stretches(drive, size)
     else:
         stretch, stroke_v = np.zeros(mean_drive.size, np.intp), 2 * float(np.abs(np.append(drive_before, drive)).max())
-    return Kept(run.name, time_s, mean_drive, position, path_v, stretch, stroke_v, drive, size, drive_before)
+    return AveragedRecording(
+        run.name, time_s, mean_drive, position, path_v, stretch, stroke_v, drive, size, drive_before
+    )
 
 
-def equations(
-    run: Kept, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
+def build_equations(
+    run: AveragedRecording, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
 ) -> Equations:
     """With plays at these thresholds in V and these terms; `duration_s` and `path_v` are those of the longest
     recordings.
@@ -74,17 +76,17 @@ def equations(
     Where memory is not known, the plays are those of a drive that has gone before again and again.
     """
     if run.before_v is None:
-        memory = settled_memory(run.full_v, thresholds)
+        memory = periodic_memory(run.full_v, thresholds)
     else:
         memory = play_outputs(np.append(run.before_v, run.full_v[0]), thresholds)[-1]
-    plays = averaged_plays(run, thresholds, memory)
+    plays = play_block_means(run, thresholds, memory)
     plays[:, :-1] -= plays[:, 1:].copy()
     stretches = int(run.stretch.max()) + 1
     offsets = np.where(run.stretch < 0, stretches - 1, run.stretch)[:, None] == np.arange(stretches)
     centred_time = run.time_s / max(float(run.time_s[-1]), 1e-12) - 0.5
     drift = [centred_time] if "drift" in terms else []
     elapsed = run.time_s / duration_s if clock == "time" else run.path_v / path_v
-    creep = [lagged(run.drive_v, elapsed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
+    creep = [lagged_drive(run.drive_v, elapsed, 1 / part) for part in CREEP_PARTS] if "creep" in terms else []
     return Equations(
         plays,
         np.array(creep).reshape(-1, centred_time.size).T,
@@ -95,9 +97,9 @@ def equations(
     )
 
 
-def _stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
+def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
     """Of every block, −1 for those that are not all in one or in one with too few to judge any; the longest stroke."""
-    numbers = known_stretches(drive)
+    numbers = covered_intervals(drive)
     tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)
     block_numbers = np.where(np.all(tick_numbers == tick_numbers[:, :1], axis=1), tick_numbers[:, 0], -1)
     stretch, stroke_v = np.full(block_numbers.size, -1), 0.0
@@ -107,23 +109,23 @@ def _stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
     return stretch, stroke_v
 
 
-def averaged_plays(run: Kept, thresholds: Real, state: Real) -> Real:
+def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> Real:
     """(blocks, plays), of plays that stood at `state` (plays,) when the recording began."""
-    parts, chunk_ticks = [], max(1, AT_ONCE // run.size) * run.size
+    parts, chunk_ticks = [], max(1, CHUNK_TICKS // run.size) * run.size
     for start in range(0, run.full_v.size, chunk_ticks):
         outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
         state = outputs[-1]
-        parts.append(averaged(outputs, run.size))
+        parts.append(block_means(outputs, run.size))
     return np.concatenate(parts)
 
 
-def averaged(rows: Real, size: int) -> Real:
+def block_means(rows: Real, size: int) -> Real:
     """Means of `size` successive rows; an incomplete block at the end is left out."""
     complete = rows[: rows.shape[0] // size * size]
     return complete.reshape(-1, size, rows.shape[1]).mean(axis=1)
 
 
-def lagged(drive_v: Real, passed: Real, constant: float) -> Real:
+def lagged_drive(drive_v: Real, passed: Real, constant: float) -> Real:
     """Drive behind a first-order lag, which stood still at first: (blocks,). `passed` is what the constant is in."""
     shares = -np.expm1(-np.diff(passed, prepend=passed[0]) / constant)
     found, level = np.empty(drive_v.size), float(drive_v[0])

@@ -9,18 +9,18 @@ import numpy as np
 from rtloop.hil.modal import Real
 from rtloop.laws.shipped.play_model import MAX_PLAYS
 
-Placed = Literal["chebyshev", "chebyshev-from-0", "uniform"]
+PlacementRule = Literal["chebyshev", "chebyshev-from-0", "uniform"]
 Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 
 
-def tried(placement: Placement) -> tuple[Placed, ...]:
+def candidate_placements(placement: Placement) -> tuple[PlacementRule, ...]:
     """Of "auto", with a dead band and without. Raises ValueError."""
     if placement not in get_args(Placement):
         raise ValueError(f"placement: {placement!r}; allowed are {', '.join(get_args(Placement))}")
     return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
 
 
-def placed_thresholds(count: int, largest_v: float, placement: Placed) -> Real:
+def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> Real:
     """`count` thresholds in V below `largest_v`, the largest drive.
 
     "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10

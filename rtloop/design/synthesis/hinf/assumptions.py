@@ -25,9 +25,9 @@ class NoController(ValueError):
 def check_assumptions(plant: GeneralisedPlant) -> None:
     """Raises NoController, naming every assumption that does not hold."""
     faults = [
-        *_stabilisable("stabilisability", "u does not move", plant.a, plant.b2),
-        *_stabilisable("detectability", "y does not show", plant.a.T, plant.c2.T),
-        *_ranks(plant),
+        *_unreachable_modes("stabilisability", "u does not move", plant.a, plant.b2),
+        *_unreachable_modes("detectability", "y does not show", plant.a.T, plant.c2.T),
+        *_rank_faults(plant),
     ]
     if not faults:
         faults += _axis_zeros("from u to z", plant.a, plant.b2, plant.c1, plant.d12)
@@ -36,7 +36,7 @@ def check_assumptions(plant: GeneralisedPlant) -> None:
         raise NoController("; ".join(faults))
 
 
-def _stabilisable(condition: str, says: str, a: Real, b: Real) -> list[str]:
+def _unreachable_modes(condition: str, says: str, a: Real, b: Real) -> list[str]:
     """Modes in Re ≥ 0 that the inputs do not reach (Popov-Belevitch-Hautus)."""
     faults = []
     for value in np.linalg.eigvals(a):
@@ -47,7 +47,7 @@ def _stabilisable(condition: str, says: str, a: Real, b: Real) -> list[str]:
     return faults
 
 
-def _ranks(plant: GeneralisedPlant) -> list[str]:
+def _rank_faults(plant: GeneralisedPlant) -> list[str]:
     faults = []
     for name, matrix, requirement in (
         ("D12", plant.d12, "full column rank is needed: every u must cost something at high frequencies"),
@@ -60,7 +60,7 @@ def _ranks(plant: GeneralisedPlant) -> list[str]:
     return faults
 
 
-def _axis_zeros(which: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
+def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
     """Zeros on the imaginary axis: the modes of A − B D⁺C that C, less what D explains, does not see."""
     solve = np.linalg.pinv(d)
     inner, residual_c = a - b @ solve @ c, c - d @ solve @ c
@@ -70,7 +70,7 @@ def _axis_zeros(which: str, a: Real, b: Real, c: Real, d: Real) -> list[str]:
         if value.imag < 0 or not on_axis:
             continue
         if _is_singular(np.vstack([inner - 1j * value.imag * np.eye(a.shape[0]), residual_c]).T):
-            place = f"the path {which} has a zero at ω = {value.imag:.6g} rad/s"
+            place = f"the path {path_name} has a zero at ω = {value.imag:.6g} rad/s"
             faults.append(f"imaginary-axis zero: {place}; a little damping would help")
     return faults
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from rtloop.analysis.closed_loop import realised
+from rtloop.analysis.closed_loop import realise_transfer
 from rtloop.design.synthesis.weights import Weights
 from rtloop.hil.modal import Complex, Real
 from rtloop.linear.transfer import Transfer
@@ -50,7 +50,7 @@ class GeneralisedPlant(NamedTuple):
     d21: Real
     d22: Real
 
-    def closed_with(self, controller: Matrices) -> Matrices:
+    def close_loop(self, controller: Matrices) -> Matrices:
         """F_l(P, K): the loop from w to z with u = K y. Raises ValueError where D22 and D_K leave no solution."""
         loop_matrix = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
         if np.linalg.cond(loop_matrix) > 1e14:
@@ -69,14 +69,14 @@ class GeneralisedPlant(NamedTuple):
         return Matrices(a, b, c, self.d11 + self.d12 @ command_from_w)
 
 
-def augmented(plant: Transfer, weights: Weights) -> GeneralisedPlant:
+def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
     """The paper's standard scheme for D(s) and W1, W2, W3: 8 + 1 + 1 + 1 = 11 states for eq (5).
 
     D11 is not 0 where W1(∞) is not. Raises ValueError for a plant with direct feedthrough.
     """
     if not plant.is_strictly_proper:
         raise ValueError(f"plant: {plant.zeros.size} zeros and {plant.order} poles; fewer zeros than poles are needed")
-    g, w1, w2, w3 = (realised(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
+    g, w1, w2, w3 = (realise_transfer(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
     zeros_g, zeros_2, zeros_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
     error = np.concatenate([-g.c, 0 * w1.b, zeros_2, -w3.c])  # e without x_d and without the direct part of W3
     a = np.asarray(block_diag(g.a, w1.a, w2.a, w3.a), dtype=float)

@@ -29,22 +29,22 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
     if np.any(poles.real >= 0):
         return Peak(math.inf, float(np.abs(poles[np.argmax(poles.real)])))
     grid = np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])
-    best = max(_gains(system, grid), Peak(_largest(system.d), math.inf))
+    best = max(_highest_gain(system, grid), Peak(_spectral_norm(system.d), math.inf))
     for _ in range(60):
         crossings = _crossings(system, (1 + tolerance) * best.norm)
         if crossings.size < 2:
             return best
         middles = 0.5 * (crossings[1:] + crossings[:-1])
-        best = max(best, _gains(system, np.concatenate([middles, np.sqrt(crossings[1:] * crossings[:-1])])))
+        best = max(best, _highest_gain(system, np.concatenate([middles, np.sqrt(crossings[1:] * crossings[:-1])])))
     return best
 
 
-def _gains(system: Matrices, omega: Real) -> Peak:
+def _highest_gain(system: Matrices, omega: Real) -> Peak:
     values = np.linalg.norm(system.response((1j * omega).astype(complex)), 2, axis=(1, 2))
     return max(Peak(float(value), float(frequency)) for value, frequency in zip(values, omega, strict=True))
 
 
-def _largest(matrix: Real) -> float:
+def _spectral_norm(matrix: Real) -> float:
     return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
 
 

@@ -15,7 +15,7 @@ from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
 from rtloop.hil.modal import Real
 
 
-class Normalised(NamedTuple):
+class NormalForm(NamedTuple):
     """The plant in normal form; `to_u` (m2, m2) and `from_y` (p2, p2) lead back, without the `direct` part D22."""
 
     a: Real
@@ -46,20 +46,20 @@ class Normalised(NamedTuple):
         )  # fmt: skip
 
 
-def normalised(plant: GeneralisedPlant) -> Normalised:
+def normalise(plant: GeneralisedPlant) -> NormalForm:
     """The normal form; D12 must have full column rank and D21 full row rank."""
     scale = _state_scale(plant)
     a = plant.a * scale / scale[:, None]
     b1, b2, c1, c2 = plant.b1 / scale[:, None], plant.b2 / scale[:, None], plant.c1 * scale, plant.c2 * scale
-    turn_z, to_u = _turned(plant.d12)
-    turn_w, from_y = _turned(plant.d21.T)
-    return Normalised(
+    turn_z, to_u = _normalising_pair(plant.d12)
+    turn_w, from_y = _normalising_pair(plant.d21.T)
+    return NormalForm(
         a, b1 @ turn_w, b2 @ to_u, turn_z.T @ c1, from_y.T @ c2, turn_z.T @ plant.d11 @ turn_w,
         to_u, from_y.T, plant.d22,
     )  # fmt: skip
 
 
-def _turned(matrix: Real) -> tuple[Real, Real]:
+def _normalising_pair(matrix: Real) -> tuple[Real, Real]:
     """Orthogonal Q and invertible T with Qᵀ·matrix·T = [0; I]."""
     left, values, right = np.linalg.svd(matrix)
     count = values.size

@@ -33,7 +33,7 @@ def stabilising_solution(hamiltonian: Real) -> Real:
     of a second beside some of ten microseconds are ordinary here.
     """
     n = hamiltonian.shape[0] // 2
-    scale = _scale(hamiltonian)
+    scale = _symplectic_scale(hamiltonian)
     joint_scale = np.concatenate([scale, 1 / scale])
     balanced = hamiltonian * joint_scale / joint_scale[:, None]
     try:
@@ -56,7 +56,7 @@ def stabilising_solution(hamiltonian: Real) -> Real:
     return x / scale / scale[:, None]
 
 
-def _scale(hamiltonian: Real) -> Real:
+def _symplectic_scale(hamiltonian: Real) -> Real:
     """t (n,), powers of two: diag(t, 1/t) balances H as well as a symplectic scaling can (Benner 2001)."""
     n = hamiltonian.shape[0] // 2
     if not n:

@@ -19,7 +19,7 @@ from scipy.linalg import sqrtm
 from rtloop.design.synthesis.hinf.assumptions import NoController, check_assumptions
 from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
 from rtloop.design.synthesis.hinf.norm import hinf_norm
-from rtloop.design.synthesis.hinf.normalised import Normalised, normalised
+from rtloop.design.synthesis.hinf.normalised import NormalForm, normalise
 from rtloop.design.synthesis.hinf.riccati import Fault, NoSolution, stabilising_solution
 from rtloop.hil.modal import Real
 
@@ -56,14 +56,16 @@ def synthesise_hinf(
     Order: that of the plant.
     """
     check_assumptions(plant)
-    normal_form = normalised(plant)
+    normal_form = normalise(plant)
     gamma_opt, limiting = smallest_gamma(normal_form, tolerance)
     target_gamma = gamma_opt * (1 + backoff) if gamma is None else gamma
     try:
-        controller = normal_form.restored(_central(normal_form, _solve(normal_form, target_gamma), target_gamma))
+        controller = normal_form.restored(
+            _central_controller(normal_form, _solve_riccati_pair(normal_form, target_gamma), target_gamma)
+        )
     except NoController as fault:
         raise NoController(f"gamma: {target_gamma:g} cannot be reached; {gamma_opt:.6g} can. {fault}") from None
-    loop = plant.closed_with(controller)
+    loop = plant.close_loop(controller)
     achieved = hinf_norm(loop).norm
     if not achieved <= 1.01 * target_gamma:
         raise NoController(
@@ -73,38 +75,38 @@ def synthesise_hinf(
     return Hinf(controller, target_gamma, gamma_opt, achieved, limiting)
 
 
-def smallest_gamma(normal: Normalised, tolerance: float = 1e-7) -> tuple[float, str]:
+def smallest_gamma(normal: NormalForm, tolerance: float = 1e-7) -> tuple[float, str]:
     """γ_opt (from above, to `tolerance` of it) and the condition that fails just below. Raises NoController."""
     low = high = max(_direct_bound(normal), 1e-6)
     limiting = "the direct part D11, which no controller changes"
-    while (fault := _fault(normal, high * (1 + tolerance))) is not None:
+    while (fault := _failing_condition(normal, high * (1 + tolerance))) is not None:
         low, high, limiting = high, 2 * high, fault
         if high > LARGEST_GAMMA:
             raise NoController(f"no controller up to γ = {LARGEST_GAMMA:g}: {limiting}")
     while high - low > tolerance * high:
         middle = math.sqrt(low * high)
-        fault = _fault(normal, middle)
+        fault = _failing_condition(normal, middle)
         low, high, limiting = (low, middle, limiting) if fault is None else (middle, high, fault)
     return high * (1 + tolerance), limiting
 
 
-def _fault(normal: Normalised, gamma: float) -> str | None:
+def _failing_condition(normal: NormalForm, gamma: float) -> str | None:
     """The condition that fails at γ, or None."""
     try:
-        _solve(normal, gamma)
+        _solve_riccati_pair(normal, gamma)
     except NoController as fault:
         return str(fault)
     return None
 
 
-def _direct_bound(normal: Normalised) -> float:
+def _direct_bound(normal: NormalForm) -> float:
     """What u and y cannot touch of D11: the larger norm of its first rows and of its first columns."""
     rows, columns = normal.d11.shape[0] - normal.b2.shape[1], normal.d11.shape[1] - normal.c2.shape[0]
     parts = normal.d11[:rows], normal.d11[:, :columns]
     return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
 
 
-def _solve(normal: Normalised, gamma: float) -> _Solutions:
+def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
     """Both Riccati equations and the coupling between them. Raises NoController."""
     if gamma <= _direct_bound(normal):
         raise NoController(
@@ -113,10 +115,10 @@ def _solve(normal: Normalised, gamma: float) -> _Solutions:
     a, b1, b2, c1, c2, d11, d12, d21 = normal.matrices
     b, d_row = np.hstack([b1, b2]), np.hstack([d11, d12])
     c, d_column = np.vstack([c1, c2]), np.vstack([d11, d21])
-    r = d_row.T @ d_row - _corner(gamma, b1.shape[1], b.shape[1])
-    r_dual = d_column @ d_column.T - _corner(gamma, c1.shape[0], c.shape[0])
-    x = _riccati("state feedback, X∞", a, b, c1, d_row, r)
-    y = _riccati("estimation, Y∞", a.T, c.T, b1.T, d_column.T, r_dual)
+    r = d_row.T @ d_row - _gamma_corner(gamma, b1.shape[1], b.shape[1])
+    r_dual = d_column @ d_column.T - _gamma_corner(gamma, c1.shape[0], c.shape[0])
+    x = _solve_riccati("state feedback, X∞", a, b, c1, d_row, r)
+    y = _solve_riccati("estimation, Y∞", a.T, c.T, b1.T, d_column.T, r_dual)
     radius = float(np.max(np.abs(np.linalg.eigvals(x @ y)), initial=0.0))
     if not radius < gamma**2:
         raise NoController(f"coupling: the spectral radius of X∞·Y∞ must stay below γ² ({radius:.6g} ≥ {gamma**2:.6g})")
@@ -125,20 +127,20 @@ def _solve(normal: Normalised, gamma: float) -> _Solutions:
     return _Solutions(x, y, np.asarray(f, float), np.asarray(injection, float))
 
 
-def _corner(gamma: float, count: int, size: int) -> Real:
+def _gamma_corner(gamma: float, count: int, size: int) -> Real:
     corner = np.zeros((size, size))
     corner[:count, :count] = gamma**2 * np.eye(count)
     return corner
 
 
-_SAYS: dict[Fault, str] = {
+_FAULT_TEXTS: dict[Fault, str] = {
     "imaginary axis": "its Hamiltonian matrix has eigenvalues on the imaginary axis",
     "no graph": "the stable subspace of its Hamiltonian matrix gives no matrix",
     "indefinite": "its solution is not positive semidefinite",
 }
 
 
-def _riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
+def _solve_riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
     """X∞ of [A 0; −C1ᵀC1 −Aᵀ] − [B; −C1ᵀD] R⁻¹ [DᵀC1  Bᵀ]; with everything transposed, Y∞."""
     n = a.shape[0]
     left, right = np.vstack([b, -c1.T @ d]), np.hstack([d.T @ c1, b.T])
@@ -146,10 +148,10 @@ def _riccati(name: str, a: Real, b: Real, c1: Real, d: Real, r: Real) -> Real:
     try:
         return stabilising_solution(hamiltonian)
     except NoSolution as error:
-        raise NoController(f"Riccati equation of the {name}: {_SAYS[error.fault]}") from None
+        raise NoController(f"Riccati equation of the {name}: {_FAULT_TEXTS[error.fault]}") from None
 
 
-def _central(normal: Normalised, solutions: _Solutions, gamma: float) -> Matrices:
+def _central_controller(normal: NormalForm, solutions: _Solutions, gamma: float) -> Matrices:
     """The central controller (Q = 0) of theorem 17.1, for D12 = [0; I], D21 = [0 I], D22 = 0."""
     a, b1, b2, _, c2, d11, _, _ = normal.matrices
     x, y, f, injection = solutions

@@ -20,11 +20,11 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
-from rtloop.hil.trusted import Untrusted, release, remake_file
+from rtloop.hil.trusted import UntrustedPath, close_descriptor, replace_file
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     MAGIC,
-    indexed_span,
+    index_record_span,
     pack_chunk,
     pack_end,
     pack_records,
@@ -38,7 +38,7 @@ class NotOnDisk(OutputError):
     """The system could not bring a written file to the disk: it may have given up any of it, and says so only once."""
 
 
-class Content(NamedTuple):
+class ChunkContent(NamedTuple):
     """What a chunk holds: its records, the span of their log times, messages and index record by channel."""
 
     records: bytes | memoryview
@@ -48,7 +48,7 @@ class Content(NamedTuple):
     indexes: dict[int, bytes]
 
 
-class _Written(NamedTuple):
+class _WrittenChunk(NamedTuple):
     """Kept for every chunk of a file, therefore small: its packed record of the index, and what undoing it needs."""
 
     record: bytes
@@ -65,7 +65,7 @@ class ChunkFile:
         self.size = 0
         self._repeated = repeated
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
-        self._chunks: list[_Written] = []
+        self._chunks: list[_WrittenChunk] = []
         self._distinct_counts: dict[tuple[tuple[int, int], ...], dict[int, int]] = {}
         self._crc = 0
         self._fd = self._open()
@@ -83,16 +83,16 @@ class ChunkFile:
         """About what the index will take."""
         return sum(len(chunk.record) for chunk in self._chunks)
 
-    def is_there(self) -> bool:
+    def is_in_place(self) -> bool:
         """Whether the unfinished file still lies under its name: a removed one can be written, and is lost."""
         try:
-            return os.path.samestat(os.lstat(self._name), self._made)
+            return os.path.samestat(os.lstat(self._name), self._created_status)
         except (FileNotFoundError, NotADirectoryError):
             return False
         except OSError:
             return True  # nobody knows; writing will tell
 
-    def append(self, content: Content) -> None:
+    def append_chunk(self, content: ChunkContent) -> None:
         """Compress and write one chunk and its index records, if it has any."""
         chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
         index_begin = self.size + len(chunk)
@@ -112,21 +112,21 @@ class ChunkFile:
             uncompressed_size=len(content.records),
         )
         counts = self._distinct_counts.setdefault(tuple(content.counts.items()), content.counts)
-        written_chunk = _Written(pack_records([entry]), counts, self._crc)
+        written_chunk = _WrittenChunk(pack_records([entry]), counts, self._crc)
         self._append(chunk + b"".join(content.indexes.values()))
         self._chunks.append(written_chunk)
         if self._name != self.part:
-            self._show()
+            self._rename_to_part()
 
-    def drop_last(self) -> dict[int, int]:
+    def drop_last_chunk(self) -> dict[int, int]:
         """Take the last chunk off the file; returns its messages by channel."""
         chunk = self._chunks.pop()
-        _, _, self.size = indexed_span(chunk.record)
+        _, _, self.size = index_record_span(chunk.record)
         self._crc = chunk.crc_before
         try:
             os.ftruncate(self._fd, self.size)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._output_error(error) from None
         return chunk.counts
 
     def write_end(self) -> None:
@@ -141,14 +141,14 @@ class ChunkFile:
         """
         try:
             self._make_durable()
-            if not self.is_there():
+            if not self.is_in_place():
                 raise OutputError(f"{self.part}: was removed while it was written", errno.ENOENT)
             if os.path.lexists(self.path):
                 message = f"{self.path} appeared while it was written; the recording stays in {self.part}"
                 raise OutputError(message, errno.EEXIST)
             os.rename(self.part, self.path)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._output_error(error) from None
         finally:
             self.close()
         with contextlib.suppress(OSError):  # the file is whole: without its name on the disk it is found as a .part
@@ -167,7 +167,7 @@ class ChunkFile:
     def close(self) -> None:
         """Give up the file as it is; idempotent."""
         if self._fd >= 0:
-            release(self._fd)  # what counts is that it was synced
+            close_descriptor(self._fd)  # what counts is that it was synced
             self._fd = -1
 
     def discard(self) -> None:
@@ -180,26 +180,26 @@ class ChunkFile:
         """Of a file that nobody takes for a recording yet; one that was left so is begun anew."""
         self._refuse_to_replace()
         try:
-            fd = remake_file(self._name, 0o644)
+            fd = replace_file(self._name, 0o644)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._output_error(error) from None
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # so that nobody recovers it while it grows
-            self._made = os.fstat(fd)
-            if not self.is_there():
+            self._created_status = os.fstat(fd)
+            if not self.is_in_place():
                 raise BlockingIOError(errno.EWOULDBLOCK, "another process began it as well")
         except OSError as error:
-            release(fd)
-            raise self._refused(error) from None
+            close_descriptor(fd)
+            raise self._output_error(error) from None
         return fd
 
-    def _show(self) -> None:
+    def _rename_to_part(self) -> None:
         """Give the file, which has its first chunk, the name under which it grows."""
         self._refuse_to_replace()
         try:
             os.rename(self._name, self.part)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._output_error(error) from None
         self._name = self.part
 
     def _sync_folder(self) -> None:
@@ -207,13 +207,13 @@ class ChunkFile:
         try:
             os.fsync(folder)
         finally:
-            release(folder)
+            close_descriptor(folder)
 
     def _refuse_to_replace(self) -> None:
         try:
-            has_final, has_part = _is_taken(self.path), _is_taken(self.part)
+            has_final, has_part = _name_exists(self.path), _name_exists(self.part)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._output_error(error) from None
         if has_final:
             raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
         if has_part:
@@ -229,12 +229,12 @@ class ChunkFile:
         except OSError as error:
             with contextlib.suppress(OSError):  # what is left of it is overwritten, or recognised as cut off
                 os.ftruncate(self._fd, self.size)
-            raise self._refused(error) from None
+            raise self._output_error(error) from None
         self.size += len(data)
         self._crc = zlib.crc32(data, self._crc)
 
     def _statistics(self) -> Statistics:
-        starts, ends, _ = zip(*(indexed_span(chunk.record) for chunk in self._chunks), strict=True)
+        starts, ends, _ = zip(*(index_record_span(chunk.record) for chunk in self._chunks), strict=True)
         counts: dict[int, int] = {}
         for chunk in self._chunks:
             for channel, count in chunk.counts.items():
@@ -251,12 +251,12 @@ class ChunkFile:
             schema_count=sum(isinstance(record, Schema) for record in self._repeated),
         )
 
-    def _refused(self, error: OSError) -> OutputError:
-        path = error.filename if isinstance(error, Untrusted) else self.part
+    def _output_error(self, error: OSError) -> OutputError:
+        path = error.filename if isinstance(error, UntrustedPath) else self.part
         return OutputError(f"{path}: {error.strerror}", error.errno or 0)
 
 
-def _is_taken(path: Path) -> bool:
+def _name_exists(path: Path) -> bool:
     """Whether anything, be it a link that leads nowhere, has this name. Raises OSError where that cannot be told."""
     try:
         os.lstat(path)

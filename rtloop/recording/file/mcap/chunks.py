@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
-from rtloop.hil.trusted import open_named, release
+from rtloop.hil.trusted import close_descriptor, open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
@@ -29,12 +29,12 @@ from rtloop.recording.file.mcap.container import (
 SEARCH_BYTES = 1 << 20
 INDEX_HEAD_BYTES = PREFIX.size + 6
 Opener = Callable[[Path], int]
-"""`open_named`, `open_found` or `open_own` of `rtloop.hil.trusted`."""
+"""`open_user_file`, `open_without_link` or `open_own` of `rtloop.hil.is_trusted`."""
 LARGEST_SUMMARY_BYTES = 16 << 20
 """Beyond the size of what it sums up: a chunk takes more room than its index."""
 
 
-class Entry(NamedTuple):
+class ChunkEntry(NamedTuple):
     """Where a chunk record is, in bytes, and what the index says about it, if there is one."""
 
     offset: int
@@ -42,13 +42,13 @@ class Entry(NamedTuple):
     index: ChunkIndex | None  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
-class Source:
+class McapSource:
     """A file opened, by `opener`, for reading at any place from any thread.
 
     Raises RecordingError when it cannot be an MCAP file.
     """
 
-    def __init__(self, path: Path, opener: Opener = open_named) -> None:
+    def __init__(self, path: Path, opener: Opener = open_user_file) -> None:
         self.path = path
         try:
             self._fd = opener(path)
@@ -58,11 +58,11 @@ class Source:
             """Tells whether a file is the same, and unchanged."""
             magic = os.pread(self._fd, len(MAGIC), 0)
         except FileNotFoundError:
-            raise RecordingError(f"{path}: no such file{_hint(path)}") from None
+            raise RecordingError(f"{path}: no such file{_other_name_hint(path)}") from None
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror}") from None
         if magic != MAGIC:
-            release(self._fd)
+            close_descriptor(self._fd)
             description = (
                 "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
             )
@@ -77,10 +77,10 @@ class Source:
 
     def close(self) -> None:
         """Close the file."""
-        release(self._fd)
+        close_descriptor(self._fd)
 
 
-def _hint(path: Path) -> str:
+def _other_name_hint(path: Path) -> str:
     """What lies there under the other name of the same recording."""
     if path.suffix == ".part" and path.with_suffix("").exists():
         return f", but there is {path.with_suffix('').name}, finished or recovered meanwhile"
@@ -88,7 +88,7 @@ def _hint(path: Path) -> str:
     return f", but there is {part.name}, left from an unfinished run" if part.exists() else ""
 
 
-def indexed_chunks(source: Source) -> list[Entry]:
+def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
     """The chunks by the index of a finished file. Raises DamagedChunk where there is none or it is damaged."""
     tail = source.read(max(source.size - FOOTER_BYTES - len(MAGIC), 0), FOOTER_BYTES + len(MAGIC))
     if len(tail) < FOOTER_BYTES + len(MAGIC) or not tail.endswith(MAGIC):
@@ -99,13 +99,13 @@ def indexed_chunks(source: Source) -> list[Entry]:
     if source.size - start > start + LARGEST_SUMMARY_BYTES:
         raise DamagedChunk("its end is damaged")
     indexes = parse_summary(source.read(start, source.size - len(MAGIC) - start))
-    _require_seamless(source, indexes, start - DATA_END_BYTES)
-    return [Entry(index.chunk_start_offset, index.chunk_length, index) for index in indexes]
+    _require_contiguous(source, indexes, start - DATA_END_BYTES)
+    return [ChunkEntry(index.chunk_start_offset, index.chunk_length, index) for index in indexes]
 
 
-def _require_seamless(source: Source, indexes: list[ChunkIndex], end: int) -> None:
+def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int) -> None:
     """Raise DamagedChunk unless the chunks, each with its message indexes, are all that stands in the data section."""
-    _, position = _record_at(source, len(MAGIC))
+    _, position = _parse_record(source, len(MAGIC))
     position += len(MAGIC)
     for index in indexes:
         if index.chunk_start_offset != position or index.chunk_length < CHUNK_HEAD.size:
@@ -115,12 +115,12 @@ def _require_seamless(source: Source, indexes: list[ChunkIndex], end: int) -> No
         raise DamagedChunk("its chunk index does not go with its chunks")
 
 
-def scanned_chunks(source: Source, position: int = len(MAGIC)) -> tuple[list[Entry], list[str]]:
+def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
     """The chunks found by going through the file from a record at `position` on, and what is wrong with it."""
-    entries: list[Entry] = []
+    entries: list[ChunkEntry] = []
     problems: list[str] = []
     while position < source.size:
-        entry, length = _record_at(source, position)
+        entry, length = _parse_record(source, position)
         if entry:
             entries.append(entry)
         if length:
@@ -137,7 +137,7 @@ def scanned_chunks(source: Source, position: int = len(MAGIC)) -> tuple[list[Ent
     return entries, problems
 
 
-def _record_at(source: Source, position: int) -> tuple[Entry | None, int]:
+def _parse_record(source: McapSource, position: int) -> tuple[ChunkEntry | None, int]:
     """The chunk at `position`, and the length of the record there: 0 if it is none that a recording has."""
     head = source.read(position, CHUNK_HEAD.size)
     if len(head) < INDEX_HEAD_BYTES:
@@ -151,14 +151,14 @@ def _record_at(source: Source, position: int) -> tuple[Entry | None, int]:
             parse_chunk_head(head)
         except DamagedChunk:
             return None, 0
-        return Entry(position, record_length, None), record_length
+        return ChunkEntry(position, record_length, None), record_length
     entries_length = int.from_bytes(head[PREFIX.size + 2 : INDEX_HEAD_BYTES], "little")
     is_index = opcode == Opcode.MESSAGE_INDEX and length == 6 + entries_length
     is_header = opcode == Opcode.HEADER and position == len(MAGIC)
     return None, record_length if is_index or is_header else 0
 
 
-def _next_chunk(source: Source, position: int) -> int | None:
+def _next_chunk(source: McapSource, position: int) -> int | None:
     """Offset of the next whole chunk record that begins at or behind `position`."""
     search = position + CHUNK_MARK_OFFSET
     while search < source.size:
@@ -166,7 +166,7 @@ def _next_chunk(source: Source, position: int) -> int | None:
         place = block.find(CHUNK_MARK)
         while place >= 0:
             candidate = search + place - CHUNK_MARK_OFFSET
-            if _record_at(source, candidate)[0]:
+            if _parse_record(source, candidate)[0]:
                 return candidate
             place = block.find(CHUNK_MARK, place + 1)
         if len(block) < SEARCH_BYTES:

@@ -141,7 +141,7 @@ def pack_end(
     return pack_records([DataEnd(data_crc)]) + summary + pack_records([footer]) + MAGIC
 
 
-def indexed_span(record: bytes) -> tuple[int, int, int]:
+def index_record_span(record: bytes) -> tuple[int, int, int]:
     """Of a packed chunk index record: its first and last log time, and where in the file its chunk begins."""
     _, _, start, end, offset = CHUNK_INDEX_HEAD.unpack_from(record)
     return start, end, offset

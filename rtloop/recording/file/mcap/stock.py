@@ -14,7 +14,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from rtloop.recording.file.mcap.chunks import Source
+from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.mcap.container import DamagedChunk
 
 LARGEST_BYTES = 32 << 20
@@ -28,7 +28,7 @@ UNREADABLE = (McapError, struct.error, ValueError, KeyError, RuntimeError, EOFEr
 Item = tuple[Schema | None, Channel, Message]
 
 
-def read_messages(source: Source) -> Iterator[Item]:
+def read_messages(source: McapSource) -> Iterator[Item]:
     """Yield all messages in the order of the file. Raises DamagedChunk where the rest cannot be read."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -45,7 +45,7 @@ def read_messages(source: Source) -> Iterator[Item]:
         raise DamagedChunk(f"it is damaged ({type(error).__name__})") from None
 
 
-def library(source: Source) -> str:
+def library(source: McapSource) -> str:
     """The name of the library that wrote the file, by the file's header; empty where that cannot be read."""
     try:
         header = next(_records(source), None)
@@ -69,7 +69,7 @@ def described(counts: Counter[tuple[str, str]]) -> str:
     return ", ".join(shown) + (", …" if len(counts) > MOST_SHOWN else "") or "no message"
 
 
-def _records(source: Source) -> Iterator[McapRecord]:
+def _records(source: McapSource) -> Iterator[McapRecord]:
     """Yield the records of the data section, those of a chunk in its place. Raises DamagedChunk, UNREADABLE."""
     reader = StreamReader(_Stream(source), emit_chunks=True, validate_crcs=True)  # type: ignore[arg-type]
     for record in reader.records:
@@ -106,7 +106,7 @@ def _unpacked(chunk: Chunk) -> Chunk:
 class _Stream:
     """A file for the stock reader, from its beginning on."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: McapSource) -> None:
         self._source, self._begin = source, 0
         self._window = io.BytesIO()
 

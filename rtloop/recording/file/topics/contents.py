@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from rtloop.hil.trusted import open_found
-from rtloop.recording.file.mcap.chunks import Entry, Source, scanned_chunks
+from rtloop.hil.trusted import open_without_link
+from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, scan_chunks
 from rtloop.recording.file.mcap.container import (
     MESSAGE_HEAD,
     PREFIX,
@@ -30,7 +30,7 @@ class Message(NamedTuple):
     payload: bytes
 
 
-def may_tell(entry: Entry, channel: int) -> bool:
+def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
     """Whether a chunk may hold messages of one of the slow topics: what is left out stands in chunks of its own."""
     if entry.index is None or channel == format.OVERVIEW:
         return may_hold(entry, channel)
@@ -39,14 +39,14 @@ def may_tell(entry: Entry, channel: int) -> bool:
     )
 
 
-def may_hold(entry: Entry, channel: int) -> bool:
+def may_hold(entry: ChunkEntry, channel: int) -> bool:
     """Whether a chunk may hold messages of a channel: every chunk but those of ticks is indexed by channel."""
     if entry.index is None:
         return True
     return channel in (entry.index.message_index_offsets or {format.TICKS})
 
 
-def overlaps(entry: Entry, start_ns: float, end_ns: float) -> bool:
+def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
     """Whether a chunk may hold messages between two log times, to a microsecond: a double has no room for more."""
     index, margin_ns = entry.index, 1e3
     return index is None or not (
@@ -54,7 +54,7 @@ def overlaps(entry: Entry, start_ns: float, end_ns: float) -> bool:
     )
 
 
-def read_chunk(source: Source, entry: Entry) -> bytes:
+def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
     """The chunk record. Raises DamagedChunk where it contradicts the index, which has a checksum."""
     record = source.read(entry.offset, entry.length)
     if entry.index:
@@ -65,22 +65,22 @@ def read_chunk(source: Source, entry: Entry) -> bytes:
     return record
 
 
-def contents_behind(path: Path, position: int) -> Iterator[bytes]:
+def chunk_contents_from(path: Path, position: int) -> Iterator[bytes]:
     """What the whole chunks hold from a record at `position` of a file on. Raises RecordingError."""
-    with closing(Source(path, open_found)) as source:
-        for entry in scanned_chunks(source, position)[0]:
+    with closing(McapSource(path, open_without_link)) as source:
+        for entry in scan_chunks(source, position)[0]:
             with suppress(DamagedChunk):
                 yield unpack_chunk(read_chunk(source, entry))
 
 
-def is_ticks(content: bytes) -> bool:
+def holds_ticks(content: bytes) -> bool:
     """Whether a chunk holds ticks."""
     return content[:1] == bytes([Opcode.MESSAGE]) and _channel(content[PREFIX.size :]) == format.TICKS
 
 
-def tells_of_ticks(content: bytes) -> bool:
+def accounts_for_ticks(content: bytes) -> bool:
     """Whether a chunk holds ticks, or what is kept of them where they are left out."""
-    return is_ticks(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
+    return holds_ticks(content) or any(message.channel == format.OVERVIEW for message in split_messages(content))
 
 
 def split_messages(content: bytes) -> list[Message]:

@@ -19,19 +19,19 @@ from rtloop.signals import Failure, Mode, trip_causes
 Event = dict[str, Any]
 GAP, FINISHED, ROTATED, RECOVERED, CUT = "gap", "finished", "rotated", "recovered", "cut"
 RECORDING_FAILED, RECORDING_RESUMED = "recording_failed", "recording_resumed"
-KEPT, REMOVED = "kept", "removed"
+RETENTION_BEGUN, FILE_REMOVED = "kept", "removed"
 """Kinds that the recorder itself writes; `who` is RECORDER."""
 RECORDER = "recorder"
 COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
 """Kinds that somebody asked for."""
 OPERATOR = Origin.OPERATOR.name.lower()
 """Who asks without a name."""
-TAKEN = (*(origin.name.lower() for origin in Origin), RECORDER)
+RESERVED_NAMES = (*(origin.name.lower() for origin in Origin), RECORDER)
 MAX_NAME = 40
 """Characters of an operator's name."""
-BETWEEN = " .-_@+'"
+NAME_PUNCTUATION = " .-_@+'"
 """What may stand in one beside letters and digits: it goes through terminals, logs, pages and addresses."""
-UNITS = {
+CAUSE_UNITS = {
     **dict.fromkeys(("position", "tracking"), " µm"),
     **dict.fromkeys(("non_finite", "sensor_range", "enable"), " V"),
     **dict.fromkeys(("stale", "late"), " µs"),
@@ -42,7 +42,7 @@ FINAL = (FINISHED, ROTATED, RECOVERED, CUT)
 """One of these ends a file; its `what` holds the totals."""
 
 
-def event_of(
+def event_from_message(
     message: np.void, axes: Sequence[str], time_ns: int, laws: Sequence[str] = (), name: str | None = None
 ) -> Event:
     """The event of one record of MESSAGE; `time_ns` since the start of the run, `laws` the names of those it knows.
@@ -53,7 +53,7 @@ def event_of(
     kind, axis = int(message["kind"]), int(message["axis"])
     meaning: dict[str, Any] = {}
     if kind == Kind.SET_MODE:
-        meaning = {"mode": _name(Mode, values[0])}
+        meaning = {"mode": _member_name(Mode, values[0])}
     elif kind == Kind.TRIPPED:
         meaning = {"causes": trip_causes(values[0]), "reason": trip_reason(message, axes, laws)}
     elif kind == Kind.PERIODS_MISSED:
@@ -63,8 +63,8 @@ def event_of(
     return {
         "tick": int(message["tick"]),
         "time_ns": time_ns,
-        "kind": _name(Kind, kind),
-        "who": name or _name(Origin, int(message["origin"])),
+        "kind": _member_name(Kind, kind),
+        "who": name or _member_name(Origin, int(message["origin"])),
         "axis": axes[axis] if 0 <= axis < len(axes) else None,
         "what": {**meaning, "values": [json_value(value) for value in values], "identity": int(message["identity"])},
     }
@@ -78,53 +78,55 @@ def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> s
         return None
     if causes == ["law"]:
         law_name = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
-        return f"{axes[axis]}: law {law_name!r} {_failure(int(limit), value)}"
-    unit = UNITS.get(causes[0], "")
+        return f"{axes[axis]}: law {law_name!r} {_failure_text(int(limit), value)}"
+    unit = CAUSE_UNITS.get(causes[0], "")
     limit_text = "" if causes == ["non_finite"] else f", its limit {limit:g}{unit}"
     return f"{axes[axis]}: {causes[0]} {value:.6g}{unit}{limit_text}"
 
 
-def _failure(code: int, value: float) -> str:
+def _failure_text(code: int, value: float) -> str:
     """What a law did, by its `Failure`."""
-    slot, _, function = _name(Failure, code - code % 2).partition("_")
+    slot, _, function = _member_name(Failure, code - code % 2).partition("_")
     return f"raised in {function} of the {slot}" if code % 2 else f"returned {value:g} from {function} of the {slot}"
 
 
-def message_of(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
+def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
     """The record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder's own."""
     if event["who"] == RECORDER:
         return None
     record = np.zeros(1, MESSAGE)
     record["tick"], record["identity"] = event["tick"], event["what"]["identity"]
-    record["kind"], record["origin"] = _number(Kind, event["kind"]), _origin(event["who"])
+    record["kind"], record["origin"] = _member_value(Kind, event["kind"]), _origin_value(event["who"])
     record["axis"] = ALL_AXES if event["axis"] is None else list(axes).index(event["axis"])
     record["values"][0] = [float(value) for value in event["what"]["values"]]
     return record
 
 
-def name_fault(name: str) -> str | None:
+def name_problem(name: str) -> str | None:
     """What is wrong with the name of an operator, and what is allowed; None for one that may stand in a recording."""
-    has_valid_characters = all(character in BETWEEN or category(character)[0] in "LMN" for character in name)
+    has_valid_characters = all(character in NAME_PUNCTUATION or category(character)[0] in "LMN" for character in name)
     if not 0 < len(name) <= MAX_NAME or not has_valid_characters or not name[0].isalnum() or name.endswith(" "):
         displayed = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
-        allowed = f"1 to {MAX_NAME} letters, digits, blanks and {BETWEEN.strip()}, a letter or digit first"
+        allowed = f"1 to {MAX_NAME} letters, digits, blanks and {NAME_PUNCTUATION.strip()}, a letter or digit first"
         return f"{displayed}; {allowed}, are allowed"
-    if name != OPERATOR and (known(Origin, name) or name.lower() == RECORDER):
-        return f"{name!r}; others have this name: one that is no number and none of {', '.join(TAKEN)} is allowed"
+    if name != OPERATOR and (is_member_name(Origin, name) or name.lower() == RECORDER):
+        return (
+            f"{name!r}; others have this name: one that is no number and none of {', '.join(RESERVED_NAMES)} is allowed"
+        )
     return None
 
 
-def known(kinds: Any, name: str) -> bool:
+def is_member_name(kinds: Any, name: str) -> bool:
     """Whether an event may call a member of `kinds` so: by its name, or by its number where this version has none."""
     return name.upper() in kinds.__members__ or (name.isascii() and name.isdigit() and len(name) < 10)
 
 
-def recorder_event(kind: str, tick: int, time_ns: int, what: dict[str, Any]) -> Event:
+def recorder_event(kind: str, tick: int, time_ns: int, details: dict[str, Any]) -> Event:
     """An event of the recorder's own."""
-    return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": what}
+    return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": details}
 
 
-def _name(kinds: Any, value: float) -> str:
+def _member_name(kinds: Any, value: float) -> str:
     """The member's name in lower case, or the number where this version knows none."""
     try:
         return str(kinds(int(value)).name).lower()
@@ -132,12 +134,12 @@ def _name(kinds: Any, value: float) -> str:
         return str(value)
 
 
-def _origin(who: str) -> int:
+def _origin_value(who: str) -> int:
     """Of who is no origin by that word or number, an operator gave a name."""
-    return _number(Origin, who) if known(Origin, who) else int(Origin.OPERATOR)
+    return _member_value(Origin, who) if is_member_name(Origin, who) else int(Origin.OPERATOR)
 
 
-def _number(kinds: Any, name: str) -> int:
+def _member_value(kinds: Any, name: str) -> int:
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 
 

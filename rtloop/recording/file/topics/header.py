@@ -17,17 +17,17 @@ from mcap.records import Channel
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.mcap.container import DamagedChunk, pack_records, split_records
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.checked import Malformed, header_from, require_columns
+from rtloop.recording.file.topics.checked import MalformedText, parse_header, require_columns
 from rtloop.recording.file.topics.contents import split_messages
 
-EVERY = [(one.id, one.topic) for one in format.channels()]
-OWN_CHANNELS = (EVERY, [*EVERY, (format.OVERVIEW, format.OVERVIEW_TOPIC)])
+EVERY_TICK_CHANNELS = [(one.id, one.topic) for one in format.channels()]
+OWN_CHANNELS = (EVERY_TICK_CHANNELS, [*EVERY_TICK_CHANNELS, (format.OVERVIEW, format.OVERVIEW_TOPIC)])
 """Of a recording of every tick, and of one around events."""
-OF_A_RUN = ("created_unix_ns", "name", "columns")
+RUN_KEYS = ("created_unix_ns", "name", "columns")
 """What is the same in the headers of all files of a run."""
 
 
-def own_header(content: bytes) -> bytes:
+def own_header_payload(content: bytes) -> bytes:
     """The text of the header, in the first chunk of a file that rtloop wrote. Raises DamagedChunk for any other."""
     messages = split_messages(content)
     if [message.channel for message in messages] != [format.CONFIGURATION]:
@@ -51,27 +51,27 @@ def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dic
     Raises RecordingError where it is one of a newer version, or malformed.
     """
     try:
-        header = header_from(payload)
+        header = parse_header(payload)
         digest = hashlib.sha256(header["configuration"].encode()).hexdigest()
         if header.get("configuration_sha256") != digest:
-            raise Malformed("the recorded configuration does not match its SHA-256")
+            raise MalformedText("the recorded configuration does not match its SHA-256")
         expected_records = pack_records([*format.schemas(header["columns"]), *format.channels()])
         if content is not None and not content.startswith(expected_records):
-            raise Malformed("the schema of the ticks does not match the recorded columns")
+            raise MalformedText("the schema of the ticks does not match the recorded columns")
         require_columns(header)
-    except Malformed as reason:
+    except MalformedText as reason:
         raise RecordingError(f"{path}: header of the recording: {reason}") from None
     return header
 
 
-def absent(numbers: Iterable[int]) -> list[str]:
+def missing_part_messages(numbers: Iterable[int]) -> list[str]:
     """What is missing between, or in front of, the parts of a rotated run that are there; one alone is a whole one."""
     present = set(numbers)
     if len(present) == 1:
         return []
-    return [absent_part(number) for number in range(1, max(present)) if number not in present]
+    return [missing_part_message(number) for number in range(1, max(present)) if number not in present]
 
 
-def absent_part(number: int) -> str:
+def missing_part_message(number: int) -> str:
     """The sentence for one part."""
     return f"part {number} of the run is missing"

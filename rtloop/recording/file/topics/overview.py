@@ -20,9 +20,9 @@ from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.ticks import LARGEST
 from rtloop.signals import DEADLINE, TICK
 
-LEAST, MOST, MEAN = range(3)
-PARTS = ("min", "max", "mean")
-MAX_COLUMNS = 2047 // len(PARTS)
+MINIMUM, MAXIMUM, MEAN = range(3)
+STATISTICS = ("min", "max", "mean")
+MAX_COLUMNS = 2047 // len(STATISTICS)
 """Beyond that a field's tag has three bytes."""
 Intervals = np.ndarray[Any, Any]
 """Shape (n, columns, 3)."""
@@ -30,9 +30,9 @@ Range = tuple[int, int]
 """First tick, how many."""
 
 
-def declared(columns: Sequence[str]) -> list[McapRecord]:
+def overview_records(columns: Sequence[str]) -> list[McapRecord]:
     """The schema and channel records of the topic."""
-    data = format.doubles_schema("Overview", _names(columns))
+    data = format.doubles_schema("Overview", _field_names(columns))
     return [
         Schema(id=format.OVERVIEW_SCHEMA, name="rtloop.Overview", encoding="protobuf", data=data),
         Channel(
@@ -92,49 +92,49 @@ class OverviewLayout:
     """The messages of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        self._columns, names = len(columns), _names(columns)
+        self._columns, names = len(columns), _field_names(columns)
         self._dtype = np.dtype(format.doubles(names))
         self._names = names
-        self._blank = np.zeros(1, self._dtype)
-        format.fill_tags(self._blank, names)
+        self._template = np.zeros(1, self._dtype)
+        format.fill_tags(self._template, names)
         is_fixed = np.ones(self._dtype.itemsize, bool)
         for name in names:
             _, start, *_ = (self._dtype.fields or {})[name]  # pyright: ignore[reportArgumentType]
             is_fixed[start : start + 8] = False
         self._fixed = np.flatnonzero(is_fixed)
-        self._tags = self._blank.view(np.uint8)[self._fixed]
+        self._tags = self._template.view(np.uint8)[self._fixed]
 
-    def messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
+    def make_messages(self, intervals: Intervals, start_unix_ns: int) -> list[Message]:
         """A message an interval, at the time of its first tick."""
-        records = np.repeat(self._blank, len(intervals))
+        records = np.repeat(self._template, len(intervals))
         for index, name in enumerate(self._names):
-            records[name] = intervals[:, index // len(PARTS), index % len(PARTS)]
-        times = intervals[:, DEADLINE, LEAST].astype(np.int64) + start_unix_ns
+            records[name] = intervals[:, index // len(STATISTICS), index % len(STATISTICS)]
+        times = intervals[:, DEADLINE, MINIMUM].astype(np.int64) + start_unix_ns
         return [
             Message(format.OVERVIEW, int(time), record.tobytes()) for time, record in zip(times, records, strict=True)
         ]
 
-    def require(self, payload: bytes) -> None:
+    def require_overview(self, payload: bytes) -> None:
         """Raise ValueError where a payload is no overview of these columns."""
         if len(payload) != self._dtype.itemsize:
             raise ValueError("an overview has not the length of its fields")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
             raise ValueError("an overview has other fields than the columns")
 
-    def intervals(self, payloads: Sequence[bytes]) -> Intervals:
+    def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
         """What messages say that `require` lets pass."""
         records = np.frombuffer(b"".join(payloads), self._dtype)
-        intervals = np.empty((len(records), self._columns, len(PARTS)))
+        intervals = np.empty((len(records), self._columns, len(STATISTICS)))
         for index, name in enumerate(self._names):
-            intervals[:, index // len(PARTS), index % len(PARTS)] = records[name]
+            intervals[:, index // len(STATISTICS), index % len(STATISTICS)] = records[name]
         return intervals
 
 
-def plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
+def are_plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
     """Which intervals (n, columns, 3) are about ticks behind those of all before them."""
     is_plausible = np.ones(len(intervals), bool)
     for column in (TICK, DEADLINE):
-        minimum, maximum = intervals[:, column, LEAST], intervals[:, column, MOST]
+        minimum, maximum = intervals[:, column, MINIMUM], intervals[:, column, MAXIMUM]
         is_plausible &= (minimum >= 0) & (minimum <= maximum) & (maximum <= LARGEST) & (minimum == np.floor(minimum))
         is_plausible &= maximum == np.floor(maximum)
         previous_maximum = np.fmax.accumulate(np.concatenate([[-1.0], maximum[:-1]]))
@@ -142,17 +142,17 @@ def plausible(intervals: Intervals) -> np.ndarray[Any, Any]:
     return is_plausible
 
 
-def ranges(intervals: Intervals) -> list[Range]:
+def tick_ranges(intervals: Intervals) -> list[Range]:
     """The ticks that intervals are about, those that follow each other as one."""
     if not len(intervals):
         return []
-    first, end = intervals[:, TICK, LEAST].astype(np.int64), intervals[:, TICK, MOST].astype(np.int64) + 1
+    first, end = intervals[:, TICK, MINIMUM].astype(np.int64), intervals[:, TICK, MAXIMUM].astype(np.int64) + 1
     breaks = np.flatnonzero(first[1:] != end[:-1]) + 1
     begins, ends = np.concatenate([[0], breaks]), np.concatenate([breaks, [len(first)]]) - 1
     return [(int(first[begin]), int(end[last] - first[begin])) for begin, last in zip(begins, ends, strict=True)]
 
 
-def uncovered(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
+def uncovered_ranges(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
     """What no range of `covered`, in the order of their ticks, has of the ticks from `first` to before `end`."""
     gaps = []
     for begin, count in covered:
@@ -166,5 +166,5 @@ def uncovered(first: int, end: int, covered: Iterable[Range]) -> list[Range]:
     return [*gaps, (first, end - first)] if first < end else gaps
 
 
-def _names(columns: Sequence[str]) -> list[str]:
-    return [f"{column}_{part}" for column in columns for part in PARTS]
+def _field_names(columns: Sequence[str]) -> list[str]:
+    return [f"{column}_{part}" for column in columns for part in STATISTICS]

@@ -16,7 +16,7 @@ from rtloop.recording.file.topics import format
 from rtloop.signals import Mode
 
 LARGEST, LARGEST_NS = float(1 << 53), 1 << 62
-WHOLE = {
+INTEGER_COLUMNS = {
     "tick": (0, LARGEST),
     "deadline_ns": (0, LARGEST),
     "periods_missed": (0, LARGEST),
@@ -35,7 +35,7 @@ class Ticks(NamedTuple):
     first: int
     last: int
 
-    def since(self, tick: int) -> Ticks | None:
+    def from_tick(self, tick: int) -> Ticks | None:
         """Those from `tick` on; None where all come before it."""
         if self.last < tick:
             return None
@@ -48,37 +48,37 @@ class TickLayout:
 
     def __init__(self, columns: Sequence[str]) -> None:
         self.columns = tuple(columns)
-        self._blank = format.blank_ticks(self.columns, 1)
+        self._template = format.blank_ticks(self.columns, 1)
         varying = ("_log_time", "_publish_time", *self.columns)
-        is_fixed = np.ones(self._blank.itemsize, bool)
+        is_fixed = np.ones(self._template.itemsize, bool)
         for name in varying:
-            _, start, *_ = (self._blank.dtype.fields or {})[name]
+            _, start, *_ = (self._template.dtype.fields or {})[name]
             is_fixed[start : start + 8] = False
         self._fixed = np.flatnonzero(is_fixed)
-        self._fixed_bytes = self._blank.view(np.uint8)[self._fixed]
+        self._fixed_bytes = self._template.view(np.uint8)[self._fixed]
 
-    def ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
+    def parse_ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
         """The columns `names` of a chunk of ticks. Raises DamagedChunk."""
-        dtype = self._blank.dtype
+        dtype = self._template.dtype
         if len(content) % dtype.itemsize:
             raise DamagedChunk("its length is not that of whole ticks")
         fixed = np.frombuffer(content, np.uint8).reshape(-1, dtype.itemsize)[:, self._fixed]
         if not np.array_equal(fixed, np.broadcast_to(self._fixed_bytes, fixed.shape)):
             raise DamagedChunk("it holds more than ticks")
         records: np.ndarray[Any, Any] = np.frombuffer(content, dtype)
-        _require_whole(records)
+        _require_integers(records)
         _require_times(records)
         tick = records["tick"]
         return Ticks(format.tick_rows(records, names), tick, int(tick[0]), int(tick[-1]))
 
     def start_ns(self, content: bytes) -> int:
         """Log time of the start of the run, in ns since the UNIX epoch, by a chunk of ticks. Raises DamagedChunk."""
-        ticks = self.ticks(content, ["deadline_ns"])
-        records: np.ndarray[Any, Any] = np.frombuffer(content, self._blank.dtype, count=1)
+        ticks = self.parse_ticks(content, ["deadline_ns"])
+        records: np.ndarray[Any, Any] = np.frombuffer(content, self._template.dtype, count=1)
         return int(records["_log_time"][0]) - int(ticks.rows[0, 0])
 
 
-def missing(ticks: np.ndarray[Any, Any], expected: int) -> list[tuple[int, int]]:
+def missing_ranges(ticks: np.ndarray[Any, Any], expected: int) -> list[tuple[int, int]]:
     """(first tick, how many) of all that is missing in `ticks` (n,), n > 0, which are to begin at `expected`."""
     if ticks[0] == expected and ticks[-1] == expected + len(ticks) - 1:  # the usual case
         return []
@@ -89,15 +89,17 @@ def missing(ticks: np.ndarray[Any, Any], expected: int) -> list[tuple[int, int]]
     ]
 
 
-def _require_whole(records: np.ndarray[Any, Any]) -> None:
-    for name in WHOLE.keys() & set(records.dtype.names or ()):  # measured signals that were imported have few of them
-        if fault := whole_fault(name, records[name]):
+def _require_integers(records: np.ndarray[Any, Any]) -> None:
+    for name in INTEGER_COLUMNS.keys() & set(
+        records.dtype.names or ()
+    ):  # measured signals that were imported have few of them
+        if fault := integer_problem(name, records[name]):
             raise DamagedChunk(fault)
 
 
-def whole_fault(name: str, values: np.ndarray[Any, Any]) -> str | None:
+def integer_problem(name: str, values: np.ndarray[Any, Any]) -> str | None:
     """What is wrong with the values of a column of whole numbers; None where nothing is."""
-    low, high = WHOLE[name]
+    low, high = INTEGER_COLUMNS[name]
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
     if is_valid.all():
         return None
