@@ -1,4 +1,4 @@
-"""Files are opened by `rtloop.hil.is_trusted`: every other open in the product is found, and has its reason here.
+"""Files are opened by `rtloop.hil.trusted`: every other open in the product is found, and has its reason here.
 
 A descriptor becomes a file by `os.fdopen`, which takes nothing else.
 """

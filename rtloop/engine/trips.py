@@ -1,6 +1,6 @@
 """The event of a trip: which axis, by which value beyond which limit. Not judged here: the law has, a tick is told of.
 
-The conditions are those of `rtloop.law.safety` and `rtloop.law.lasting_causes`, on the same inputs and the same state.
+The conditions are those of `rtloop.law.safety` and `rtloop.law.watch`, on the same inputs and the same state.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where a service keeps its socket and its shared block, which holds the last drive, so that others find them.
 
-What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.hil.is_trusted`).
+What lies there is believed, and killed and driven by: nobody else may have put it there (`rtloop.hil.trusted`).
 """
 
 from __future__ import annotations

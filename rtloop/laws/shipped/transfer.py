@@ -1,6 +1,6 @@
 """C(z), any linear controller from error to command, in state space: x⁺ = A x + b e, v = c x + d e.
 
-From C(s) by `rtloop.linear.discretise_controller`, which is imported where a law is built and not where it runs.
+From C(s) by `rtloop.linear.discretise`, which is imported where a law is built and not where it runs.
 """
 
 from __future__ import annotations

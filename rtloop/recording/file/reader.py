@@ -56,7 +56,7 @@ class Reader:
     """An open recording. `tolerant`: what is damaged is left out and named in `problems` instead of raising.
 
     `left_out` are those of the problems for which something is missing from what is read. `opener` opens the file:
-    `open_user_file` of `rtloop.hil.is_trusted` for one that a user named, another for one found in a folder.
+    `open_user_file` of `rtloop.hil.trusted` for one that a user named, another for one found in a folder.
 
     Raises RecordingError, here and while reading.
     """

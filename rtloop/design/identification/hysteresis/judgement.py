@@ -42,9 +42,10 @@ class Judgement:
 
     `error_um` is held out, NaN where the memory is not known, `written_error_um` the same of the plays that are
     written, without drift and creep, and `early_error_um` is that of the other blocks, with a memory estimated for
-    these alone (`early_part`), NaN elsewhere; `residual_um` is what the model that is written leaves of the rest. `offset_um` is the last stretch's. `from_rest` says that the memory at the beginning was given; `known_from_s`
-    is when that of all plays that are written is known, None where never; `unsettled_um` how far the recording departs
-    from a loop that repeats itself where it is not; `drift_um` the drift over its duration.
+    these alone (`early_part`), NaN elsewhere; `residual_um` is what the model that is written leaves of the rest.
+    `offset_um` is the last stretch's. `from_rest` says that the memory at the beginning was given; `known_from_s`
+    is when that of all plays that are written is known, None where never; `unsettled_um` how far the recording
+    departs from a loop that repeats itself where it is not; `drift_um` the drift over its duration.
     """
 
     name: str

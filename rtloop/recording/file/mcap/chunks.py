@@ -29,7 +29,7 @@ from rtloop.recording.file.mcap.container import (
 SEARCH_BYTES = 1 << 20
 INDEX_HEAD_BYTES = PREFIX.size + 6
 Opener = Callable[[Path], int]
-"""`open_user_file`, `open_without_link` or `open_own` of `rtloop.hil.is_trusted`."""
+"""`open_user_file`, `open_without_link` or `open_own` of `rtloop.hil.trusted`."""
 LARGEST_SUMMARY_BYTES = 16 << 20
 """Beyond the size of what it sums up: a chunk takes more room than its index."""
 
