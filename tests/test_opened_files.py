@@ -26,7 +26,7 @@ LIBRARIES = {
     "shutil.copy", "shutil.copy2", "shutil.copyfile", "shutil.copytree", "click.File", "click.open_file",
 }  # fmt: skip
 """Functions that take a path, or an open file."""
-FILES = ("file", "opened", "part", "lines", "path_of(", "io.BytesIO(", "HeldFile")
+FILES = ("file", "opened", "stream", "part", "lines", "descriptor_path(", "io.BytesIO(", "HeldFile")
 """How the first argument of such a function begins where it is an open file."""
 VERBS = {"driver.open", "self._driver.open", "self.open", "loop.open", "self.loop.open", "self.model.open"}
 """Of a driver, and the open loop's frequency response: no files."""
@@ -103,7 +103,7 @@ def test_an_open_by_a_path_is_found(text: str):
 @pytest.mark.parametrize(
     "text",
     ["os.fdopen(open_named(path))", "np.load(file)", "driver.open()", "loop.open(hz)", "figure.savefig(file, dpi=110)",
-     "h5py.File(path_of(opened), 'r')", "read_text(path)", "load(config)"],
+     "h5py.File(descriptor_path(opened), 'r')", "read_text(path)", "load(config)"],
 )  # fmt: skip
 def test_an_open_file_is_none(text: str):
     assert list(opens(text)) == []

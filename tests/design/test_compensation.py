@@ -29,7 +29,7 @@ def models(draw) -> PlayModel:
 @settings(deadline=None)
 @given(models(), models(), st.lists(st.floats(-1, 1), min_size=1, max_size=40))
 def test_the_composition_is_the_operator_and_stays_within_its_bound(actuator, compensator, commands) -> None:
-    inverse, v = compensator.without_dead_band().inverse(), COMMAND_UM * np.array(commands)
+    inverse, v = compensator.remove_dead_band().inverse(), COMMAND_UM * np.array(commands)
     residual = residual_operator(actuator, inverse, COMMAND_UM)
     y = compensated_output(actuator, inverse, v)
     size = max(1.0, float(np.abs(y).max()))
@@ -42,7 +42,7 @@ def test_the_composition_is_the_operator_and_stays_within_its_bound(actuator, co
 @settings(deadline=None)
 @given(models(), models())
 def test_the_bound_is_reached(actuator, compensator) -> None:
-    inverse = compensator.without_dead_band().inverse()
+    inverse = compensator.remove_dead_band().inverse()
     residual = residual_operator(actuator, inverse, COMMAND_UM)
     for gain in (residual.gain, residual.best_gain, 1.0):
         v = residual.worst_commands_um(gain)

@@ -184,7 +184,7 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     assert not found.meets_specification
     assert "settling (5 %) with resonance +3 %" in answer(found)
     assert text.scenarios(found)[0][0] == f"worst of {found.scenarios.count} scenarios, linear"
-    assert as_dict(replace(found, examine=nothing_moved))["scenarios"]["rows"][0]["met"] is False
+    assert as_dict(replace(found, find_robustness=nothing_moved))["scenarios"]["rows"][0]["met"] is False
 
 
 def nothing_moved() -> Robustness:

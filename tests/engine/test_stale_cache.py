@@ -23,13 +23,13 @@ from rtloop.law.layout import FUNCTIONS
 from rtloop.law.memory import LawMemory, Layout
 
 layout = Layout(())
-law = LawMemory.at_rest(layout, np.zeros(0, FUNCTIONS), np.zeros(1, layout.coefficients))
+law = LawMemory.create_at_rest(layout, np.zeros(0, FUNCTIONS), np.zeros(1, layout.coefficients))
 set_mode(law.law, 1, False)
 hits = sum(set_mode.stats.cache_hits.values())
 print(json.dumps({"tap_index": int(law.axes["tap_index"][0]), "from_cache": hits == 1}))
 """
 """A change of mode, whose kernel calls another in `prefilter.py`."""
-EDIT = ("rtloop/law/prefilter.py", "state.tap_index = ANEW", "state.tap_index = -2")
+EDIT = ("rtloop/law/prefilter.py", "state.tap_index = REFILL", "state.tap_index = -2")
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ class Mutant(NamedTuple):
 
 MUTANTS = (
     Mutant("a ramp that does not wait between its steps", RAMP,
-           "def _wait(until_s: float) -> None:\n", "def _wait(until_s: float) -> None:\n    return\n",
+           "def _wait_until(until_s: float) -> None:\n", "def _wait_until(until_s: float) -> None:\n    return\n",
            STEEP, (PARKED, CARD, DEATHS)),
     Mutant("a ramp 2.1 times as steep", RAMP,
            "slew_v_per_s * period_s)", "2.1 * slew_v_per_s * period_s)", STEEP, (PARKED, CARD)),
@@ -48,8 +48,9 @@ MUTANTS = (
            '    def _end(self) -> None:\n        """Park first, if the loop died; then let the recorder finish."""\n',
            "    def _end(self) -> None:\n        time.sleep(0.85)\n", LATE, (PARKED, STUCK)),
     Mutant("a parking that steps the last 0.2 V", RAMP,
-           "now_v = np.clip(safe_v, now_v - step_v, now_v + step_v)",
-           "now_v = np.where(np.abs(safe_v - now_v) <= 0.2, safe_v, np.clip(safe_v, now_v - step_v, now_v + step_v))",
+           "current_v = np.clip(safe_v, current_v - step_v, current_v + step_v)",
+           "current_v = np.where(np.abs(safe_v - current_v) <= 0.2, safe_v, "
+           "np.clip(safe_v, current_v - step_v, current_v + step_v))",
            STEEP, (PARKED, DEATHS)),
     Mutant("a driver's close that writes 0 V at once in place of the ramp", RAMP,
            "    write = _WRITE(pointers.write)", "    return\n    write = _WRITE(pointers.write)", STEEP,

@@ -296,7 +296,7 @@ POLLS = 100
 class EndOfOrders:
     """Orders of a service that is gone."""
 
-    closed = True
+    is_closed = True
 
     def next(self) -> None:
         """No order."""
@@ -305,7 +305,7 @@ class EndOfOrders:
 class EmptyRings:
     """A session whose rings hold nothing; raises StillPolling once it was asked POLLS times."""
 
-    room, cursor, failure = 1, 0, None
+    free_rows, cursor, failure = 1, 0, None
 
     def __init__(self) -> None:
         self.polls = 0

@@ -239,7 +239,7 @@ def test_a_board_of_another_user_is_not_driven(kind: str):
             # the last from fs.protected_symlinks
             allowed = (f"user {ATTACKER}", "symbolic link", "a link, which is not followed", "Permission denied")
             assert any(reason in caught.value.message for reason in allowed), caught.value.message
-            assert caught.value.name in ("Untrusted", "DriverError", "OSError", "PermissionError")
+            assert caught.value.name in ("UntrustedPath", "DriverError", "OSError", "PermissionError")
     finally:
         path.unlink(missing_ok=True)
         real.unlink(missing_ok=True)

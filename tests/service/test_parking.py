@@ -55,12 +55,12 @@ def block():
 
 
 def test_a_block_knows_who_drives_and_that_he_died(block):
-    assert block.driven_by() is None
+    assert block.driver_pid() is None
     with a_loop(block) as loop:
-        assert block.driven_by() == loop.pid
+        assert block.driver_pid() == loop.pid
         loop.kill()
         loop.wait()
-        assert block.driven_by() is None
+        assert block.driver_pid() is None
 
 
 def test_a_loop_that_ends_by_itself_is_waited_for(block):

@@ -28,7 +28,7 @@ class Driven:
         assert word is Word.HEARTBEAT_NS
         return 7
 
-    def driven_by(self) -> int | None:
+    def driver_pid(self) -> int | None:
         return None if self.killed_s is not None and self._can_be_killed else 4711
 
     def kill_driver(self) -> None:

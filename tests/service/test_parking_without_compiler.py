@@ -88,7 +88,7 @@ def test_the_writes_are_the_same_with_machine_code_and_without(tmp_path: Path, m
             monkeypatch.setattr(machine_code, "load", lambda name: None)
         driver = ShmDriver(ShmOptions(file=str(tmp_path / name)), {"x": Wiring("adc0", "dac0")}, 4000.0)
         with allow_uncompiled():
-            assert (shm_write.address == shm_write._written[1]) == (name == "written")
+            assert (shm_write.address == shm_write._python_callback[1]) == (name == "written")
             pointers = driver.open()
         write = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)(pointers.write)
         for volts in np.random.default_rng(1).uniform(-11.0, 11.0, 200):

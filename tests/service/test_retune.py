@@ -163,7 +163,7 @@ def test_a_gain_that_is_too_uncertain_is_not_taken(
         made_for.append(subject.plant.dc_gain)
         raise NoDesign("none")
 
-    monkeypatch.setattr("rtloop.commands.adapt.retune.shaped", no_taps)
+    monkeypatch.setattr("rtloop.commands.adapt.retune.design_taps", no_taps)
     with pytest.raises(NoDesign):
         retune(Service(tmp_path, HZ, (0.95, std)), asked(), as_json=False)  # type: ignore[arg-type]
     assert made_for == [pytest.approx(gain)]

@@ -37,7 +37,7 @@ def shift_to_zero(run: LoopExcitation) -> LoopExcitation:
         run,
         input=run.input - run.input[0],
         position_um=run.position_um - run.position_um[0],
-        outside=run.external - run.external[:, :1],
+        external=run.external - run.external[:, :1],
     )
 
 
