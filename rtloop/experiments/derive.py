@@ -34,14 +34,14 @@ def derived(
     Raises ConfigError.
     """
     raw = tomllib.loads(base.text)
-    first, timeline = run.timeline.segments[0], run.timeline
-    raw["loop"]["mode"] = first.mode
+    first_segment, timeline = run.timeline.segments[0], run.timeline
+    raw["loop"]["mode"] = first_segment.mode
     raw["schedule"] = timeline.schedule(axis)
-    for one in raw["axis"]:
-        one["reference"] = dict(timeline.references[0] if one["name"] == axis else hold(0.0))
+    for axis_table in raw["axis"]:
+        axis_table["reference"] = dict(timeline.references[0] if axis_table["name"] == axis else hold(0.0))
     if run.plant:
         _change_plant(raw["driver"], axis, run.plant)
-    about = {
+    metadata = {
         "name": experiment,
         "run": run.label,
         "runs": runs,
@@ -54,7 +54,7 @@ def derived(
         "segments": timeline.segments,
     }
     name = "-".join(filter(None, [base.name, experiment, _file_name(run.label)]))
-    text = write_section("", raw, [MARK + json.dumps(about, allow_nan=False), f"derived from {base.name}"])
+    text = write_section("", raw, [MARK + json.dumps(metadata, allow_nan=False), f"derived from {base.name}"])
     return parse(text, name, base.folder, f"{base.name}, experiment {experiment}")
 
 
@@ -67,21 +67,21 @@ def keep_tables(run: Run, folder: Path) -> None:
                 np.save(file, samples)
     references = run.timeline.references
     references[:] = [
-        {**one, "file": str((folder / one["file"]).resolve())} if one.get("file") in run.tables else one
-        for one in references
+        {**reference, "file": str((folder / reference["file"]).resolve())} if reference.get("file") in run.tables else reference
+        for reference in references
     ]
 
 
 def about(configuration: str) -> dict[str, Any] | None:
     """What `derived` wrote about the run; None for any other configuration."""
-    first = configuration.partition("\n")[0].removeprefix("# ")
-    if not first.startswith(MARK):
+    first_line = configuration.partition("\n")[0].removeprefix("# ")
+    if not first_line.startswith(MARK):
         return None
     try:
-        found = json.loads(first.removeprefix(MARK))
+        metadata = json.loads(first_line.removeprefix(MARK))
     except ValueError:
         return None
-    return found if isinstance(found, dict) else None
+    return metadata if isinstance(metadata, dict) else None
 
 
 def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:

@@ -46,8 +46,8 @@ class LinearModel:
         self._path = axis.prefilter.path()
         self._controller: DiscreteController | Sampled | None = None
         self.loop: Loop | None = None
-        shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
-        if not shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
+        is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # promises nothing of one axis alone
+        if not is_shared and (law := controller_of(axis, 1 / rate_hz)) is not None:
             self._controller = controller = linear_part(law)
             loop = discrete_loop(controller, self.dynamics, model.delay_ticks, self._path)
             self.loop = loop if loop.is_stable else None
@@ -88,16 +88,16 @@ class LinearModel:
         if self.loop is None:
             return None
         a, b, c, d = self.loop.matrices
-        path = self.loop.reference
-        answer = simulated(a, b, c, d, path.error_input(reference))
-        if path.has_command_path:
-            answer += simulated(a, self.loop.injection.b, c, np.array([0.0, 1.0]), path.command_input(reference))
-        return answer[0], answer[1]
+        prefilter = self.loop.reference
+        signals = simulated(a, b, c, d, prefilter.error_input(reference))
+        if prefilter.has_command_path:
+            signals += simulated(a, self.loop.injection.b, c, np.array([0.0, 1.0]), prefilter.command_input(reference))
+        return signals[0], signals[1]
 
     def left_of(self, disturbance: Real) -> Real | None:
         """Position (n,) that the loop at rest leaves of a disturbance (n,) before the dynamics: d − T d, d = D Ω."""
-        moved = simulated(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
-        return None if self.loop is None else moved - simulated(*self.loop.matrices, moved)[0]
+        displacement = simulated(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
+        return None if self.loop is None else displacement - simulated(*self.loop.matrices, displacement)[0]
 
     @cached_property
     def step_peak(self) -> float | None:
@@ -122,8 +122,8 @@ class LinearModel:
     @cached_property
     def open_peak(self) -> float:
         """Largest |P| over D(0), at any frequency."""
-        near = [self.resonance_hz] if self.resonance_hz else []
-        hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), near])
+        resonances_hz = [self.resonance_hz] if self.resonance_hz else []
+        hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), resonances_hz])
         return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))
 
     @cached_property
@@ -134,8 +134,8 @@ class LinearModel:
 
     def stable_at(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the plant's resonance shifted."""
-        shifted = self.loop_with(shift_resonance(self.dynamics, shift_percent))
-        return shifted is not None and shifted.is_stable
+        loop = self.loop_with(shift_resonance(self.dynamics, shift_percent))
+        return loop is not None and loop.is_stable
 
     def loop_with(self, plant: Transfer) -> Loop | None:
         """The loop with another plant; None without a controller."""

@@ -42,29 +42,29 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     if signal.size * hz < LEAST_CYCLES * rate_hz or signal.size < 3:
         raise ValueError(f"{signal.size} samples at {rate_hz:g} Hz are {signal.size * hz / rate_hz:.2g} cycles of "
                          f"{hz:g} Hz; at least {LEAST_CYCLES} are needed")  # fmt: skip
-    gram, right = np.zeros((3, 3)), np.zeros(3)
+    gram, rhs = np.zeros((3, 3)), np.zeros(3)
     for start in range(0, signal.size, BLOCK):
-        part = signal[start : start + BLOCK]
-        columns = _columns(start, part.size, hz / rate_hz)
+        block = signal[start : start + BLOCK]
+        columns = _columns(start, block.size, hz / rate_hz)
         gram += columns.T @ columns
-        right += columns.T @ part
-    weights = np.linalg.solve(gram, right)
-    left = power = 0.0
+        rhs += columns.T @ block
+    weights = np.linalg.solve(gram, rhs)
+    residual_power = power = 0.0
     for start in range(0, signal.size, BLOCK):
-        part = signal[start : start + BLOCK]
-        columns = _columns(start, part.size, hz / rate_hz)
-        about_mean = part - weights[2]
-        power += float(about_mean @ about_mean)
-        rest = part - columns @ weights
-        left += float(rest @ rest)
-    return Tone(complex(weights[0], -weights[1]), max(0.0, 1 - left / power) if power else 0.0)
+        block = signal[start : start + BLOCK]
+        columns = _columns(start, block.size, hz / rate_hz)
+        deviation = block - weights[2]
+        power += float(deviation @ deviation)
+        residual = block - columns @ weights
+        residual_power += float(residual @ residual)
+    return Tone(complex(weights[0], -weights[1]), max(0.0, 1 - residual_power / power) if power else 0.0)
 
 
 def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
     """From input `u` to output `x`, each (samples,), at `hz`."""
-    source, answer = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
-    gain = answer.amplitude / source.amplitude if source.amplitude else complex(np.nan, np.nan)
-    return Response(gain, source.part * answer.part)
+    input_tone, output_tone = tone(u, hz, rate_hz), tone(x, hz, rate_hz)
+    gain = output_tone.amplitude / input_tone.amplitude if input_tone.amplitude else complex(np.nan, np.nan)
+    return Response(gain, input_tone.part * output_tone.part)
 
 
 def _columns(start: int, count: int, turns_per_sample: float) -> Real:

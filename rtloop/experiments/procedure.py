@@ -59,18 +59,18 @@ class Timeline:
 
     def depolarise(self, amplitude_v: float) -> None:
         """Wipe out the actuator's memory: whole cycles of a sine, each a little smaller than the one before."""
-        for left in range(DEPOLARISING_CYCLES, 0, -1):
-            wave = sine(amplitude_v * left / DEPOLARISING_CYCLES, DEPOLARISING_HZ)
-            self.add("depolarise", "raw", wave, 1 / DEPOLARISING_HZ)
+        for remaining in range(DEPOLARISING_CYCLES, 0, -1):
+            reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ)
+            self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
         """Entries of [[schedule]] for all but the first segment."""
         entries: list[dict[str, Any]] = []
-        for before, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
-            at = {"at_tick": segment.start_tick}
-            entries.append({**at, "axis": axis, "reference": dict(reference)})
-            if segment.mode != before.mode:
-                entries.append({**at, "mode": segment.mode})
+        for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
+            tick_entry = {"at_tick": segment.start_tick}
+            entries.append({**tick_entry, "axis": axis, "reference": dict(reference)})
+            if segment.mode != previous.mode:
+                entries.append({**tick_entry, "mode": segment.mode})
         return entries
 
 
@@ -129,8 +129,8 @@ class Experiment:
 
     def unsuitable(self, configuration: Configuration, axis: AxisOptions, rig: bool) -> str | None:
         """Why this experiment cannot be done with a configuration; None where it can."""
-        number = [one.name for one in configuration.axes].index(axis.name)
-        if self.needs_controller and configuration.axes[configuration.owners[number]].controller is None:
+        axis_index = [axis_options.name for axis_options in configuration.axes].index(axis.name)
+        if self.needs_controller and configuration.axes[configuration.owners[axis_index]].controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment closes the loop"
         if self.both_ways and axis.limits.lowest_v == 0.0:
             return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment drives to both sides"
@@ -144,21 +144,21 @@ class Experiment:
 
         Raises ConfigError for what somebody set and the limits forbid.
         """
-        made = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
+        changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults = []
-        for key, largest in self.largest.items():
-            value = made.get(key, getattr(options, key))
-            asked, most = float(np.max(np.abs(value))), largest(setting)
-            if asked <= most:
+        for key, limit_of_setting in self.largest.items():
+            value = changes.get(key, getattr(options, key))
+            magnitude, limit = float(np.max(np.abs(value))), limit_of_setting(setting)
+            if magnitude <= limit:
                 continue
             if key in options.model_fields_set:
                 unit = " µm" if key.endswith("_um") else ""
-                allowed = f"axis {setting.axis.name!r} allows {most:.4g}{unit} here, by its limits and interlocks"
-                faults.append(f"{self.name}.{key}: {asked:g}{unit}; {allowed}")
+                allowed = f"axis {setting.axis.name!r} allows {limit:.4g}{unit} here, by its limits and interlocks"
+                faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
-            step = 10.0 ** (math.floor(math.log10(most)) - 1)
-            scale = math.floor(most / step) * step / asked
-            made[key] = tuple(scale * one for one in value) if isinstance(value, tuple) else scale * value
+            step = 10.0 ** (math.floor(math.log10(limit)) - 1)
+            scale = math.floor(limit / step) * step / magnitude
+            changes[key] = tuple(scale * number for number in value) if isinstance(value, tuple) else scale * value
         if faults:
             raise ConfigError("parameters of the experiments", faults)
-        return options.model_copy(update=made)
+        return options.model_copy(update=changes)

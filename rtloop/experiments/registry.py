@@ -41,25 +41,25 @@ def chosen(names: Sequence[str]) -> list[Experiment]:
 
 def parameters(experiments: Sequence[Experiment], settings: Sequence[str]) -> dict[str, Options]:
     """Options of each experiment, with `EXPERIMENT.KEY=VALUE` applied, VALUE as in TOML. Raises ConfigError."""
-    given: dict[str, dict[str, object]] = {experiment.name: {} for experiment in experiments}
+    raw_options: dict[str, dict[str, object]] = {experiment.name: {} for experiment in experiments}
     faults = []
     for setting in settings:
         key, equals, value = setting.partition("=")
         name, dot, option = key.strip().rpartition(".")
-        if not equals or not dot or name not in given:
-            faults.append(f"--set {setting}: EXPERIMENT.KEY=VALUE is needed, with one of {', '.join(given)}")
+        if not equals or not dot or name not in raw_options:
+            faults.append(f"--set {setting}: EXPERIMENT.KEY=VALUE is needed, with one of {', '.join(raw_options)}")
             continue
         try:
-            given[name][option] = tomllib.loads(f"value = {value}")["value"]
+            raw_options[name][option] = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
             faults.append(f"--set {setting}: {value!r} is no value; a number, or numbers as in [1.0, 2.0], is needed")
-    found = {}
+    options = {}
     for experiment in experiments:
-        raw = given[experiment.name]
+        raw = raw_options[experiment.name]
         try:
-            found[experiment.name] = experiment.options.model_validate(raw)
+            options[experiment.name] = experiment.options.model_validate(raw)
         except ValidationError as error:
             faults += describe(error, experiment.name, raw, set(experiment.options.model_fields))
     if faults:
         raise ConfigError("parameters of the experiments", faults)
-    return found
+    return options

@@ -36,80 +36,80 @@ class Report(NamedTuple):
 
 def take(paths: Sequence[Path]) -> list[Taken]:
     """The runs that these files hold, in their order, rotated ones put together. Raises RecordingError."""
-    parts: dict[tuple[Any, ...], list[Path]] = {}
+    run_paths: dict[tuple[Any, ...], list[Path]] = {}
     for path in paths:
         header = load(path).header
-        parts.setdefault((header["created_unix_ns"], header.get("name")), []).append(path)
-    return [Taken(load(files)) for _, files in sorted(parts.items(), key=lambda item: item[0][0])]
+        run_paths.setdefault((header["created_unix_ns"], header.get("name")), []).append(path)
+    return [Taken(load(files)) for _, files in sorted(run_paths.items(), key=lambda item: item[0][0])]
 
 
 def report(takings: Sequence[Taken], say: Say = lambda _: None) -> Report:
     """Analyse what there is, in their order. Raises RecordingError where two recordings are of the same run."""
-    sections, drawn = [], {}
+    sections, pictures_by_name = [], {}
     _require_distinct(takings)
-    own = [taken for taken in takings if not taken.beside] or takings
-    others = [taken for taken in takings if taken not in own]
+    main_runs = [run for run in takings if not run.beside] or takings
+    comparison_runs = [run for run in takings if run not in main_runs]
     for name, experiment in EXPERIMENTS.items():
-        mine, other = ([taken for taken in some if taken.experiment == name] for some in (own, others))
-        if mine:
+        experiment_runs, other_runs = ([run for run in group if run.experiment == name] for group in (main_runs, comparison_runs))
+        if experiment_runs:
             say(f"{name}: analysing")
-            section, files = _section(experiment, mine, other)
+            section, files = _section(experiment, experiment_runs, other_runs)
             sections.append(section)
-            drawn[name] = files
-    headers = [taken.recording.header for taken in takings]
-    first = own[0].recording.header
+            pictures_by_name[name] = files
+    headers = [run.recording.header for run in takings]
+    first_header = main_runs[0].recording.header
     content = {
-        "name": _name(own[0]),
-        "beside": _name(others[0]) if others else None,
+        "name": _name(main_runs[0]),
+        "beside": _name(comparison_runs[0]) if comparison_runs else None,
         "created_unix_ns": min(header["created_unix_ns"] for header in headers),
-        "driver": first["driver"]["kind"],
-        "rate_hz": first["rate_hz"],
-        "paced": first["paced"],
-        "host": first["host"],
-        "realtime": first["realtime"] if first["paced"] else None,
-        "versions": first["versions"],
+        "driver": first_header["driver"]["kind"],
+        "rate_hz": first_header["rate_hz"],
+        "paced": first_header["paced"],
+        "host": first_header["host"],
+        "realtime": first_header["realtime"] if first_header["paced"] else None,
+        "versions": first_header["versions"],
         "experiments": sections,
     }
-    return Report(to_jsonable(content), drawn)
+    return Report(to_jsonable(content), pictures_by_name)
 
 
 def _section(
     experiment: Experiment, takings: Sequence[Taken], others: Sequence[Taken]
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """One experiment: verdicts and pictures, or the problem that prevents them."""
-    beside: Analysis | None = None
-    found: Analysis | None = None
+    comparison: Analysis | None = None
+    analysis: Analysis | None = None
     files: dict[str, bytes] = {}
     problem = None
     try:
-        found = _analysed(experiment, takings)
-        curves = found.curves
+        analysis = _analysed(experiment, takings)
+        curves = analysis.curves
         if others:
-            beside = _analysed(experiment, others)
-            curves = {**curves, "beside": {**beside.curves, "name": _name(others[0])}}
+            comparison = _analysed(experiment, others)
+            curves = {**curves, "beside": {**comparison.curves, "name": _name(others[0])}}
         files = pictures(experiment.draw, curves, experiment.size)
     except (UnsuitableData, ValueError) as fault:
         problem = str(fault)
-    second = {row.quantity: row.run for row in beside.rows} if beside else {}
+    comparison_values = {row.quantity: row.run for row in comparison.rows} if comparison else {}
     section = {
         "name": experiment.name,
         "title": experiment.title,
         "about": experiment.about,
         "parameters": takings[0].parameters,
-        "recordings": [path.name for taken in [*takings, *others] for path in taken.paths],
-        "periods_missed": sum(int(taken.recording["periods_missed"][1:].sum()) for taken in [*takings, *others]),
+        "recordings": [path.name for run in [*takings, *others] for path in run.paths],
+        "periods_missed": sum(int(run.recording["periods_missed"][1:].sum()) for run in [*takings, *others]),
         "problem": problem,
-        "rows": [{**row.as_dict(), "beside": second.get(row.quantity)} for row in found.rows] if found else [],
-        "tables": [_table(table) for table in found.tables] if found else [],
-        "notes": list(found.notes) if found else [],
+        "rows": [{**row.as_dict(), "beside": comparison_values.get(row.quantity)} for row in analysis.rows] if analysis else [],
+        "tables": [_table(table) for table in analysis.tables] if analysis else [],
+        "notes": list(analysis.notes) if analysis else [],
     }
     return section, files
 
 
 def _analysed(experiment: Experiment, takings: Sequence[Taken]) -> Analysis:
     """Raises UnsuitableData or ValueError for what cannot be judged."""
-    for taken in takings:
-        taken.require_whole()
+    for run in takings:
+        run.require_whole()
     if len(takings) < takings[0].runs:
         raise UnsuitableData(f"{len(takings)} of its {takings[0].runs} recordings are there; not analysed")
     return experiment.analyse(takings, experiment.options.model_validate(takings[0].parameters))
@@ -125,10 +125,10 @@ def _table(table: Table) -> dict[str, Any]:
 
 
 def _require_distinct(takings: Sequence[Taken]) -> None:
-    seen: dict[tuple[str, str, bool], Taken] = {}
-    for taken in takings:
-        key = taken.experiment, taken.label, taken.beside
-        if key in seen:
-            raise RecordingError(f"{taken.paths[0]}: {taken.experiment} {taken.label}".rstrip() + " is in "
-                                 f"{seen[key].paths[0]} as well; one of them is needed")  # fmt: skip
-        seen[key] = taken
+    run_by_key: dict[tuple[str, str, bool], Taken] = {}
+    for run in takings:
+        key = run.experiment, run.label, run.beside
+        if key in run_by_key:
+            raise RecordingError(f"{run.paths[0]}: {run.experiment} {run.label}".rstrip() + " is in "
+                                 f"{run_by_key[key].paths[0]} as well; one of them is needed")  # fmt: skip
+        run_by_key[key] = run

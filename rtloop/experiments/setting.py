@@ -51,9 +51,9 @@ class Setting:
         """How far a slow drive may go to both sides: by its limits, and where the position trips."""
         largest_v = min(self.axis.limits.drive_v, -self.axis.limits.lowest_v)
         drives_v = np.linspace(0.0, largest_v, 1001)
-        moved_um = np.abs(loading_curve(self.axis.feedforward.actuator(), drives_v))
-        beyond = np.flatnonzero(moved_um > self.trips_um)
-        return float(drives_v[max(beyond[0] - 1, 1)]) if beyond.size else largest_v
+        displacement_um = np.abs(loading_curve(self.axis.feedforward.actuator(), drives_v))
+        tripping = np.flatnonzero(displacement_um > self.trips_um)
+        return float(drives_v[max(tripping[0] - 1, 1)]) if tripping.size else largest_v
 
     @property
     def reach_um(self) -> float:
@@ -93,5 +93,5 @@ class Setting:
     @property
     def largest_part_of_drive(self) -> float:
         """Of the drive's limit, all at once and without control."""
-        moved_um = abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
-        return min(1.0, self.trips_um / moved_um)
+        overshoot_um = abs(self.um_per_v) * self.axis.limits.drive_v * (self.model.open_overshoot if self.model else 2.0)
+        return min(1.0, self.trips_um / overshoot_um)

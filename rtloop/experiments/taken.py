@@ -28,20 +28,20 @@ class Taken:
     """One run of an experiment."""
 
     def __init__(self, recording: Recording) -> None:
-        said = about(recording.configuration)
-        if said is None:
+        metadata = about(recording.configuration)
+        if metadata is None:
             raise RecordingError(f"{recording.paths[0]}: is not of an experiment; `rtloop info` shows what it holds")
         self.recording = recording
-        self.experiment: str = said["name"]
-        self.label: str = said["run"]
-        self.runs: int = said["runs"]
-        self.axis: str = said["axis"]
-        self.parameters: dict[str, Any] = said["parameters"]
-        self.ticks_planned: int = said["ticks"]
-        self.segments = [Segment(*values) for values in said["segments"]]
-        self.asked = SpecificationOptions.model_validate(said.get("asked", {}))
-        self.beside: bool = said.get("beside", False)
-        self._may_trip: bool = said["may_trip"]
+        self.experiment: str = metadata["name"]
+        self.label: str = metadata["run"]
+        self.runs: int = metadata["runs"]
+        self.axis: str = metadata["axis"]
+        self.parameters: dict[str, Any] = metadata["parameters"]
+        self.ticks_planned: int = metadata["ticks"]
+        self.segments = [Segment(*values) for values in metadata["segments"]]
+        self.asked = SpecificationOptions.model_validate(metadata.get("asked", {}))
+        self.beside: bool = metadata.get("beside", False)
+        self._may_trip: bool = metadata["may_trip"]
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -61,7 +61,7 @@ class Taken:
     @cached_property
     def axis_options(self) -> AxisOptions:
         """The axis as it was configured."""
-        return AxisOptions.model_validate(next(one for one in self.configured["axis"] if one["name"] == self.axis))
+        return AxisOptions.model_validate(next(axis for axis in self.configured["axis"] if axis["name"] == self.axis))
 
     @property
     def actuator_model(self) -> PlayModel:
@@ -99,16 +99,16 @@ class Taken:
         if self.trip and not self._may_trip:
             causes = ", ".join(self.trip["causes"])
             raise UnsuitableData(f"{self._named}tripped at tick {self.trip['tick']} ({causes}); not analysed")
-        last = self._ticks[-1] + 1 if self._ticks.size else 0
-        if last < self.ticks_planned:
+        end_tick = self._ticks[-1] + 1 if self._ticks.size else 0
+        if end_tick < self.ticks_planned:
             raise UnsuitableData(
-                f"{self._named}ended after {last / self.rate_hz:.1f} of {self.ticks_planned / self.rate_hz:g} s; "
+                f"{self._named}ended after {end_tick / self.rate_hz:.1f} of {self.ticks_planned / self.rate_hz:g} s; "
                 "not analysed"
             )
-        if not self._may_trip and (found := limited(self.recording["flags"])):
-            raise UnsuitableData(f"{self._named}{found}: what it shows is the limit; not judged")
-        if missing := int(last) - self._ticks.size:
-            raise UnsuitableData(f"{self._named}{missing} ticks are missing from the recording; not analysed")
+        if not self._may_trip and (clipping := limited(self.recording["flags"])):
+            raise UnsuitableData(f"{self._named}{clipping}: what it shows is the limit; not judged")
+        if missing_ticks := int(end_tick) - self._ticks.size:
+            raise UnsuitableData(f"{self._named}{missing_ticks} ticks are missing from the recording; not analysed")
 
     def signal(self, name: str) -> Real:
         """A signal of the axis by its name without the axis, (ticks,)."""
@@ -152,12 +152,12 @@ class Taken:
 def limited(flags: Real) -> str | None:
     """How many ticks were clipped, by which limit, and the first of them; None where none was."""
     values = flags.astype(np.int64)
-    found = []
+    messages = []
     for flag, name in ((Flag.COMMAND_LIMITED, "the command"), (Flag.DRIVE_LIMITED, "the drive")):
         ticks = np.flatnonzero(values & flag)
         if ticks.size:
-            found.append(f"{name} was clipped in {ticks.size} ticks, the first of them {ticks[0]}")
-    return "; ".join(found) or None
+            messages.append(f"{name} was clipped in {ticks.size} ticks, the first of them {ticks[0]}")
+    return "; ".join(messages) or None
 
 
 def whole(segment: Segment) -> slice:

@@ -50,7 +50,7 @@ def pictures(draw: Callable[[Any, Any, Ink], None], curves: Any, size: tuple[flo
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtra("the report's pictures need matplotlib: pip install 'rtloop[plot]'") from None
-    drawn: dict[str, bytes] = {}
+    images: dict[str, bytes] = {}
     for name, ink in THEMES.items():
         with matplotlib.rc_context(_settings(ink)):
             figure = Figure(figsize=size, layout="constrained")
@@ -58,8 +58,8 @@ def pictures(draw: Callable[[Any, Any, Ink], None], curves: Any, size: tuple[flo
             draw(figure, curves, ink)
             file = io.BytesIO()
             figure.savefig(file, format="png", dpi=DPI)
-        drawn[name] = file.getvalue()
-    return drawn
+        images[name] = file.getvalue()
+    return images
 
 
 def _settings(ink: Ink) -> Any:

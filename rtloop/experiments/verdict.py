@@ -59,13 +59,13 @@ class Row:
         """The answers in words; a difference is named."""
         if not math.isfinite(self.run):
             return "not to be had from this run"
-        off = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
+        difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
         answers = (
             (self.met, "meets what is asked", "MISSES what is asked"),
             (self.as_claimed, "as claimed", "not as claimed"),
-            (self.as_the_model, "as the model", f"off the model by {off}"),
+            (self.as_the_model, "as the model", f"off the model by {difference}"),
         )
-        return ", ".join(yes if answer else no for answer, yes, no in answers if answer is not None)
+        return ", ".join(yes_text if answer else no_text for answer, yes_text, no_text in answers if answer is not None)
 
     @property
     def mark(self) -> str:

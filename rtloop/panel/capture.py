@@ -46,14 +46,14 @@ class Run(NamedTuple):
 
 def present_run(client: Client) -> Run:
     """Of the service. Raises UnavailableError where nothing is recorded."""
-    said = client.get("/status")
-    recording = said["recording"]
-    if "file" not in recording or "rate_hz" not in said:
-        raise UnavailableError(f"{client.path}: nothing to capture from: no loop is recorded, it is {said['state']}")
+    status = client.get("/status")
+    recording = status["recording"]
+    if "file" not in recording or "rate_hz" not in status:
+        raise UnavailableError(f"{client.path}: nothing to capture from: no loop is recorded, it is {status['state']}")
     if recording["state"] != "recording":
         since = f"not recorded from tick {recording['since_tick']} on: {recording['reason']}"
         raise UnavailableError(f"{client.path}: nothing to capture from: {since}")
-    return Run(Path(recording["file"]), int(said["tick"]), int(recording["written_ticks"]), float(said["rate_hz"]))
+    return Run(Path(recording["file"]), int(status["tick"]), int(recording["written_ticks"]), float(status["rate_hz"]))
 
 
 def capture(client: Client, file: Path, first: int, end: int, folder: Path | None = None) -> dict[str, Any]:
@@ -96,20 +96,20 @@ def _cut(file: Path, first: int, end: int, folder: Path | None) -> dict[str, Any
 
 def _holding(file: Path, tick: int) -> list[Path]:
     """The last files of a run, from the one before that with `tick` on: a state of the law may stand in there."""
-    found = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
-    files = sorted(found, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
-    for place in reversed(range(len(files))):
-        with Reader(files[place], tolerant=True, opener=open_without_link) as reader:
+    paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
+    files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
+    for index in reversed(range(len(files))):
+        with Reader(files[index], tolerant=True, opener=open_without_link) as reader:
             if reader.first_tick <= tick:
-                return files[max(place - 1, 0) :]
+                return files[max(index - 1, 0) :]
     return files or [file]
 
 
 def _free(file: Path, tick: int, folder: Path | None) -> Path:
     """A name that nothing has."""
     path = cut_path(file if folder is None else folder / file.name, tick, "capture")
-    others = (path.with_name(f"{path.stem}-{number}.mcap") for number in count(2))
-    return next(one for one in chain([path], others) if not lexists(one))
+    alternatives = (path.with_name(f"{path.stem}-{number}.mcap") for number in count(2))
+    return next(candidate for candidate in chain([path], alternatives) if not lexists(candidate))
 
 
 def _verdict(path: Path) -> str:
@@ -120,27 +120,27 @@ def _verdict(path: Path) -> str:
         return f"not possible: {error}"
     if report.identical:
         return "identical"
-    if (found := report.first_difference) is not None:
-        return f"different: tick {found['tick']}, {found['signal']}"
+    if (difference := report.first_difference) is not None:
+        return f"different: tick {difference['tick']}, {difference['signal']}"
     return "; ".join(["no difference, but not verified as a whole", *(entry["why"] for entry in report.not_verified)])
 
 
 def main() -> int:
     """Command line entry."""
     parser = argparse.ArgumentParser(prog="rtloop.panel.capture", description="save a stretch of a running loop")
-    for name, kind in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
-        parser.add_argument(name, type=kind)
-    asked = parser.parse_args()
-    said: dict[str, Any]
+    for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):
+        parser.add_argument(name, type=argument_type)
+    arguments = parser.parse_args()
+    response: dict[str, Any]
     try:
-        done = capture(Client(asked.socket), asked.file, asked.first, asked.end)
-        path = Path(done["output"])
-        said = {"file": path.name, **{key: done[key] for key in ("first", "end", "ticks", "gaps", "problems")}}
-        said["replay"] = _verdict(path)
+        result = capture(Client(arguments.socket), arguments.file, arguments.first, arguments.end)
+        path = Path(result["output"])
+        response = {"file": path.name, **{key: result[key] for key in ("first", "end", "ticks", "gaps", "problems")}}
+        response["replay"] = _verdict(path)
     except RtloopError as error:
-        said = {"error": str(error)}
-    print(json.dumps(said), flush=True)
-    return 1 if "error" in said else 0
+        response = {"error": str(error)}
+    print(json.dumps(response), flush=True)
+    return 1 if "error" in response else 0
 
 
 if __name__ == "__main__":

@@ -53,15 +53,15 @@ class Crossing:
 
     def find(self, ready: Mask, fired: Mask, gap: bool) -> Places:
         """Where `fired` holds for the first time after `ready` did; never both at once."""
-        places = np.flatnonzero(ready | fired)
+        indices = np.flatnonzero(ready | fired)
         if gap and not fired[0]:
             self._ready = False
-        if places.size == 0:
-            return places
-        sides = ready[places]
-        before = np.concatenate([[self._ready], sides[:-1]])
-        self._ready = bool(sides[-1])
-        return places[before & ~sides]
+        if indices.size == 0:
+            return indices
+        ready_states = ready[indices]
+        previous_ready = np.concatenate([[self._ready], ready_states[:-1]])
+        self._ready = bool(ready_states[-1])
+        return indices[previous_ready & ~ready_states]
 
 
 class Edge(Condition):
@@ -80,12 +80,12 @@ class Edge(Condition):
 
     def find(self, values: Real, gap: bool) -> Places:
         """Where the level is reached."""
-        level, hysteresis, places = self._level, self._hysteresis, []
+        level, hysteresis, indices = self._level, self._hysteresis, []
         if self._rising is not None:
-            places.append(self._rising.find(values < level - hysteresis, values >= level, gap))
+            indices.append(self._rising.find(values < level - hysteresis, values >= level, gap))
         if self._falling is not None:
-            places.append(self._falling.find(values > level + hysteresis, values <= level, gap))
-        return places[0] if len(places) == 1 else np.union1d(*places)
+            indices.append(self._falling.find(values > level + hysteresis, values <= level, gap))
+        return indices[0] if len(indices) == 1 else np.union1d(*indices)
 
 
 class Window(Condition):
@@ -101,8 +101,8 @@ class Window(Condition):
 
     def find(self, values: Real, gap: bool) -> Places:
         """The first ticks outside."""
-        outside = (values < self._low) | (values > self._high)
-        return self._leaving.find(~outside & ~np.isnan(values), outside, gap)
+        is_outside = (values < self._low) | (values > self._high)
+        return self._leaving.find(~is_outside & ~np.isnan(values), is_outside, gap)
 
 
 class Tripped(Condition):
@@ -116,9 +116,9 @@ class Tripped(Condition):
     def find(self, values: Real, gap: bool) -> Places:
         """Where one appears."""
         causes = values.astype(np.int64) & TRIP_MASK
-        before = _before(causes, self._before)
+        previous_causes = _before(causes, self._before)
         self._before = int(causes[-1])
-        return np.flatnonzero(causes & ~before)
+        return np.flatnonzero(causes & ~previous_causes)
 
 
 class ModeChanged(Condition):
@@ -131,9 +131,9 @@ class ModeChanged(Condition):
 
     def find(self, values: Real, gap: bool) -> Places:
         """The first ticks in it."""
-        before = _before(values, self._before)
+        previous_modes = _before(values, self._before)
         self._before = float(values[-1])
-        return np.flatnonzero(values != before)
+        return np.flatnonzero(values != previous_modes)
 
 
 class Late(Condition):
@@ -162,10 +162,10 @@ class Stepped(Condition):
 
     def find(self, values: Real, gap: bool) -> Places:
         """The ticks with the new value; none behind lost ones, over which a ramp goes far as well."""
-        before = _before(values, None if gap else self._before)
+        previous_values = _before(values, None if gap else self._before)
         self._before = float(values[-1])
         with np.errstate(invalid="ignore", over="ignore"):  # from infinity to infinity is no step
-            return np.flatnonzero(np.abs(values - before) > self._threshold)
+            return np.flatnonzero(np.abs(values - previous_values) > self._threshold)
 
 
 class Commanded(Condition):
@@ -178,12 +178,12 @@ class Commanded(Condition):
 
     def find(self, values: Real, gap: bool) -> Places:
         """The ticks at which one did; the first one there is, for those that are lost."""
-        found: list[int] = []
+        indices: list[int] = []
         while self._ticks and self._ticks[0] <= values[-1]:
             tick = self._ticks.popleft()
             if tick >= values[0] or gap:
-                found.append(int(np.searchsorted(values, tick)))
-        return np.unique(np.array(found, np.intp))
+                indices.append(int(np.searchsorted(values, tick)))
+        return np.unique(np.array(indices, np.intp))
 
 
 def _before(values: npt.NDArray, first: float | None) -> npt.NDArray:

@@ -33,6 +33,6 @@ def envelope(values: Real, pixels: int) -> Envelope:
     count = values.shape[-1]
     if count <= pixels:
         return Envelope(np.arange(count), values, values, np.isnan(values))
-    first = -(-np.arange(pixels) * count // pixels)  # rounded up
-    low, high = np.fmin.reduceat(values, first, axis=-1), np.fmax.reduceat(values, first, axis=-1)
-    return Envelope(first, low, high, np.isnan(np.minimum.reduceat(values, first, axis=-1)))
+    first_samples = -(-np.arange(pixels) * count // pixels)  # rounded up
+    low, high = np.fmin.reduceat(values, first_samples, axis=-1), np.fmax.reduceat(values, first_samples, axis=-1)
+    return Envelope(first_samples, low, high, np.isnan(np.minimum.reduceat(values, first_samples, axis=-1)))

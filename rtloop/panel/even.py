@@ -25,21 +25,21 @@ class Even:
 
         `values` (n,), where what is not finite is a hole, stand at the whole numbers `places` (n,).
         """
-        good = np.isfinite(values)
-        values, places = values[good], places[good]
+        finite = np.isfinite(values)
+        values, places = values[finite], places[finite]
         if values.size == 0:
             return []
-        goes_on = self._last is not None
+        has_previous = self._last is not None
         if self._last is not None:
             values, places = np.concatenate([[self._last[1]], values]), np.concatenate([[self._last[0]], places])
         self._last = float(places[-1]), float(values[-1])
         strides = np.diff(places)
         breaks = 1 + np.flatnonzero((strides < 1) | (strides > self._longest + 1))
         runs = []
-        for number, (at, x) in enumerate(zip(np.split(places, breaks), np.split(values, breaks), strict=True)):
-            grid = np.arange(at[0], at[-1] + 1)
-            self.bridged += grid.size - at.size
-            filled = np.interp(grid, at, x) if grid.size > at.size else x
-            continued = goes_on and number == 0
-            runs.append((continued, filled[1:] if continued else filled))  # the last one before was handed out before
+        for run_number, (run_indices, run_values) in enumerate(zip(np.split(places, breaks), np.split(values, breaks), strict=True)):
+            grid = np.arange(run_indices[0], run_indices[-1] + 1)
+            self.bridged += grid.size - run_indices.size
+            interpolated = np.interp(grid, run_indices, run_values) if grid.size > run_indices.size else run_values
+            is_continuation = has_previous and run_number == 0
+            runs.append((is_continuation, interpolated[1:] if is_continuation else interpolated))  # the last one before was handed out before
         return runs

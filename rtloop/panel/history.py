@@ -31,9 +31,9 @@ class History:
         capacity = self._values.shape[1]
         self._values[:, np.arange(max(self.end, stretch.first - capacity), stretch.first) % capacity] = np.nan
         begin = max(stretch.end - capacity, stretch.first)
-        places = np.arange(begin, stretch.end) % capacity
+        columns_to_write = np.arange(begin, stretch.end) % capacity
         for row, column in zip(self._values, columns, strict=True):
-            row[places] = column[begin - stretch.first :]
+            row[columns_to_write] = column[begin - stretch.first :]
         self.end = stretch.end
 
     def between(self, first: int, end: int, rows: Sequence[int] | None = None) -> Real:
@@ -42,13 +42,13 @@ class History:
         `rows` says which of the signals, by their places among them; all by default.
         """
         capacity = self._values.shape[1]
-        kept = self._values if rows is None else [self._values[row] for row in rows]
-        values = np.full((len(kept), max(end - first, 0)), np.nan)
-        begin, beyond = max(first, self.end - capacity), min(end, self.end)
-        while begin < beyond:  # twice at most: up to the end of the array, and from its beginning on
-            place = begin % capacity
-            count = min(beyond - begin, capacity - place)
-            for value, row in zip(values, kept, strict=True):
-                value[begin - first : begin - first + count] = row[place : place + count]
+        source_rows = self._values if rows is None else [self._values[row] for row in rows]
+        values = np.full((len(source_rows), max(end - first, 0)), np.nan)
+        begin, available_end = max(first, self.end - capacity), min(end, self.end)
+        while begin < available_end:  # twice at most: up to the end of the array, and from its beginning on
+            column = begin % capacity
+            count = min(available_end - begin, capacity - column)
+            for target, row in zip(values, source_rows, strict=True):
+                target[begin - first : begin - first + count] = row[column : column + count]
             begin += count
         return values

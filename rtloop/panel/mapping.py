@@ -34,9 +34,9 @@ class Mapping:
         return Ring(head, marks, self._array("events_slots", MESSAGE))
 
     def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
-        offset, described, shape = self._directory[name]
-        kind = np.dtype(described) if dtype is None else dtype
-        return np.frombuffer(self._map, kind, int(np.prod(shape)), offset).reshape(shape)
+        offset, type_name, shape = self._directory[name]
+        array_dtype = np.dtype(type_name) if dtype is None else dtype
+        return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)
 
 
 def open_mapping(path: Path) -> Mapping | None:

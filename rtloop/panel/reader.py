@@ -52,13 +52,13 @@ class Reader:
 
     def messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
         """The next events of the run that is read, (n,) of MESSAGE; those of a tick are there before it is."""
-        ready = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
-        found = np.zeros(min(ready, MOST_EVENTS), MESSAGE)
-        if self._events is None or not ready:
-            return found
-        copied, first, _ = drain(self._events, self._event_cursor, found)
-        self._event_cursor = first + copied
-        return found[:copied]
+        ready_count = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
+        messages = np.zeros(min(ready_count, MOST_EVENTS), MESSAGE)
+        if self._events is None or not ready_count:
+            return messages
+        copied_count, first, _ = drain(self._events, self._event_cursor, messages)
+        self._event_cursor = first + copied_count
+        return messages[:copied_count]
 
     def _follow(self) -> bool:
         """Go over to the block that lies there now; False while no loop has made one."""
@@ -81,13 +81,13 @@ class Reader:
     def _take(self) -> Stretch | None:
         if self._ring is None:
             return None
-        ready = int(self._ring.head[0]) - self._cursor
-        if ready == 0:
+        ready_count = int(self._ring.head[0]) - self._cursor
+        if ready_count == 0:
             return None
-        rows = np.empty((min(ready, MOST_TICKS), len(self._columns)))
-        copied, first, lost = drain(self._ring, self._cursor, rows)
-        if copied == 0:
+        rows = np.empty((min(ready_count, MOST_TICKS), len(self._columns)))
+        copied_count, first, lost = drain(self._ring, self._cursor, rows)
+        if copied_count == 0:
             return None
-        self._cursor = first + copied
+        self._cursor = first + copied_count
         self.lost += lost
-        return Stretch(self._columns, first, rows[:copied], lost, self.run)
+        return Stretch(self._columns, first, rows[:copied_count], lost, self.run)

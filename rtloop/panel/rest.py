@@ -24,8 +24,8 @@ def reference_of(axis: str) -> str:
 
 def is_at_rest(reference: Real, mode: Real) -> bool:
     """Whether reference and mode (n,), NaN where ticks are lost, stand still, or the mode is off throughout."""
-    known = np.isfinite(reference) & np.isfinite(mode)
-    reference, mode = reference[known], mode[known]
+    valid = np.isfinite(reference) & np.isfinite(mode)
+    reference, mode = reference[valid], mode[valid]
     return not reference.size or bool(np.all(mode == Mode.OFF) or np.ptp(reference) == np.ptp(mode) == 0.0)
 
 
@@ -43,6 +43,6 @@ class Rest:
 
     def feed(self, reference: Real, mode: Real) -> None:
         """Judge the next ticks, each (n,), with the one before them."""
-        both = np.hstack([self._last, [reference, mode]])
-        self.at_rest = self.at_rest and is_at_rest(*both)
-        self._last = both[:, -1:]
+        samples = np.hstack([self._last, [reference, mode]])
+        self.at_rest = self.at_rest and is_at_rest(*samples)
+        self._last = samples[:, -1:]

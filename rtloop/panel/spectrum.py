@@ -61,8 +61,8 @@ class Density(NamedTuple):
         """
         if not low_hz < high_hz:
             return 0.0
-        ends = [np.interp([low_hz, high_hz], power.edges_hz, power.below) for power in self.powers]
-        return float(np.sqrt(max(sum(beyond - below for below, beyond in ends), 0.0)))
+        band_powers = [np.interp([low_hz, high_hz], power.edges_hz, power.below) for power in self.powers]
+        return float(np.sqrt(max(sum(high_power - low_power for low_power, high_power in band_powers), 0.0)))
 
 
 class Spectrum:
@@ -92,9 +92,9 @@ class Spectrum:
         filters begin anew.
         """
         for start in range(0, len(values), WORKED_ON):
-            part = slice(start, start + WORKED_ON)
-            for goes_on, samples in self._even.take(values[part], periods[part]):
-                if not goes_on:
+            block = slice(start, start + WORKED_ON)
+            for is_continuation, samples in self._even.take(values[block], periods[block]):
+                if not is_continuation:
                     for stage in self._stages:
                         stage.begin()
                 self._pass_down(samples)
@@ -104,24 +104,24 @@ class Spectrum:
         stages = [stage for stage in self._stages if stage.averages >= max(least, 1)]
         hz, edges, amplitude, averages, powers = [], [np.array([self._rate_hz / 2])], [], [], []
         for number, stage in enumerate(stages):
-            rate_hz, deepest = self._rate_hz / DECIMATION**number, number == len(stages) - 1
+            rate_hz, is_deepest = self._rate_hz / DECIMATION**number, number == len(stages) - 1
             width_hz, bins = rate_hz / self._segment, np.arange(self._segment // 2 + 1)
             density = stage.density / rate_hz * self._scale**2
-            lowest = LOWEST_BIN if deepest else int(PASS * self._segment / DECIMATION)
-            taken = (bins >= lowest) & ((bins - 0.5) * width_hz < edges[-1][0])
-            hz.append(bins[taken] * width_hz)
-            edges.append((bins[taken] - 0.5) * width_hz)
-            amplitude.append(np.sqrt(density[taken]))
-            averages.append(np.full(np.count_nonzero(taken), stage.averages))
-            share = np.where(bins >= LOWEST_BIN, 1.0, 0.0) if deepest else _share(bins / self._segment * DECIMATION)
+            lowest_bin = LOWEST_BIN if is_deepest else int(PASS * self._segment / DECIMATION)
+            selected = (bins >= lowest_bin) & ((bins - 0.5) * width_hz < edges[-1][0])
+            hz.append(bins[selected] * width_hz)
+            edges.append((bins[selected] - 0.5) * width_hz)
+            amplitude.append(np.sqrt(density[selected]))
+            averages.append(np.full(np.count_nonzero(selected), stage.averages))
+            share = np.where(bins >= LOWEST_BIN, 1.0, 0.0) if is_deepest else _share(bins / self._segment * DECIMATION)
             if number:
                 share -= _share(bins / self._segment)
-            ends = np.minimum(np.append(bins - 0.5, bins[-1]), bins[-1]) * width_hz
-            powers.append(Power(ends, np.concatenate([[0.0], np.cumsum(share * density * np.diff(ends))])))
+            upper_edges = np.minimum(np.append(bins - 0.5, bins[-1]), bins[-1]) * width_hz
+            powers.append(Power(upper_edges, np.concatenate([[0.0], np.cumsum(share * density * np.diff(upper_edges))])))
         if not stages:
             return Density(np.zeros(0), edges[0], np.zeros(0), np.zeros(0, np.intp), self._unit, ())
-        joined = (np.concatenate(parts[::-1]) for parts in (hz, edges, amplitude, averages))
-        return Density(*joined, unit=self._unit, powers=tuple(powers))
+        columns = (np.concatenate(parts[::-1]) for parts in (hz, edges, amplitude, averages))
+        return Density(*columns, unit=self._unit, powers=tuple(powers))
 
     def _pass_down(self, samples: Real) -> None:
         number = 0
@@ -170,14 +170,14 @@ class _Stage:
 
     def _average(self, samples: Real) -> None:
         step, segment = self._segment // 2, self._segment
-        waiting = np.concatenate([self._waiting, samples])
-        count = 1 + (waiting.size - segment) // step
+        pending = np.concatenate([self._waiting, samples])
+        count = 1 + (pending.size - segment) // step
         if count >= 1:
-            segments = np.lib.stride_tricks.sliding_window_view(waiting, segment)[::step]
+            segments = np.lib.stride_tricks.sliding_window_view(pending, segment)[::step]
             self._power += np.sum(np.abs(np.fft.rfft(segments * self._window)) ** 2, axis=0)
             self.averages += count
-            waiting = waiting[count * step :].copy()
-        self._waiting = waiting
+            pending = pending[count * step :].copy()
+        self._waiting = pending
 
 
 def _share(part: Real) -> Real:

@@ -57,10 +57,10 @@ class Batch:
 
     def take(self) -> Stretch | None:
         """All that are kept, one behind the other: between them ticks may be lost. None where there are none."""
-        kept, self._kept = self._kept, []
-        if not kept:
+        stretches, self._kept = self._kept, []
+        if not stretches:
             return None
-        return replace(kept[0], rows=np.concatenate([one.rows for one in kept]), lost=sum(one.lost for one in kept))
+        return replace(stretches[0], rows=np.concatenate([stretch.rows for stretch in stretches]), lost=sum(stretch.lost for stretch in stretches))
 
 
 def index_of(name: str, columns: Sequence[str]) -> int:

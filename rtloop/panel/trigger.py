@@ -65,9 +65,9 @@ class Settings:
     auto_ticks: int = 1000
 
     def __post_init__(self) -> None:
-        for name, least in (("ticks", 1), ("holdoff_ticks", 0), ("auto_ticks", 1)):
-            if (value := getattr(self, name)) < least:
-                raise ValueError(f"trigger {name}: {value}; at least {least} is needed")
+        for name, minimum in (("ticks", 1), ("holdoff_ticks", 0), ("auto_ticks", 1)):
+            if (value := getattr(self, name)) < minimum:
+                raise ValueError(f"trigger {name}: {value}; at least {minimum} is needed")
         if not 0 <= self.pre_percent <= 100:
             raise ValueError(f"trigger pre_percent: {self.pre_percent:g}; 0 … 100 is allowed")
 
@@ -114,33 +114,33 @@ class Trigger:
             self._condition, self.open = self._make(), None
             self._run, self._next = stretch.run, stretch.first
             self._free = self._ready = stretch.first
-        lost = stretch.first - self._next
-        places = self._condition.find(values, lost > 0).tolist()
+        lost_ticks = stretch.first - self._next
+        indices = self._condition.find(values, lost_ticks > 0).tolist()
         self._next = stretch.end
-        ended = []
-        while self.open is not None or self._begin(stretch, places, lost):
+        sweeps = []
+        while self.open is not None or self._begin(stretch, indices, lost_ticks):
             if self.open is None or self.open.end > stretch.end:
                 break
-            ended.append(self.open)
+            sweeps.append(self.open)
             self.open = None
-        return ended
+        return sweeps
 
     def _begin(self, stretch: Stretch, places: list[int], lost: int) -> bool:
         """Open the next sweep that begins in the stretch; False where none does."""
         settings, tick, cause = self._settings, stretch.end, None
         if settings.mode is not Mode.SINGLE or self._armed:
-            number = bisect_left(places, self._ready - stretch.first)
-            if number < len(places):
-                tick, cause = stretch.first + places[number], Cause.TRIGGER
-        if self._forced and (free := max(self._free, stretch.first)) < tick:
-            tick, cause = free, Cause.FORCED
-        if settings.mode is Mode.AUTO and (due := max(self._ready + settings.auto_ticks, stretch.first)) < tick:
-            tick, cause = due, Cause.AUTO
+            next_index = bisect_left(places, self._ready - stretch.first)
+            if next_index < len(places):
+                tick, cause = stretch.first + places[next_index], Cause.TRIGGER
+        if self._forced and (free_tick := max(self._free, stretch.first)) < tick:
+            tick, cause = free_tick, Cause.FORCED
+        if settings.mode is Mode.AUTO and (auto_tick := max(self._ready + settings.auto_ticks, stretch.first)) < tick:
+            tick, cause = auto_tick, Cause.AUTO
         if cause is None:
             return False
-        exact = cause is not Cause.TRIGGER or self._condition.at_its_tick(tick - stretch.first, lost > 0)
+        is_exact = cause is not Cause.TRIGGER or self._condition.at_its_tick(tick - stretch.first, lost > 0)
         first = tick - settings.pre_ticks
-        self.open = Sweep(stretch.run, first, tick, first + settings.ticks, cause, 0 if exact else lost)
+        self.open = Sweep(stretch.run, first, tick, first + settings.ticks, cause, 0 if is_exact else lost)
         self._free = self.open.end
         self._ready = max(self._free, tick + settings.holdoff_ticks)
         self._armed = self._forced = False

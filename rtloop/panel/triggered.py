@@ -33,14 +33,14 @@ def captured(
     _require(condition is None or at is None, "capture: trigger and at; one of them is allowed")
     _require(0 < seconds < float("inf"), f"capture seconds: {seconds}; a finite number above 0 is needed")
     _require(timeout_s >= 0, f"capture timeout_s: {timeout_s}; 0 or more is needed")
-    run, said = present_run(client), client.get("/configuration")
-    settings = Settings(max(round(seconds * said["rate_hz"]), 1), Mode.SINGLE, pre_percent)
+    run, configuration = present_run(client), client.get("/configuration")
+    settings = Settings(max(round(seconds * configuration["rate_hz"]), 1), Mode.SINGLE, pre_percent)
     if condition is not None:
-        first = _await_trigger(said, run.tick + 1, settings, condition, timeout_s)
+        first = _await_trigger(configuration, run.tick + 1, settings, condition, timeout_s)
     else:
         first = run.tick + 1 if at is None else at - settings.pre_ticks
-    begin, where = max(first, 0), None if folder is None else Path(folder)
-    return load(capture(client, run.file, begin, first + settings.ticks, where)["output"])
+    begin, output_folder = max(first, 0), None if folder is None else Path(folder)
+    return load(capture(client, run.file, begin, first + settings.ticks, output_folder)["output"])
 
 
 def _await_trigger(
@@ -59,8 +59,8 @@ def _await_trigger(
         if stretch is not None and stretch.run > 0:
             raise UnavailableError("capture: the loop was started anew before a trigger came")
         if stretch is not None and stretch.end > begin:
-            old = max(begin - stretch.first, 0)
-            if sweeps := trigger.feed(replace(stretch, first=stretch.first + old, rows=stretch.rows[old:])):
+            skipped_rows = max(begin - stretch.first, 0)
+            if sweeps := trigger.feed(replace(stretch, first=stretch.first + skipped_rows, rows=stretch.rows[skipped_rows:])):
                 return sweeps[0].first
             if trigger.open is not None:
                 return trigger.open.first

@@ -45,10 +45,10 @@ class Child:
 
     def reports(self) -> list[dict[str, Any]]:
         """The JSON lines that came since the last call."""
-        found = []
+        reports = []
         while not self._reports.empty():
-            found.append(self._reports.get())
-        return found
+            reports.append(self._reports.get())
+        return reports
 
     @property
     def exit_code(self) -> int | None:

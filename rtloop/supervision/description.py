@@ -23,9 +23,9 @@ PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
     """The header of a recording of this plan."""
     plan, configuration = prepared.plan, prepared.configuration
-    around = configuration.recording.around
+    event_window = configuration.recording.around
     return {
-        "format": FORMAT if around is None else FORMAT_AROUND,
+        "format": FORMAT if event_window is None else FORMAT_AROUND,
         "name": plan.name,
         "created_unix_ns": time.time_ns(),
         "axes": list(plan.axes),
@@ -54,17 +54,17 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
         "realtime": realtime,
         "versions": {name: _version(name) for name in PACKAGES} | {"python": sys.version.split()[0]},
         "host": {"kernel": platform.release(), "machine": platform.machine(), "cpu": _cpu(), "cpus": os.cpu_count()},
-        **({} if around is None else {"around": around_of(around)._asdict()}),
+        **({} if event_window is None else {"around": around_of(event_window)._asdict()}),
     }
 
 
 def _laws(plan: Plan) -> dict[str, Any]:
     """The layout of the law. A law that is not shipped has its text, for a replay without its file, and its file."""
-    described = plan.layout.description()
-    for entry, law in zip(described["laws"], plan.laws, strict=True):
+    layout = plan.layout.description()
+    for entry, law in zip(layout["laws"], plan.laws, strict=True):
         if law.text:
             entry |= {"sha256": law.sha256, "text": law.text, "file": str(Path(law.file).absolute())}
-    return described
+    return layout
 
 
 def _version(package: str) -> str:

@@ -89,11 +89,11 @@ def keep(path: Path, hardware: Hardware) -> None:
 
     Raises OutputError, HostRefused for a folder that others may write to.
     """
-    what, new = "the note of the hardware", path.with_name(f"{path.name}.new")
-    with output_errors(f"{path}: cannot make {what}"):
-        with os.fdopen(new_file(new, what), "wb") as file:
+    target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
+    with output_errors(f"{path}: cannot make {target}"):
+        with os.fdopen(new_file(new_path, target), "wb") as file:
             file.write(_AS_JSON.dump_json(hardware))
-        os.replace(new, path)
+        os.replace(new_path, path)
 
 
 def noted(path: Path) -> Hardware | None:

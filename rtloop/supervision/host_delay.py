@@ -52,25 +52,25 @@ class SpentMargin:
     @property
     def words(self) -> str:
         """For people."""
-        part = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
-        wire = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
+        percent = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
+        wire_text = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
         return (
-            f"measured on this host: {self.lateness_us:.4g} µs late (p99){wire}, {self.more_us:.4g} µs = "
-            f"{self.more_ticks:.3g} ticks of delay more, {part:.3g} % of the {self.margin_us:.4g} µs that it bears"
+            f"measured on this host: {self.lateness_us:.4g} µs late (p99){wire_text}, {self.more_us:.4g} µs = "
+            f"{self.more_ticks:.3g} ticks of delay more, {percent:.3g} % of the {self.margin_us:.4g} µs that it bears"
         )
 
 
 def note_host_delay(configuration: Configuration, **measured: Any) -> None:
     """Keep what was measured at the configuration's rate. Raises OutputError, HostRefused for a folder of others."""
     rate_hz = configuration.loop.rate_hz
-    before = measured_delay(configuration)
-    kept = (before or HostDelay(rate_hz=rate_hz)).model_copy(update=measured)
+    previous = measured_delay(configuration)
+    updated = (previous or HostDelay(rate_hz=rate_hz)).model_copy(update=measured)
     path = runtime_folder() / _name(configuration)
     try:
         close_descriptor(open_folder(path.parent, FOLDER_MODE))
         fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o640)
         with os.fdopen(fd, "w") as file:
-            file.write(kept.model_dump_json())
+            file.write(updated.model_dump_json())
     except UntrustedPath as error:
         raise refusal(error) from None
     except OSError as error:
@@ -82,11 +82,11 @@ def measured_delay(configuration: Configuration) -> HostDelay | None:
     for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
             with os.fdopen(open_file(folder / _name(configuration), os.O_RDONLY), "rb") as file:
-                found = HostDelay.model_validate_json(file.read(MOST_BYTES))
+                delay = HostDelay.model_validate_json(file.read(MOST_BYTES))
         except (OSError, ValidationError):
             continue
-        if found.rate_hz == configuration.loop.rate_hz:
-            return found
+        if delay.rate_hz == configuration.loop.rate_hz:
+            return delay
     return None
 
 
@@ -99,31 +99,31 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
     if check.on_model is None or not check.on_model.is_stable:
         return None
     margin_s, _ = delay_margin(check.on_model)
-    wire = max(host.wire_ticks.get(check.name, 1) - 1 - check.delay_ticks, 0)
+    extra_ticks = max(host.wire_ticks.get(check.name, 1) - 1 - check.delay_ticks, 0)
     period_us = US_PER_S / host.rate_hz
-    more_us = host.lateness_us + wire * period_us
-    return SpentMargin(host.lateness_us, wire, more_us, more_us / period_us, US_PER_S * margin_s)
+    more_us = host.lateness_us + extra_ticks * period_us
+    return SpentMargin(host.lateness_us, extra_ticks, more_us, more_us / period_us, US_PER_S * margin_s)
 
 
 def require_margins(prepared: Prepared) -> None:
     """Raise ConfigError where an axis requires a margin that this host spends, or whose delay nobody has measured."""
     configuration, faults = prepared.configuration, list[str]()
-    asking = [axis.name for axis in configuration.axes if axis.margins.require_margin]
-    if not asking or not prepared.plan.pacing.paced:
+    required_axes = [axis.name for axis in configuration.axes if axis.margins.require_margin]
+    if not required_axes or not prepared.plan.pacing.paced:
         return
     host = measured_delay(configuration)
     for check in prepared.checks:
-        if check.name not in asking:
+        if check.name not in required_axes:
             continue
-        where = f"axis.{check.name}.margins.require_margin"
+        key = f"axis.{check.name}.margins.require_margin"
         spent = None if host is None else spent_margin(check, host)
         if host is None:
-            faults.append(f"{where}: the delay of this host is not known; `rtloop doctor CONFIG` measures it")
+            faults.append(f"{key}: the delay of this host is not known; `rtloop doctor CONFIG` measures it")
         elif spent is None:
             faults.append(
-                f"{where}: the axis's margin is not known; a controller that is linear and a model are needed"
+                f"{key}: the axis's margin is not known; a controller that is linear and a model are needed"
             )
         elif spent.is_spent:
-            faults.append(f"{where}: {spent.words}; nothing is left")
+            faults.append(f"{key}: {spent.words}; nothing is left")
     if faults:
         raise ConfigError(configuration.source, faults)

@@ -51,9 +51,9 @@ def park_configuration(config: Path) -> str:
                 with _answering(block_path(config.stem)):
                     _await_end(block, boards[0].heartbeat_timeout_s, boards[0].trip_slew_v_per_s)
             _park(boards[0], None if block is None else block["last_drive_v"], account)
-        for other in boards[1:]:
+        for board in boards[1:]:
             with account.attempt():
-                _park(other, None, account)
+                _park(board, None, account)
     return account.result()
 
 
@@ -129,13 +129,13 @@ def _await_end(block: SharedBlock, heartbeat_timeout_s: float, slew_v_per_s: flo
     ramp_s = float(np.max(np.abs(block["last_drive_v"]))) / slew_v_per_s
     ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # nor for a drive that is no number
     beat_ns = block.load(Word.HEARTBEAT_NS)
-    kill_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
+    kill_time_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driver_pid()) is not None:
         if block.load(Word.HEARTBEAT_NS) != beat_ns:
             raise UnavailableError(f"process {pid} drives the outputs and its service is alive; stop that instead")
-        if time.monotonic() > kill_s + KILL_S:
+        if time.monotonic() > kill_time_s + KILL_S:
             raise DriverError(f"process {pid} drives the outputs and cannot be killed")
-        if time.monotonic() > kill_s:
+        if time.monotonic() > kill_time_s:
             block.kill_driver()
         time.sleep(POLL_S)
 

@@ -24,9 +24,9 @@ SYSTEM_FOLDER = Path("/run/rtloop")
 
 def runtime_folder() -> Path:
     """RUNTIME_DIRECTORY as systemd sets it, else the user's runtime folder, else one of this user in /tmp."""
-    given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    if given:
-        return Path(given)
+    directory = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    if directory:
+        return Path(directory)
     if os.geteuid() == 0 and SYSTEM_FOLDER.parent.is_dir():
         return SYSTEM_FOLDER
     user = Path(f"/run/user/{os.getuid()}")

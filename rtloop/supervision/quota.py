@@ -83,23 +83,23 @@ class Quota:
 
     def keep(self, budget_s: float = BUDGET_S) -> list[Removal]:
         """Remove what is too much, and say what that was. `budget_s`: for opening files."""
-        gone: list[Removal] = []
+        removals: list[Removal] = []
         self.failure = None
         try:
-            lying = self._lying()
-            self._look(lying, budget_s)
-            self.bytes = sum(one.bytes for one in lying)
-            for one in self._removable(lying):
+            entries = self._lying()
+            self._look(entries, budget_s)
+            self.bytes = sum(entry.bytes for entry in entries)
+            for entry in self._removable(entries):
                 reason = self._too_much()
                 if reason is None:
                     break
-                (self._folder / one.name).unlink()
-                self.bytes -= one.bytes
-                self.removed, self.removed_bytes = self.removed + 1, self.removed_bytes + one.bytes
-                gone.append(Removal(self._folder / one.name, one.bytes, reason))
+                (self._folder / entry.name).unlink()
+                self.bytes -= entry.bytes
+                self.removed, self.removed_bytes = self.removed + 1, self.removed_bytes + entry.bytes
+                removals.append(Removal(self._folder / entry.name, entry.bytes, reason))
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
-        return gone
+        return removals
 
     def _too_much(self) -> str | None:
         """Why something is to go."""
@@ -112,45 +112,45 @@ class Quota:
 
     def _removable(self, lying: list[Lying]) -> list[Lying]:
         """The oldest first."""
-        finished = [one for one in lying if one.name.endswith(".mcap")]
-        unseen = {one.started for one in finished if one not in self._known}  # or could not be read
+        finished_entries = [entry for entry in lying if entry.name.endswith(".mcap")]
+        unread_runs = {entry.started for entry in finished_entries if entry not in self._known}  # or could not be read
         return [
-            one
-            for one in finished[:-1]
-            if one in self._known
-            and one.started not in unseen  # a trip may be in the next file of its run
-            and not _around_a_trip(self._known[one], self._known.values())
+            entry
+            for entry in finished_entries[:-1]
+            if entry in self._known
+            and entry.started not in unread_runs  # a trip may be in the next file of its run
+            and not _around_a_trip(self._known[entry], self._known.values())
         ]
 
     def _lying(self) -> list[Lying]:
-        found, foreign = [], []
+        files, foreign_names = [], []
         with os.scandir(self._folder) as entries:
             for entry in entries:
                 match = self._pattern.fullmatch(entry.name)
                 if not match or not entry.is_file(follow_symlinks=False):
                     continue
                 if not is_own(Path(entry)):
-                    foreign.append(entry.name)
+                    foreign_names.append(entry.name)
                     continue
                 status, number = entry.stat(follow_symlinks=False), int(match[2] or 1)
-                found.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
-        if foreign:
-            what = f"{count_text(len(foreign), 'recording')} of other users, such as {min(foreign)}"
-            self.failure = f"{self._folder}: {what}: not counted and never removed"
-        return sorted(found)
+                files.append(Lying(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
+        if foreign_names:
+            foreign_text = f"{count_text(len(foreign_names), 'recording')} of other users, such as {min(foreign_names)}"
+            self.failure = f"{self._folder}: {foreign_text}: not counted and never removed"
+        return sorted(files)
 
     def _look(self, lying: list[Lying], budget_s: float) -> None:
         """Into files that were not seen before, the oldest first."""
         until_s = time.monotonic() + budget_s
-        self._known = {one: self._known[one] for one in lying if one in self._known}
+        self._known = {entry: self._known[entry] for entry in lying if entry in self._known}
         self._strange &= set(lying)
-        for one in lying:
-            new = one not in self._known and one not in self._strange and one.name.endswith(".mcap")
-            if new and time.monotonic() < until_s:
-                if (found := self._stored(one)) is None:
-                    self._strange.add(one)
+        for entry in lying:
+            is_new = entry not in self._known and entry not in self._strange and entry.name.endswith(".mcap")
+            if is_new and time.monotonic() < until_s:
+                if (contents := self._stored(entry)) is None:
+                    self._strange.add(entry)
                 else:
-                    self._known[one] = found
+                    self._known[entry] = contents
 
     def _stored(self, one: Lying) -> Stored | None:
         """What a file says; None where it is damaged, or none of this configuration's recordings."""
@@ -159,8 +159,8 @@ class Quota:
                 header, totals = reader.header, reader.totals
                 if totals is None or header["name"] != self._name or any(map(header.get, OTHERWISE_MADE)):
                     return None
-                around = EventWindow.from_header(header)
-                before_s, after_s = (around.before_s, around.after_s) if around else (BEFORE_S, AFTER_S)
+                event_window = EventWindow.from_header(header)
+                before_s, after_s = (event_window.before_s, event_window.after_s) if event_window else (BEFORE_S, AFTER_S)
                 ticks = [event["tick"] for event in reader.events if event["kind"] in ("tripped", "driver_failed")]
                 rate_hz = header["rate_hz"]
                 trips = tuple((tick - round(before_s * rate_hz), tick + round(after_s * rate_hz)) for tick in ticks)
@@ -173,5 +173,5 @@ class Quota:
 
 
 def _around_a_trip(file: Stored, stored: Iterable[Stored]) -> bool:
-    trips = [trip for other in stored if other.run == file.run for trip in other.trips]
+    trips = [trip for candidate in stored if candidate.run == file.run for trip in candidate.trips]
     return any(first < file.end and last >= file.first for first, last in trips)

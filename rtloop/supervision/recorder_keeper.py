@@ -83,8 +83,8 @@ class RecorderKeeper:
         """Hand over the header; `recording` once the file is open, or `failure`."""
         self._header = header
         if self._options.keep_gib is not None:
-            least = round(self._options.min_free_mib * 2**20)
-            self.quota = Quota(self._path.parent, header["name"], round(self._options.keep_gib * 2**30), least)
+            min_free_bytes = round(self._options.min_free_mib * 2**20)
+            self.quota = Quota(self._path.parent, header["name"], round(self._options.keep_gib * 2**30), min_free_bytes)
         self._thread.start()
 
     def finish(self) -> None:
@@ -119,15 +119,15 @@ class RecorderKeeper:
 
     def _apply(self, quota: Quota, *budget_s: float) -> list[Removal]:
         """What the quota removed; a failure is said once."""
-        failed = quota.failure
-        gone = quota.keep(*budget_s)
-        self.removals += [*map(str, gone), *([quota.failure] if quota.failure not in (None, failed) else [])]
-        return gone
+        previous_failure = quota.failure
+        new_removals = quota.keep(*budget_s)
+        self.removals += [*map(str, new_removals), *([quota.failure] if quota.failure not in (None, previous_failure) else [])]
+        return new_removals
 
     def _tell_recorder(self) -> None:
         """What was removed becomes events of the recording, once there is a recorder that has its orders."""
         if self._untold and self._ordered and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
-            lines = [json.dumps({"removed": one.what}) + "\n" for one in self._untold]
+            lines = [json.dumps({"removed": removal.what}) + "\n" for removal in self._untold]
             self._child.send("".join(lines).encode())
             self._untold.clear()
 
@@ -149,13 +149,13 @@ class RecorderKeeper:
             if self.state == ProcessState.READY:
                 self._order()
             return
-        taken = self._block.load(Word.RECORDER_CURSOR)
-        behind = int(self._block["ticks_head"][0]) != taken
-        stuck = self._watch.stalled(taken, time.monotonic()) and behind
+        cursor = self._block.load(Word.RECORDER_CURSOR)
+        is_behind = int(self._block["ticks_head"][0]) != cursor
+        is_stuck = self._watch.stalled(cursor, time.monotonic()) and is_behind
         loop_ended = ProcessState.has_ended(self._block.load(Word.LOOP_STATE))
-        died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
-        if (died or stuck) and self.replacements < MAX_REPLACEMENTS:
-            reason = "stood still" if stuck else f"died (exit code {self.exit_code})"
+        has_died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
+        if (has_died or is_stuck) and self.replacements < MAX_REPLACEMENTS:
+            reason = "stood still" if is_stuck else f"died (exit code {self.exit_code})"
             if not self._child.end():
                 return  # it hangs in the kernel, where its file is: it may yet go on
             self.notes.append(f"the recorder {reason} and was replaced")
@@ -221,7 +221,7 @@ class RecorderKeeper:
         if self.replacements == 0:
             return 1
         prefix = f"{self._path.stem}-"
-        numbered = [
+        numbered_paths = [
             path for path in (*self._files(".mcap"), *self._files(".mcap.part")) if path.name.startswith(prefix)
         ]
-        return max((int(path.name.removeprefix(prefix).split(".")[0]) for path in numbered), default=1) + 1
+        return max((int(path.name.removeprefix(prefix).split(".")[0]) for path in numbered_paths), default=1) + 1

@@ -23,17 +23,17 @@ def recording_state(block: SharedBlock) -> dict[str, Any]:
 
     `ticks_lost` counts all ticks of the loop that are in no file. It is 0 for a run that is recorded as a whole.
     """
-    failure, flushed, lost, cursor = (
+    failure, flushed_ticks, lost_ticks, cursor = (
         block.load(word) for word in (Word.RECORDER_FAILURE, Word.FLUSHED_TICKS, Word.LOST_TICKS, Word.RECORDER_CURSOR)
     )
     reason, since_tick = None, None
     if failure:
-        reason, since_tick = REASONS.get(failure) or os.strerror(failure), flushed
-        lost += max(cursor - flushed, 0)
+        reason, since_tick = REASONS.get(failure) or os.strerror(failure), flushed_ticks
+        lost_ticks += max(cursor - flushed_ticks, 0)
     elif int(block["ticks_head"][0]) - cursor > len(block["ticks_slots"]) // BEHIND:
         reason, since_tick = "the recorder takes no ticks", cursor
     state = "recording" if reason is None else "not recording"
-    return {"state": state, "reason": reason, "since_tick": since_tick, "ticks_lost": lost}
+    return {"state": state, "reason": reason, "since_tick": since_tick, "ticks_lost": lost_ticks}
 
 
 class Gaps:
@@ -52,19 +52,19 @@ class Gaps:
 
     def news(self) -> str | None:
         """What is to be said now; None where there is nothing."""
-        said, now_s = recording_state(self._block), self._now_s()
-        if (reason := said["reason"]) is not None:
+        state, now_s = recording_state(self._block), self._now_s()
+        if (reason := state["reason"]) is not None:
             self._ill_s = now_s
             if not self._reasons:
                 self._begun_s = now_s
             if reason in self._reasons:
                 return None
             self._reasons.add(reason)
-            return f"not recorded from tick {said['since_tick']} on: {reason}"
+            return f"not recorded from tick {state['since_tick']} on: {reason}"
         if self._reasons and now_s - self._ill_s < QUIET_S:
             return None
-        lost, self._lost = said["ticks_lost"] - self._lost, said["ticks_lost"]
+        lost_ticks, self._lost = state["ticks_lost"] - self._lost, state["ticks_lost"]
         if not self._reasons:
             return None
         self._reasons.clear()
-        return f"recorded again after {self._ill_s - self._begun_s:.1f} s; {count_text(lost, 'tick')} lost"
+        return f"recorded again after {self._ill_s - self._begun_s:.1f} s; {count_text(lost_ticks, 'tick')} lost"

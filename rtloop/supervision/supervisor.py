@@ -155,18 +155,18 @@ class Supervisor:
 
         `on_progress` is called now and then in a thread of its own: a terminal that stands still holds up nothing.
         """
-        ended = threading.Event()
-        showing = threading.Thread(target=self._show, args=(on_progress, ended), daemon=True)
+        end_event = threading.Event()
+        progress_thread = threading.Thread(target=self._show, args=(on_progress, end_event), daemon=True)
         try:
             self.start()
-            showing.start()
+            progress_thread.start()
             while (result := self.poll()) is None:
                 time.sleep(POLL_S)
             return result
         finally:
-            ended.set()
-            if showing.is_alive():
-                showing.join(PROGRESS_PERIOD_S)
+            end_event.set()
+            if progress_thread.is_alive():
+                progress_thread.join(PROGRESS_PERIOD_S)
             self.close()
 
     def _show(self, on_progress: Callable[[Supervisor], None] | None, ended: threading.Event) -> None:
@@ -222,9 +222,9 @@ class Supervisor:
 
     def _loop_stalled(self) -> bool:
         """Whether ticks stand still although they are paced; the loop's process is then killed."""
-        running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
+        is_running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (
-            running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
+            is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
         ):
             return False
         if not self._stall.stalled(self.ticks, time.monotonic()):
@@ -255,18 +255,18 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
-        failed = self._reports.get("failed")
-        if failed is None:
+        failure = self._reports.get("failed")
+        if failure is None:
             raise LoopFault(f"the loop's process ended with {exit_code} before the run began")
-        error = RtloopError(failed["message"])
-        error.exit_code = failed["exit_code"]
+        error = RtloopError(failure["message"])
+        error.exit_code = failure["exit_code"]
         raise error
 
     def _end(self) -> None:
         """Park first, if the loop died; then let the recorder finish."""
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
-            died = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
-            self.error = f"the loop's process {died}; {self._park()}"
+            death_text = "stood still and was killed" if self._stalled else f"died ({_ending(self._loop.exit_code)})"
+            self.error = f"the loop's process {death_text}; {self._park()}"
             self.block.store(Word.LOOP_STATE, ProcessState.FAILED)
         self.ended = True
         self.recorder.finish()
@@ -297,8 +297,8 @@ class Supervisor:
 
 def seconds_since_start() -> float:
     """Age of this process in s, interpreter start and imports included."""
-    after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-    started_s = int(after_name[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
+    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    started_s = int(fields[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started_s
 
 

@@ -50,35 +50,35 @@ def _loop(timeline: Timeline, label: str, reference: Mapping[str, Any], duration
 
 def analyse(recordings: Sequence[Taken], _: CharacteriseOptions) -> Analysis:
     """Loops as measured, and as the model of the configuration gives them for the recorded drive."""
-    (taken,) = recordings
-    drive, position = taken.read("drive_v", "position_um")
-    rest = taken.labelled("rest")[0]
+    (run,) = recordings
+    drive, position = run.read("drive_v", "position_um")
+    rest = run.labelled("rest")[0]
     start = rest.start_tick
     drive, position = drive[start:-1], position[start + 1 :]
     position = position - position[: rest.ticks // 2].mean()
-    model = model_output(taken.actuator_model, drive) * taken.static_gain
+    model = model_output(run.actuator_model, drive) * run.static_gain
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
     curves: dict[str, Any] = {}
-    for segment in taken.labelled("half", "major", "minor"):
-        part = slice(segment.start_tick - start, segment.start_tick - start + segment.ticks - 1)
-        shapes[segment.label] = loop_shape(drive[part], position[part]), loop_shape(drive[part], model[part])
-        curves[segment.label] = thinned(drive[part], position[part], model[part])
+    for segment in run.labelled("half", "major", "minor"):
+        rows_of_segment = slice(segment.start_tick - start, segment.start_tick - start + segment.ticks - 1)
+        shapes[segment.label] = loop_shape(drive[rows_of_segment], position[rows_of_segment]), loop_shape(drive[rows_of_segment], model[rows_of_segment])
+        curves[segment.label] = thinned(drive[rows_of_segment], position[rows_of_segment], model[rows_of_segment])
     error = position - model
     error -= error.mean()
-    curves["error"] = thinned(np.arange(drive.size) / taken.rate_hz, error)
-    major, modelled = shapes["major"]
+    curves["error"] = thinned(np.arange(drive.size) / run.rate_hz, error)
+    major, model_major = shapes["major"]
     half, minor = shapes["half"], shapes["minor"]
-    fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, NEAR_PART * modelled.width
+    fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, NEAR_PART * model_major.width
     rows = [
-        taken.row("hysteresis_percent", "h/H, whole range", "%", major.percent, modelled.percent, NEAR_PERCENT),
-        taken.row("hysteresis_um", "h, whole range", "µm", major.height, modelled.height, near_um),
-        taken.row("range_um", "H, whole range", "µm", major.width, modelled.width, near_um),
-        taken.row("", "h/H, half the range", "%", half[0].percent, half[1].percent, NEAR_PERCENT),
-        taken.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, NEAR_PERCENT),
-        taken.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_PERCENT),
+        run.row("hysteresis_percent", "h/H, whole range", "%", major.percent, model_major.percent, NEAR_PERCENT),
+        run.row("hysteresis_um", "h, whole range", "µm", major.height, model_major.height, near_um),
+        run.row("range_um", "H, whole range", "µm", major.width, model_major.width, near_um),
+        run.row("", "h/H, half the range", "%", half[0].percent, half[1].percent, NEAR_PERCENT),
+        run.row("", "h/H, minor loop", "%", minor[0].percent, minor[1].percent, NEAR_PERCENT),
+        run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_PERCENT),
     ]
     notes = ["The model is that of [axis.feedforward] times D(0), driven with the recorded voltage."]
-    if taken.truth == "residual":
+    if run.truth == "residual":
         notes.append("The simulated actuator (truth = \"residual\") is on purpose not the one that the model is of, "
                      "so that some hysteresis remains after compensation: no compensator was told.")  # fmt: skip
     return Analysis(rows, curves, (_table(shapes),), notes)
@@ -93,17 +93,17 @@ def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     """The loops, the model over the major one, and their difference in time."""
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
-    loops, compared, error = (figure.add_subplot(place) for place in (grid[0, 0], grid[0, 1], grid[1, :]))
+    loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.other)):
         drive, position, _ = curves[label]
         loops.plot(drive, position, color=color, label={"half": "half the range"}.get(label, f"{label} loop"))
     ink.label(loops, "drive u / V", "position x / µm", "hysteresis under slow sines")
     ink.legend(loops)
     drive, position, model = curves["major"]
-    compared.plot(drive, position, color=ink.measured, linewidth=3.0, alpha=0.55, label="measured")
-    compared.plot(drive, model, color=ink.model, linewidth=1.0, label="model, same drive")
-    ink.label(compared, "drive u / V", "position x / µm", "measured and model")
-    ink.legend(compared)
+    comparison.plot(drive, position, color=ink.measured, linewidth=3.0, alpha=0.55, label="measured")
+    comparison.plot(drive, model, color=ink.model, linewidth=1.0, label="model, same drive")
+    ink.label(comparison, "drive u / V", "position x / µm", "measured and model")
+    ink.legend(comparison)
     error.plot(*curves["error"], color=ink.error, linewidth=0.9)
     error.margins(x=0)
     ink.label(error, "time / s", "difference / µm")

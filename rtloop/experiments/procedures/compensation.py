@@ -46,31 +46,31 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
 
 def analyse(recordings: Sequence[Taken], options: CompensationOptions) -> Analysis:
     """y = x/D(0) over v: the loop that is left, its error, its slope ρ and Ω."""
-    (taken,) = recordings
-    reference, position, drive = taken.read("reference_um", "position_um", "drive_v")
-    rest, segment = taken.labelled("rest")[0], taken.labelled("sine")[0]
+    (run,) = recordings
+    reference, position, drive = run.read("reference_um", "position_um", "drive_v")
+    rest, segment = run.labelled("rest")[0], run.labelled("sine")[0]
     offset = position[whole(rest)].mean()
-    part = whole(segment)
-    v, y = reference[part][:-1], (position[part][1:] - offset) / taken.static_gain
-    modelled = model_output(taken.actuator_model, drive[rest.start_tick :])[segment.start_tick - rest.start_tick :][
+    ticks = whole(segment)
+    v, y = reference[ticks][:-1], (position[ticks][1:] - offset) / run.static_gain
+    model_output_um = model_output(run.actuator_model, drive[rest.start_tick :])[segment.start_tick - rest.start_tick :][
         : v.size
     ]
-    shape, model_shape = loop_shape(v, y), loop_shape(v, modelled)
+    shape, model_shape = loop_shape(v, y), loop_shape(v, model_output_um)
     steady = slice(int(v.size * 0.5 / options.cycles), None)
     gain = float(v[steady] @ y[steady] / (v[steady] @ v[steady]))
     error, omega = v - y, y - gain * v
-    left_um, model_left_um = float(np.abs(error).max()), float(np.abs(v - modelled).max())
+    error_um, model_error_um = float(np.abs(error).max()), float(np.abs(v - model_output_um).max())
     rows = [
-        taken.row("residual_percent", "h/H after compensation", "%", shape.percent, model_shape.percent, NEAR),
-        taken.row("residual_um", "h after compensation", "µm", shape.height, model_shape.height, NEAR),
-        taken.row("", "largest |v − y|", "µm", left_um, model_left_um, NEAR),
-        taken.row("slope", "ρ, slope of y over v", "1", gain),
-        taken.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
+        run.row("residual_percent", "h/H after compensation", "%", shape.percent, model_shape.percent, NEAR),
+        run.row("residual_um", "h after compensation", "µm", shape.height, model_shape.height, NEAR),
+        run.row("", "largest |v − y|", "µm", error_um, model_error_um, NEAR),
+        run.row("slope", "ρ, slope of y over v", "1", gain),
+        run.row("omega_um", "largest |Ω| = |y − ρ v|", "µm", float(np.abs(omega).max())),
     ]
     notes = ["y is x/D(0), with D(0) of [axis.model]; at this frequency the dynamics should do nothing else.",
              "The model is that of [axis.feedforward], driven with the recorded voltage: behind its own inverse it "
              "leaves the dead band of its first threshold alone."]  # fmt: skip
-    if taken.truth == "residual":
+    if run.truth == "residual":
         notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 %; that this run finds it "
                      "shows that rig, inverse and analysis agree, and nothing about a laboratory.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thinned(v, y, error)}, notes=notes)
@@ -78,16 +78,16 @@ def analyse(recordings: Sequence[Taken], options: CompensationOptions) -> Analys
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     """y over v, and what is left of it."""
-    loop, rest = figure.subplots(1, 2)
+    loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]
     ends = np.array([v.min(), v.max()])
     loop.plot(ends, ends, color=ink.faint, linewidth=1.0, linestyle="--", label="y = v")
     loop.plot(v, y, color=ink.measured, label="measured")
     ink.label(loop, "command v / µm", "output y / µm", "output of the inverse compensation")
     ink.legend(loop)
-    rest.axhline(0, color=ink.faint, linewidth=0.8)
-    rest.plot(v, error, color=ink.error, linewidth=1.0)
-    ink.label(rest, "command v / µm", "ε = v − y / µm", "what compensation leaves")
+    error_panel.axhline(0, color=ink.faint, linewidth=0.8)
+    error_panel.plot(v, error, color=ink.error, linewidth=1.0)
+    ink.label(error_panel, "command v / µm", "ε = v − y / µm", "what compensation leaves")
 
 
 EXPERIMENT = Experiment(

@@ -42,12 +42,12 @@ class DisturbanceOptions(Options):
 def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
     """One for the step and one for each sine: the rig's disturbance is fixed when it is built."""
     amplitude_um = options.amplitude_um or largest_asked(setting)
-    found = [_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
+    planned_runs = [_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
     for hz in options.frequencies_hz:
         duration_s = np.ceil(max(LEAST_S * hz, 2.0)) / hz
         change = {"sine_um": amplitude_um, "sine_hz": hz}
-        found.append(_run(f"{hz:g} Hz", change, duration_s, setting, settle_s=SETTLE_S, frequency_hz=hz))
-    return found
+        planned_runs.append(_run(f"{hz:g} Hz", change, duration_s, setting, settle_s=SETTLE_S, frequency_hz=hz))
+    return planned_runs
 
 
 def _run(
@@ -63,8 +63,8 @@ def _run(
 
 def largest_asked(setting: Setting) -> float:
     """Ω of the axis's specification, or a small part of what the command reaches."""
-    asked = setting.asked.disturbance
-    return asked.largest_um if asked else PART_OF_REACH * setting.reach_um
+    limits = setting.asked.disturbance
+    return limits.largest_um if limits else PART_OF_REACH * setting.reach_um
 
 
 def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysis:
@@ -73,26 +73,26 @@ def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysi
     table: list[list[str]] = []
     amplitude_um = options.amplitude_um or 0.0
     curves: dict[str, Any] = {"amplitude_um": amplitude_um, "sines": []}
-    for taken in recordings:
-        position = taken.signal("position_um")
-        rest, segment = taken.labelled("rest")[0], taken.labelled("disturbed")[0]
-        judged = taken.tail(segment, segment.values["measured_ticks"])
+    for run in recordings:
+        position = run.signal("position_um")
+        rest, segment = run.labelled("rest")[0], run.labelled("disturbed")[0]
+        measured_slice = run.tail(segment, segment.values["measured_ticks"])
         if "frequency_hz" not in segment.values:
-            left = position[whole(segment)] - position[whole(rest)].mean()
-            model = taken.model.left_of(np.full(left.size, amplitude_um)) if taken.model else None
-            rows += _step_rows(taken, left, model, amplitude_um)
-            shown = round(SHOWN_S * taken.rate_hz)
-            curves |= {"time_ms": 1e3 * np.arange(shown) / taken.rate_hz, "step": left[:shown],
-                       "model": None if model is None else model[:shown]}  # fmt: skip
+            error = position[whole(segment)] - position[whole(rest)].mean()
+            model = run.model.left_of(np.full(error.size, amplitude_um)) if run.model else None
+            rows += _step_rows(run, error, model, amplitude_um)
+            shown_ticks = round(SHOWN_S * run.rate_hz)
+            curves |= {"time_ms": 1e3 * np.arange(shown_ticks) / run.rate_hz, "step": error[:shown_ticks],
+                       "model": None if model is None else model[:shown_ticks]}  # fmt: skip
             continue
         hz = segment.values["frequency_hz"]
-        left_nm = 1e3 * abs(tone(position[judged], hz, taken.rate_hz).amplitude)
-        rejected = taken.model.rejection(hz) if taken.model else None
-        model_nm = None if rejected is None else 1e3 * amplitude_um * float(abs(rejected[0]))
-        rows.append(_row(taken, f"what is left at {hz:g} Hz", left_nm, model_nm, NEAR * (model_nm or 0.0),
-                         allowed_um(taken, hz, amplitude_um)))  # fmt: skip
-        table.append([f"{hz:g}", f"{left_nm:.1f}", f"{left_nm / amplitude_um / 1e3:.5f}"])
-        curves["sines"].append((hz, left_nm))
+        error_nm = 1e3 * abs(tone(position[measured_slice], hz, run.rate_hz).amplitude)
+        rejection = run.model.rejection(hz) if run.model else None
+        model_nm = None if rejection is None else 1e3 * amplitude_um * float(abs(rejection[0]))
+        rows.append(_row(run, f"what is left at {hz:g} Hz", error_nm, model_nm, NEAR * (model_nm or 0.0),
+                         allowed_um(run, hz, amplitude_um)))  # fmt: skip
+        table.append([f"{hz:g}", f"{error_nm:.1f}", f"{error_nm / amplitude_um / 1e3:.5f}"])
+        curves["sines"].append((hz, error_nm))
     curves |= _over_frequency(recordings[0], amplitude_um)
     notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as it runs.",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not know: slow "
@@ -103,10 +103,10 @@ def analyse(recordings: Sequence[Taken], options: DisturbanceOptions) -> Analysi
 
 def allowed_um(taken: Taken, hz: float, amplitude_um: float) -> float | None:
     """What the specification leaves of an Ω of this size and frequency; None where it says nothing."""
-    asked = taken.asked.disturbance
-    if asked is None or (asked.up_to_hz is not None and hz > asked.up_to_hz):
+    limits = taken.asked.disturbance
+    if limits is None or (limits.up_to_hz is not None and hz > limits.up_to_hz):
         return None
-    return asked.error_um * amplitude_um / asked.largest_um
+    return limits.error_um * amplitude_um / limits.largest_um
 
 
 def _row(
@@ -118,20 +118,20 @@ def _row(
 
 def _step_rows(taken: Taken, left: Real, model: Real | None, amplitude_um: float) -> list[Row]:
     """A step has every frequency: what is asked up to some only is asked of its end alone."""
-    at_rest, at_once = allowed_um(taken, 0.0, amplitude_um), allowed_um(taken, math.inf, amplitude_um)
-    found = []
-    for quantity, value, near, allowed in (
-        ("largest error after the step", _largest_nm, NEAR, at_once),
-        ("static error after the step", _static_nm, 0.0, at_rest),
+    static_limit_um, peak_limit_um = allowed_um(taken, 0.0, amplitude_um), allowed_um(taken, math.inf, amplitude_um)
+    rows = []
+    for quantity, measure, tolerance_ratio, limit_um in (
+        ("largest error after the step", _largest_nm, NEAR, peak_limit_um),
+        ("static error after the step", _static_nm, 0.0, static_limit_um),
     ):
-        model_nm = None if model is None else value(model)
-        tolerance = max(STATIC_NEAR_NM, near * (model_nm or 0.0))
-        found.append(_row(taken, quantity, value(left), model_nm, tolerance, allowed))
-    if at_rest is not None:
-        within = [None if one is None else _within_ms(one, at_rest, taken.rate_hz) for one in (left, model)]
-        quantity, near = f"within {1e3 * at_rest:g} nm of it after", NEAR * (within[1] or 0.0)
-        found.insert(1, _row(taken, quantity, within[0] or 0.0, within[1], near, None, "ms"))
-    return found
+        model_nm = None if model is None else measure(model)
+        tolerance = max(STATIC_NEAR_NM, tolerance_ratio * (model_nm or 0.0))
+        rows.append(_row(taken, quantity, measure(left), model_nm, tolerance, limit_um))
+    if static_limit_um is not None:
+        settling_ms = [None if signal is None else _within_ms(signal, static_limit_um, taken.rate_hz) for signal in (left, model)]
+        quantity, tolerance_ratio = f"within {1e3 * static_limit_um:g} nm of it after", NEAR * (settling_ms[1] or 0.0)
+        rows.insert(1, _row(taken, quantity, settling_ms[0] or 0.0, settling_ms[1], tolerance_ratio, None, "ms"))
+    return rows
 
 
 def _largest_nm(left: Real) -> float:
@@ -150,46 +150,46 @@ def _within_ms(left: Real, allowed: float, rate_hz: float) -> float:
 def _over_frequency(taken: Taken, amplitude_um: float) -> dict[str, Any]:
     """What model and specification say of every frequency, in nm."""
     hz = np.geomspace(0.1, min(1000.0, 0.4 * taken.rate_hz), 2000)
-    rejected = taken.model.rejection(hz) if taken.model else None
-    asked_um = allowed_um(taken, 0.0, amplitude_um)
+    rejection = taken.model.rejection(hz) if taken.model else None
+    limit_um = allowed_um(taken, 0.0, amplitude_um)
     up_to_hz = taken.asked.disturbance.up_to_hz if taken.asked.disturbance else None
     return {
         "hz": hz,
-        "model_nm": None if rejected is None else 1e3 * amplitude_um * np.abs(rejected),
-        "asked_nm": None if asked_um is None else 1e3 * asked_um,
+        "model_nm": None if rejection is None else 1e3 * amplitude_um * np.abs(rejection),
+        "asked_nm": None if limit_um is None else 1e3 * limit_um,
         "asked_hz": min(up_to_hz or hz[-1], hz[-1]),
     }
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     """The step's decay, and what is left over frequency."""
-    step, left = figure.subplots(1, 2, width_ratios=(3, 2))
-    asked_nm = curves["asked_nm"]
-    if asked_nm is not None:
-        label, band_um = f"±{asked_nm:g} nm, as asked", 1e-3 * asked_nm
-        step.axhspan(-band_um, band_um, color=ink.asked, alpha=0.25, linewidth=0, label=label)
-        left.plot([curves["hz"][0], curves["asked_hz"]], [asked_nm] * 2, color=ink.asked, linewidth=1.2, linestyle="--",
-                  label=f"{asked_nm:g} nm, as asked")  # fmt: skip
+    step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
+    limit_nm = curves["asked_nm"]
+    if limit_nm is not None:
+        label, band_um = f"±{limit_nm:g} nm, as asked", 1e-3 * limit_nm
+        step_panel.axhspan(-band_um, band_um, color=ink.asked, alpha=0.25, linewidth=0, label=label)
+        frequency_panel.plot([curves["hz"][0], curves["asked_hz"]], [limit_nm] * 2, color=ink.asked, linewidth=1.2, linestyle="--",
+                  label=f"{limit_nm:g} nm, as asked")  # fmt: skip
     if "step" in curves:
-        step.plot(curves["time_ms"], curves["step"], color=ink.measured, label="position x")
+        step_panel.plot(curves["time_ms"], curves["step"], color=ink.measured, label="position x")
         if curves["model"] is not None:
-            step.plot(curves["time_ms"], curves["model"], color=ink.model, linewidth=0.9, label="model")
-    if (other := curves.get("beside")) is not None and "step" in other:
-        label = f"the same with {other['name']}"
-        step.plot(other["time_ms"], other["step"], color=ink.other, linewidth=0.9, label=label)
-    step.margins(x=0)
-    ink.label(step, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm")
-    ink.legend(step)
-    left.set_xscale("log")
-    left.set_yscale("log")
+            step_panel.plot(curves["time_ms"], curves["model"], color=ink.model, linewidth=0.9, label="model")
+    if (comparison := curves.get("beside")) is not None and "step" in comparison:
+        label = f"the same with {comparison['name']}"
+        step_panel.plot(comparison["time_ms"], comparison["step"], color=ink.other, linewidth=0.9, label=label)
+    step_panel.margins(x=0)
+    ink.label(step_panel, "time since the step of Ω / ms", "x / µm", f"step of {curves['amplitude_um']:g} µm")
+    ink.legend(step_panel)
+    frequency_panel.set_xscale("log")
+    frequency_panel.set_yscale("log")
     if curves["model_nm"] is not None:
-        left.plot(curves["hz"], curves["model_nm"], color=ink.model, linewidth=0.9, label="model, S·P")
+        frequency_panel.plot(curves["hz"], curves["model_nm"], color=ink.model, linewidth=0.9, label="model, S·P")
     if curves["sines"]:
-        left.plot(*zip(*curves["sines"], strict=True), "o", color=ink.measured, label="measured")
-    if other is not None and other["sines"]:
-        left.plot(*zip(*other["sines"], strict=True), "o", color=ink.other, label=other["name"])
-    ink.label(left, "frequency of Ω / Hz", "amplitude of x / nm", f"sines of {curves['amplitude_um']:g} µm")
-    ink.legend(left)
+        frequency_panel.plot(*zip(*curves["sines"], strict=True), "o", color=ink.measured, label="measured")
+    if comparison is not None and comparison["sines"]:
+        frequency_panel.plot(*zip(*comparison["sines"], strict=True), "o", color=ink.other, label=comparison["name"])
+    ink.label(frequency_panel, "frequency of Ω / Hz", "amplitude of x / nm", f"sines of {curves['amplitude_um']:g} µm")
+    ink.legend(frequency_panel)
 
 
 EXPERIMENT = Experiment(

@@ -53,8 +53,8 @@ def frequencies(setting: Setting) -> tuple[float, ...]:
     """From 0.01 Hz to beyond the resonance of the axis's model, dense about it."""
     resonance_hz = setting.model and setting.model.resonance_hz
     scale = (resonance_hz or REFERENCE_HZ) / REFERENCE_HZ
-    moved = FAST_HZ if abs(scale - 1) < 0.001 else [float(f"{scale * hz:.4g}") for hz in FAST_HZ]
-    return tuple(sorted({hz for hz in (*SLOW_HZ, *moved) if hz <= FASTEST_PART * setting.rate_hz}))
+    fast_hz = FAST_HZ if abs(scale - 1) < 0.001 else [float(f"{scale * hz:.4g}") for hz in FAST_HZ]
+    return tuple(sorted({hz for hz in (*SLOW_HZ, *fast_hz) if hz <= FASTEST_PART * setting.rate_hz}))
 
 
 class HarmonicOptions(Options):
@@ -85,35 +85,35 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
 
 def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
     """Magnitude, phase and coherence of each mode over frequency."""
-    (taken,) = recordings
-    found = {mode: _sweep(taken, mode) for mode in MODES}
-    raw, feedforward, closed = (found[mode] for mode in MODES)
-    model = Promised(taken.model, raw[:, 0], taken.rate_hz)
+    (run,) = recordings
+    sweeps = {mode: _sweep(run, mode) for mode in MODES}
+    raw, feedforward, closed = (sweeps[mode] for mode in MODES)
+    model = Promised(run.model, raw[:, 0], run.rate_hz)
     peak = raw[raw[:, 1].argmax()] if raw[-1, 0] > model.resonance_hz else np.full(4, np.nan)
     beyond_hz = HIGH_PART * model.resonance_hz
-    high = closed[closed[:, 0] >= beyond_hz]
-    low = [_low(one) for one in (raw, feedforward)]
-    shifts_db = _hysteresis_db(taken, options.amplitude_um)
+    high_rows = closed[closed[:, 0] >= beyond_hz]
+    low_db = [_low(sweep) for sweep in (raw, feedforward)]
+    shifts_db = _hysteresis_db(run, options.amplitude_um)
     rows = [
-        taken.row("resonance_hz", "frequency of the peak without control", "Hz", peak[0], model.peak_hz,
+        run.row("resonance_hz", "frequency of the peak without control", "Hz", peak[0], model.peak_hz,
                   max(NEAR_PEAK * (model.peak_hz or 0.0), _spacing(raw[:, 0], peak[0]))),
-        taken.row("", "height of the peak over low frequencies", "dB", peak[1] - low[0], model.peak_db, 0.5),
-        taken.row("open_low_db", "drive alone at low frequencies", "dB", low[0], shifts_db[0], NEAR_LOW_DB),
-        taken.row("", "feedforward at low frequencies", "dB", low[1], shifts_db[1], NEAR_LOW_DB),
-        taken.row("closed_low_db", "closed loop at the lowest frequency", "dB", float(closed[0, 1]),
+        run.row("", "height of the peak over low frequencies", "dB", peak[1] - low_db[0], model.peak_db, 0.5),
+        run.row("open_low_db", "drive alone at low frequencies", "dB", low_db[0], shifts_db[0], NEAR_LOW_DB),
+        run.row("", "feedforward at low frequencies", "dB", low_db[1], shifts_db[1], NEAR_LOW_DB),
+        run.row("closed_low_db", "closed loop at the lowest frequency", "dB", float(closed[0, 1]),
                   model.closed_low_db, 0.02),
-        taken.row("", "closed loop, −3 dB", "Hz", bandwidth(closed), model.bandwidth_hz,
+        run.row("", "closed loop, −3 dB", "Hz", bandwidth(closed), model.bandwidth_hz,
                   NEAR * (model.bandwidth_hz or 0.0)),
-        taken.row("closed_high_db", f"closed loop, largest beyond {beyond_hz:.3g} Hz", "dB",
-                  float(high[:, 1].max()) if len(high) else np.nan, model.closed_db_beyond(beyond_hz), 0.5),
+        run.row("closed_high_db", f"closed loop, largest beyond {beyond_hz:.3g} Hz", "dB",
+                  float(high_rows[:, 1].max()) if len(high_rows) else np.nan, model.closed_db_beyond(beyond_hz), 0.5),
     ]  # fmt: skip
     table = [[f"{hz:g}", *(f"{value:.{digits}f}" for mode in MODES for value, digits in
-              zip(found[mode][number, 1:], (3, 2, 4), strict=True))]
+              zip(sweeps[mode][number, 1:], (3, 2, 4), strict=True))]
              for number, hz in enumerate(raw[:, 0])]  # fmt: skip
-    headings = ("f / Hz", *(f"{name}: {what}" for name in ("drive", "feedforward", "closed") for what in
+    headings = ("f / Hz", *(f"{name}: {column}" for name in ("drive", "feedforward", "closed") for column in
                             ("dB", "phase / °", "γ²")))  # fmt: skip
     notes = [
-        f"Amplitude {options.amplitude_um:g} µm. Drive alone: position per volt, relative to {_gain(taken):.4g} "
+        f"Amplitude {options.amplitude_um:g} µm. Drive alone: position per volt, relative to {_gain(run):.4g} "
         "µm/V, the model's mean gain over the whole drive. A small amplitude does not leave the dead band of the "
         "hysteresis: what drive and feedforward reach at low frequencies depends on it. The model's figures for both "
         "are those of [axis.feedforward] at this amplitude.",
@@ -125,8 +125,8 @@ def analyse(recordings: Sequence[Taken], options: HarmonicOptions) -> Analysis:
         "The models are [axis.model] held over each tick, shifted by the hysteresis at this amplitude, and the loop of "
         "[axis.controller] and [axis.model] as it runs.",
     ]
-    curves = {"found": found, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
-              "claimed": taken.asked.claims.get("resonance_hz")}  # fmt: skip
+    curves = {"found": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
+              "claimed": run.asked.claims.get("resonance_hz")}  # fmt: skip
     return Analysis(rows, curves, (Table("Every frequency", headings, table),), notes)
 
 
@@ -135,17 +135,17 @@ def _hysteresis_db(taken: Taken, amplitude_um: float) -> tuple[float | None, flo
     if not isinstance(feedforward, PrandtlIshlinskiiOptions) or taken.model is None or feedforward.dead_band != "none":
         return None, None
     gain_db = 20 * math.log10(abs(taken.static_gain))
-    raw, behind_inverse = hysteresis_db(taken.actuator_model, feedforward.models()[1], _gain(taken), amplitude_um)
-    return raw + gain_db, behind_inverse + gain_db
+    raw_db, inverse_db = hysteresis_db(taken.actuator_model, feedforward.models()[1], _gain(taken), amplitude_um)
+    return raw_db + gain_db, inverse_db + gain_db
 
 
 def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
     """Fundamental for a sine of this amplitude in dB: of a drive, over `um_per_v`, and of a command, over 1."""
-    wave = amplitude_um * np.sin(2 * np.pi * np.arange(3 * TICKS_OF_A_CYCLE) / TICKS_OF_A_CYCLE)
-    drives = wave / um_per_v, model_output(inverse, wave)
-    found = [model_output(actuator, drive)[-TICKS_OF_A_CYCLE:] for drive in drives]
-    raw, behind_inverse = (abs(tone(one, 1.0, TICKS_OF_A_CYCLE).amplitude) / amplitude_um for one in found)
-    return _db(raw), _db(behind_inverse)
+    command = amplitude_um * np.sin(2 * np.pi * np.arange(3 * TICKS_OF_A_CYCLE) / TICKS_OF_A_CYCLE)
+    drives = command / um_per_v, model_output(inverse, command)
+    positions = [model_output(actuator, drive)[-TICKS_OF_A_CYCLE:] for drive in drives]
+    raw_ratio, inverse_ratio = (abs(tone(position, 1.0, TICKS_OF_A_CYCLE).amplitude) / amplitude_um for position in positions)
+    return _db(raw_ratio), _db(inverse_ratio)
 
 
 def _db(ratio: float) -> float:
@@ -158,38 +158,38 @@ def _sweep(taken: Taken, mode: str) -> Real:
     rows = []
     for segment in taken.labelled("sine"):
         if segment.mode == mode:
-            part = taken.tail(segment, segment.values["measured_ticks"])
+            measured_slice = taken.tail(segment, segment.values["measured_ticks"])
             hz = segment.values["frequency_hz"]
-            gain, coherence = response(u[part], x[part], hz, taken.rate_hz)
-            relative = gain / segment.values["gain"]
-            rows.append((hz, 20 * np.log10(abs(relative)), np.degrees(np.angle(relative)), coherence))
+            gain, coherence = response(u[measured_slice], x[measured_slice], hz, taken.rate_hz)
+            relative_gain = gain / segment.values["gain"]
+            rows.append((hz, 20 * np.log10(abs(relative_gain)), np.degrees(np.angle(relative_gain)), coherence))
     return np.array(rows)[::-1]
 
 
 def _gain(taken: Taken) -> float:
-    return next(one.values["gain"] for one in taken.labelled("sine"))
+    return next(segment.values["gain"] for segment in taken.labelled("sine"))
 
 
 def _low(found: Real) -> float:
     """Median magnitude up to LOW_HZ, or the lowest there is."""
-    inside = found[:, 0] <= max(LOW_HZ, found[0, 0])
-    return float(np.median(found[inside, 1]))
+    is_low = found[:, 0] <= max(LOW_HZ, found[0, 0])
+    return float(np.median(found[is_low, 1]))
 
 
 def _spacing(hz: Real, at_hz: float) -> float:
     """Distance from a measured frequency to its further neighbour."""
     if not np.isfinite(at_hz):
         return 0.0
-    near = np.sort(np.abs(hz - at_hz))[:3]
-    return float(near[-1])
+    distances = np.sort(np.abs(hz - at_hz))[:3]
+    return float(distances[-1])
 
 
 def bandwidth(found: Real) -> float:
     """Where the magnitude first falls 3 dB below that of the lowest frequency, between points on a line; else NaN."""
-    below = np.flatnonzero(found[:, 1] < found[0, 1] - 20 * np.log10(np.sqrt(2)))
-    if not below.size:
+    attenuated = np.flatnonzero(found[:, 1] < found[0, 1] - 20 * np.log10(np.sqrt(2)))
+    if not attenuated.size:
         return np.nan
-    i = below[0]
+    i = attenuated[0]
     return float(
         np.interp(-(found[0, 1] - 20 * np.log10(np.sqrt(2))), -found[i - 1 : i + 1, 1], found[i - 1 : i + 1, 0])
     )
@@ -216,14 +216,14 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
 def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):
-        hz, decibels, degrees, part = curves["found"][mode].T
-        trusted = np.where(part >= LEAST_COHERENCE, 1.0, np.nan)
+        hz, decibels, degrees, coherences = curves["found"][mode].T
+        mask = np.where(coherences >= LEAST_COHERENCE, 1.0, np.nan)
         style = {"color": color, "markersize": 3, "linewidth": 0.9}
-        magnitude.plot(hz, decibels * trusted, "o-", label=NAMES[mode], **style)
-        phase.plot(hz, unwrapped(degrees, trusted), "o-", **style)
-        coherence.plot(hz, part, "o-", **style)
-    for label, dashed, hz, decibels in curves["modelled"]:
-        magnitude.plot(hz, decibels, color=ink.model, linewidth=0.8, linestyle="--" if dashed else "-", label=label)
+        magnitude.plot(hz, decibels * mask, "o-", label=NAMES[mode], **style)
+        phase.plot(hz, unwrapped(degrees, mask), "o-", **style)
+        coherence.plot(hz, coherences, "o-", **style)
+    for label, is_dashed, hz, decibels in curves["modelled"]:
+        magnitude.plot(hz, decibels, color=ink.model, linewidth=0.8, linestyle="--" if is_dashed else "-", label=label)
     claim = curves["claimed"]
     if claim is not None and claim.at_least is not None and claim.at_most is not None:
         label = f"resonance as claimed: {claim.says}"
@@ -232,9 +232,9 @@ def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Ink) -> None:
 
 def unwrapped(degrees: Real, trusted: Real) -> Real:
     """Phases of the trusted points (1, else NaN) without jumps of a turn."""
-    found, kept = degrees * trusted, trusted == 1.0
-    found[kept] = np.degrees(np.unwrap(np.radians(degrees[kept])))
-    return found
+    phases, is_trusted = degrees * trusted, trusted == 1.0
+    phases[is_trusted] = np.degrees(np.unwrap(np.radians(degrees[is_trusted])))
+    return phases
 
 
 EXPERIMENT = Experiment(

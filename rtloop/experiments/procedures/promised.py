@@ -24,8 +24,8 @@ class Promised:
         self.resonance_hz = (model and model.resonance_hz) or REFERENCE_HZ
         self.near_hz = NEAR[0] * self.resonance_hz, NEAR[1] * self.resonance_hz
         highest_hz = min(max(float(measured_hz[-1]), 10.0), 0.499 * rate_hz)
-        around = np.linspace(*self.near_hz, 500)
-        grid = np.union1d(np.geomspace(min(0.01, measured_hz[0]), highest_hz, 3000), around[around <= 0.499 * rate_hz])
+        resonance_grid = np.linspace(*self.near_hz, 500)
+        grid = np.union1d(np.geomspace(min(0.01, measured_hz[0]), highest_hz, 3000), resonance_grid[resonance_grid <= 0.499 * rate_hz])
         self._hz, self._measured_hz = grid, measured_hz
         tracking = model.tracking(grid) if model else None
         self._closed_db = None if tracking is None else 20 * np.log10(np.abs(tracking))
@@ -56,8 +56,8 @@ class Promised:
         """Where the closed loop has first lost 3 dB."""
         if self._closed_db is None:
             return None
-        below = np.flatnonzero(self._closed_db < self._closed_db[0] - HALF_POWER_DB)
-        return float(self._hz[below[0]]) if below.size else None
+        attenuated = np.flatnonzero(self._closed_db < self._closed_db[0] - HALF_POWER_DB)
+        return float(self._hz[attenuated[0]]) if attenuated.size else None
 
     def closed_db_beyond(self, hz: float) -> float | None:
         """The largest of the closed loop from `hz` on, of the frequencies that were measured."""
@@ -67,11 +67,11 @@ class Promised:
 
     def curves(self, shifts_db: tuple[float | None, ...]) -> list[Curve]:
         """The plant, shifted by what the hysteresis takes off, and the closed loop."""
-        found: list[Curve] = []
+        curves: list[Curve] = []
         for shift_db in shifts_db:
             if self._open_db is not None and shift_db is not None:
-                label = "" if found else "model: dynamics, hysteresis at this amplitude"
-                found.append((label, True, self._hz, self._open_db + shift_db))
+                label = "" if curves else "model: dynamics, hysteresis at this amplitude"
+                curves.append((label, True, self._hz, self._open_db + shift_db))
         if self._closed_db is not None:
-            found.append(("model: closed loop", False, self._hz, self._closed_db))
-        return found
+            curves.append(("model: closed loop", False, self._hz, self._closed_db))
+        return curves

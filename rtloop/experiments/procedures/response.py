@@ -61,12 +61,12 @@ def _period(options: ResponseOptions, setting: Setting) -> Real:
     """Of the reference, beginning where it is nearest to 0."""
     lines = _grid(options, setting)
     model = setting.model
-    moved = None if model is None else model.tracking(lines.hz)
-    if model is None or moved is None:
-        wave = first_period(lines, options.amplitude_um)
+    tracking = None if model is None else model.tracking(lines.hz)
+    if model is None or tracking is None:
+        period = first_period(lines, options.amplitude_um)
     else:
-        wave = fit_period(lines, moved, moved / model.plant(lines.hz), options.amplitude_um)
-    return np.round(np.roll(wave, -int(np.argmin(np.abs(wave)))), DIGITS)
+        period = fit_period(lines, tracking, tracking / model.plant(lines.hz), options.amplitude_um)
+    return np.round(np.roll(period, -int(np.argmin(np.abs(period)))), DIGITS)
 
 
 def _grid(options: ResponseOptions, setting: Setting) -> LineGrid:
@@ -77,72 +77,72 @@ def _grid(options: ResponseOptions, setting: Setting) -> LineGrid:
 
 def analyse(recordings: Sequence[Taken], options: ResponseOptions) -> Analysis:
     """Margins, the resonance, and every line."""
-    (taken,) = recordings
-    near_hz, loop = (taken.model.resonance_hz, taken.model.loop) if taken.model else (None, None)
-    signals: dict[str, Real] = dict(zip(SIGNALS, taken.read(*SIGNALS), strict=True))
-    taps = taken.axis_options.prefilter.command_taps
-    found = measure_loop(signals, taken.rate_hz, near_hz, loop, taps)
-    if (moved_um := found.response.moved_um) > options.amplitude_um:
+    (run,) = recordings
+    near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)
+    signals: dict[str, Real] = dict(zip(SIGNALS, run.read(*SIGNALS), strict=True))
+    taps = run.axis_options.prefilter.command_taps
+    measurement = measure_loop(signals, run.rate_hz, near_hz, loop, taps)
+    if (moved_um := measurement.response.moved_um) > options.amplitude_um:
         raise UnsuitableData(f"the position moved by {moved_um:.3g} µm, {options.amplitude_um:g} µm were stated")
-    promised = loop_margins(loop)._asdict() if loop else {}
+    promised_margins = loop_margins(loop)._asdict() if loop else {}
     rows = [
-        _row(taken, name, label, unit, getattr(found.margins, name), promised.get(name)) for name, label, unit in ROWS
+        _row(run, name, label, unit, getattr(measurement.margins, name), promised_margins.get(name)) for name, label, unit in ROWS
     ]
-    if found.mode is not None:
+    if measurement.mode is not None:
         rows.append(
             _row(
-                taken,
+                run,
                 "resonance_hz",
                 "resonance",
                 "Hz",
-                UncertainValue(found.mode.hz, found.mode.hz_std),
+                UncertainValue(measurement.mode.hz, measurement.mode.hz_std),
                 near_hz,
                 NEAR_MODE,
             )
         )
-    measured = [
-        [label, f"{one.value:.5g}", f"{one.std:.2g}"]
+    deviations = [
+        [label, f"{margin.value:.5g}", f"{margin.std:.2g}"]
         for name, label, _ in ROWS
-        if math.isfinite((one := getattr(found.margins, name)).value)
+        if math.isfinite((margin := getattr(measurement.margins, name)).value)
     ]
     notes = [
         f"The position was moved by {moved_um:.3g} µm. What is measured is the loop of so small a motion: a hysteresis "
         "that is left makes its gain another than the linear model's, and adds to the uncertainty, which is that of "
         "noise and of all that is not linear."
     ]
-    curves = {"hz": found.loop.hz, "loop": found.loop.loop, "spread": found.loop.spread,
-              "model": None if loop is None else loop.open(found.loop.hz)}  # fmt: skip
-    return Analysis(rows, curves, (Table("Standard deviations", ("margin", "measured", "± (1σ)"), measured),), notes)
+    curves = {"hz": measurement.loop.hz, "loop": measurement.loop.loop, "spread": measurement.loop.spread,
+              "model": None if loop is None else loop.open(measurement.loop.hz)}  # fmt: skip
+    return Analysis(rows, curves, (Table("Standard deviations", ("margin", "measured", "± (1σ)"), deviations),), notes)
 
 
 def _row(
     taken: Taken, name: str, label: str, unit: str, found: UncertainValue, model: float | None, part: float = NEAR
 ) -> Row:
-    near = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), part * abs(model or 0.0))
-    return taken.row(name, label, unit, found.value, model, near)
+    tolerance = max(CERTAIN * (found.std if math.isfinite(found.std) else 0.0), part * abs(model or 0.0))
+    return taken.row(name, label, unit, found.value, model, tolerance)
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     """L in magnitude and phase, and |S|, over the model's."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
-    size, phase, sensitivity = figure.subplots(3, 1, sharex=True)
+    magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)
     std = np.abs(loop) * curves["spread"]
     for panel, value, width in (
-        (size, np.abs(loop), std),
+        (magnitude, np.abs(loop), std),
         (sensitivity, 1 / np.abs(1 + loop), std / np.abs(1 + loop) ** 2),
     ):
         panel.fill_between(hz, np.maximum(value - 2 * width, 1e-9), value + 2 * width, color=ink.measured, alpha=0.25)
         panel.loglog(hz, value, ".-", color=ink.measured, markersize=3, linewidth=0.8, label="measured, ±2σ")
     phase.semilogx(hz, np.degrees(np.unwrap(np.angle(loop))), ".-", color=ink.measured, markersize=3, linewidth=0.8)
     if model is not None:
-        size.loglog(hz, np.abs(model), color=ink.model, linewidth=0.8, label="model")
+        magnitude.loglog(hz, np.abs(model), color=ink.model, linewidth=0.8, label="model")
         phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=ink.model, linewidth=0.8)
         sensitivity.loglog(hz, 1 / np.abs(1 + model), color=ink.model, linewidth=0.8)
-    size.set_ylim(bottom=0.3 * float(np.abs(loop).min()))
-    ink.label(size, "", "|L|", "loop, measured in closed loop")
+    magnitude.set_ylim(bottom=0.3 * float(np.abs(loop).min()))
+    ink.label(magnitude, "", "|L|", "loop, measured in closed loop")
     ink.label(phase, "", "phase of L / °")
     ink.label(sensitivity, "frequency / Hz", "|S|")
-    ink.legend(size, loc="lower left")
+    ink.legend(magnitude, loc="lower left")
 
 
 EXPERIMENT = Experiment(

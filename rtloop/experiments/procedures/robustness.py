@@ -53,14 +53,14 @@ class Outcome(NamedTuple):
 
 def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
     """One for each shift."""
-    found = []
+    planned_runs = []
     for shift in options.shifts_percent:
         timeline = setting.timeline()
         timeline.add("rest", "closed_loop", hold(0.0), REST_S)
         timeline.add("step", "closed_loop", hold(options.step_um), options.duration_s, shift_percent=shift)
         change = {"dynamics": {"resonance_shift": shift / 100}}
-        found.append(Run(f"{shift:+g} %", timeline, change, may_trip=True))
-    return found
+        planned_runs.append(Run(f"{shift:+g} %", timeline, change, may_trip=True))
+    return planned_runs
 
 
 def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis:
@@ -71,23 +71,23 @@ def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis
         step = taken.labelled("step")[0]
         position = taken.signal("position_um")[step.start_tick : step.start_tick + step.ticks]
         trip = taken.trip
-        last = position[-position.size // 5 :]
+        tail = position[-position.size // 5 :]
         shift = step.values["shift_percent"]
-        outcomes.append(Outcome(shift, float(np.ptp(last)), float(np.abs(position).max()), trip))
+        outcomes.append(Outcome(shift, float(np.ptp(tail)), float(np.abs(position).max()), trip))
         traces.append((shift, position, outcomes[-1].words))
     model = ordered[0].model
-    tolerated = model.tolerated if model else None
-    predicted = {one: model.stable_at(one) for one in options.shifts_percent} if model and tolerated else None
-    table = [[f"{one.shift_percent:+g}", _words(predicted, one.shift_percent), one.words,
-              f"{one.swing_um:.3f}", f"{one.largest_um:.2f}"] for one in outcomes]  # fmt: skip
+    tolerated_shifts = model.tolerated if model else None
+    predicted = {outcome: model.stable_at(outcome) for outcome in options.shifts_percent} if model and tolerated_shifts else None
+    table = [[f"{outcome.shift_percent:+g}", _words(predicted, outcome.shift_percent), outcome.words,
+              f"{outcome.swing_um:.3f}", f"{outcome.largest_um:.2f}"] for outcome in outcomes]  # fmt: skip
     rows = []
     modelled = (None, None) if predicted is None else range_about_zero(predicted)
-    for which, run, said in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
-        near = to_next(run, options.shifts_percent, down=which == "lowest")
-        rows.append(ordered[0].row("", f"{which} tested shift that settles", "%", run, said, near))
-    by_it = f": by it {format_range(tolerated)} are tolerated" if tolerated else ""
+    for end, tested_shift, model_shift in zip(("lowest", "highest"), stable_range(outcomes), modelled, strict=True):
+        tolerance = to_next(tested_shift, options.shifts_percent, down=end == "lowest")
+        rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
+    tolerated_text = f": by it {format_range(tolerated_shifts)} are tolerated" if tolerated_shifts else ""
     notes = ["The model's are those of the tested shifts with which the loop of [axis.controller] and [axis.model] is "
-             f"stable as it runs{by_it}. The tolerance is the distance to the next shift that was tried.",
+             f"stable as it runs{tolerated_text}. The tolerance is the distance to the next shift that was tried.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
              "ringing that leaves the dead band grows, until the interlocks of the configuration trip."]  # fmt: skip
@@ -98,21 +98,21 @@ def analyse(recordings: Sequence[Taken], options: RobustnessOptions) -> Analysis
 
 def stable_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
     """Lowest and highest shift that settles with no worse one between it and 0; NaN where 0 itself does not."""
-    return range_about_zero({one.shift_percent: one.settles for one in outcomes})
+    return range_about_zero({outcome.shift_percent: outcome.settles for outcome in outcomes})
 
 
 def range_about_zero(good: Mapping[float, bool]) -> tuple[float, float]:
     """Ends of the good shifts with no bad one between them and 0; NaN where none is."""
-    settled, bad = ([s for s, answer in good.items() if answer is wanted] for wanted in (True, False))
-    above, below = min((s for s in bad if s >= 0), default=np.inf), max((s for s in bad if s <= 0), default=-np.inf)
-    inside = [s for s in settled if below < s < above]
-    return (min(inside), max(inside)) if inside else (np.nan, np.nan)
+    good_shifts, bad_shifts = ([s for s, value in good.items() if value is expected] for expected in (True, False))
+    lowest_bad, highest_bad = min((s for s in bad_shifts if s >= 0), default=np.inf), max((s for s in bad_shifts if s <= 0), default=-np.inf)
+    stable_shifts = [s for s in good_shifts if highest_bad < s < lowest_bad]
+    return (min(stable_shifts), max(stable_shifts)) if stable_shifts else (np.nan, np.nan)
 
 
 def to_next(shift: float, shifts: Sequence[float], down: bool) -> float:
     """Distance to the next shift beyond; 0 where none was tried."""
-    beyond = [abs(one - shift) for one in shifts if (one < shift if down else one > shift)]
-    return min(beyond, default=0.0)
+    distances = [abs(other_shift - shift) for other_shift in shifts if (other_shift < shift if down else other_shift > shift)]
+    return min(distances, default=0.0)
 
 
 def _words(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
@@ -125,15 +125,15 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     columns = min(5, len(traces))
     rows = -(-len(traces) // columns)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
-    for number, (panel, (shift, position, words)) in enumerate(zip(panels, traces, strict=False)):
-        color = ink.measured if words == "settles" else ink.asked if words.startswith("goes") else ink.error
+    for number, (panel, (shift, position, outcome_text)) in enumerate(zip(panels, traces, strict=False)):
+        color = ink.measured if outcome_text == "settles" else ink.asked if outcome_text.startswith("goes") else ink.error
         panel.plot(*envelope(position, curves["rate_hz"], 600), color=color, linewidth=0.8)
         label = f"{shift:+g} %" if shift else "0 %"
         ink.label(
             panel, "time / s" if number // columns == rows - 1 else "", "x / µm" if number % columns == 0 else "", label
         )
         panel.text(
-            0.96, 0.06, words.replace(" (", "\n("), transform=panel.transAxes, color=color, fontsize=8, ha="right"
+            0.96, 0.06, outcome_text.replace(" (", "\n("), transform=panel.transAxes, color=color, fontsize=8, ha="right"
         )
     for panel in panels[len(traces) :]:
         panel.set_visible(False)

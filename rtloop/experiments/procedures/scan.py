@@ -61,7 +61,7 @@ def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> R
         return None
     tables = []
     for number in range(len(options.frequencies_hz)):
-        errors = [_error(taken, number) for taken in takings]
+        errors = [_error(run, number) for run in takings]
         sizes = [rms(error) for error in errors]
         best = int(np.argmin(sizes))
         table = _table(takings[best], number)
@@ -72,15 +72,15 @@ def go_on(takings: Sequence[Taken], options: ScanOptions, setting: Setting) -> R
 
 
 def _run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
-    timeline, kept = setting.timeline(), {}
+    timeline, named_tables = setting.timeline(), {}
     timeline.add("rest", "closed_loop", hold(0.0), REST_S)
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
-        settle, measured = cycle_periods(len(table), setting.rate_hz)
-        kept[name] = table
-        timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, (settle + measured) * period_s,
-                     frequency_hz=hz, period_ticks=len(table), periods=measured)  # fmt: skip
-    return Run(f"cycle {cycle}", timeline, tables=kept)
+        settling_periods, measured_periods = cycle_periods(len(table), setting.rate_hz)
+        named_tables[name] = table
+        timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, (settling_periods + measured_periods) * period_s,
+                     frequency_hz=hz, period_ticks=len(table), periods=measured_periods)  # fmt: skip
+    return Run(f"cycle {cycle}", timeline, tables=named_tables)
 
 
 def _period(hz: float, rate_hz: float) -> int:
@@ -113,15 +113,15 @@ def _measured(taken: Taken, number: int) -> tuple[slice, int]:
 
 def _table(taken: Taken, number: int) -> Real:
     """The table (period, 2) that was played."""
-    judged, ticks = _measured(taken, number)
+    measured_slice, ticks = _measured(taken, number)
     reference, feed = taken.read("reference_um", "feed_um")
-    return np.column_stack([reference[judged][:ticks], feed[judged][:ticks]])
+    return np.column_stack([reference[measured_slice][:ticks], feed[measured_slice][:ticks]])
 
 
 def _error(taken: Taken, number: int) -> Real:
     """Wanted minus measured (period,), the mean of all periods that are judged."""
-    judged, ticks = _measured(taken, number)
-    position = taken.signal("position_um")[judged].reshape(-1, ticks).mean(axis=0)
+    measured_slice, ticks = _measured(taken, number)
+    position = taken.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
     return triangle(ticks, float(taken.parameters["amplitude_um"])) - position
 
 
@@ -131,11 +131,11 @@ def analyse(recordings: Sequence[Taken], options: ScanOptions) -> Analysis:
     table, traces = [], []
     extent_um = 2 * options.amplitude_um
     for number, hz in enumerate(options.frequencies_hz):
-        errors = [_error(taken, number) for taken in recordings]
+        errors = [_error(run, number) for run in recordings]
         percent = [100 * rms(error) / extent_um for error in errors]
         rows += [
-            recordings[0].row("", f"rms error at {hz:g} Hz, {what}", "%", percent[at])
-            for what, at in (("nothing learned", 0), (f"after {len(errors) - 1} cycles", -1))
+            recordings[0].row("", f"rms error at {hz:g} Hz, {condition}", "%", percent[cycle_index])
+            for condition, cycle_index in (("nothing learned", 0), (f"after {len(errors) - 1} cycles", -1))
         ]
         table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
         traces.append((hz, percent, errors[0], errors[-1]))
@@ -150,11 +150,11 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     """Error over a period before and after, and its size from cycle to cycle."""
     traces = curves["traces"]
     panels = figure.subplots(1, len(traces) + 1)
-    for panel, (hz, _, first, last) in zip(panels, traces, strict=False):
-        turns = np.arange(first.size) / first.size
-        panel.plot(turns, first, color=ink.faint, label="nothing learned")
-        panel.plot(turns, last, color=ink.error, label="learned")
-        panel.set_yscale("symlog", linthresh=max(1e-3, 2 * float(np.abs(last).max())))
+    for panel, (hz, _, first_error, last_error) in zip(panels, traces, strict=False):
+        turns = np.arange(first_error.size) / first_error.size
+        panel.plot(turns, first_error, color=ink.faint, label="nothing learned")
+        panel.plot(turns, last_error, color=ink.error, label="learned")
+        panel.set_yscale("symlog", linthresh=max(1e-3, 2 * float(np.abs(last_error).max())))
         ink.label(panel, "period", "error / µm" if panel is panels[0] else "", f"{hz:g} Hz")
     ink.legend(panels[0])
     for (hz, percent, *_), colour in zip(traces, (ink.measured, ink.model, ink.error) * len(traces), strict=False):

@@ -45,31 +45,31 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
 
 def analyse(recordings: Sequence[Taken], options: SinesOptions) -> Analysis:
     """Rms error, amplitude and phase at each frequency."""
-    (taken,) = recordings
-    reference, position = taken.read("reference_um", "position_um")
+    (run,) = recordings
+    reference, position = run.read("reference_um", "position_um")
     rows, table, traces = [], [], []
-    for segment in taken.labelled("sine"):
+    for segment in run.labelled("sine"):
         hz = segment.values["frequency_hz"]
-        judged = taken.tail(segment, round(segment.values["cycles"] / hz * taken.rate_hz))
-        wanted, there = reference[judged], position[judged]
-        error = wanted - there
+        measured_slice = run.tail(segment, round(segment.values["cycles"] / hz * run.rate_hz))
+        setpoint, measured = reference[measured_slice], position[measured_slice]
+        error = setpoint - measured
         rms = float(np.sqrt(np.mean(error**2)))
-        gain = response(wanted, there, hz, taken.rate_hz)
+        gain = response(setpoint, measured, hz, run.rate_hz)
         phase = float(np.degrees(np.angle(gain.gain)))
-        model = taken.model.tracking(hz) if taken.model else None
+        model = run.model.tracking(hz) if run.model else None
         model_rms = None if model is None else options.amplitude_um * abs(1 - model[0]) / np.sqrt(2)
         model_phase = None if model is None else float(np.degrees(np.angle(model[0])))
         rows += [
-            taken.row("tracking", f"rms error at {hz:g} Hz", "µm", rms, model_rms,
+            run.row("tracking", f"rms error at {hz:g} Hz", "µm", rms, model_rms,
                       max(LEAST_NEAR * options.amplitude_um, NEAR * (model_rms or 0.0))),
-            taken.row("", f"phase at {hz:g} Hz", "°", phase, model_phase, max(0.3, 0.05 * abs(model_phase or 0.0))),
+            run.row("", f"phase at {hz:g} Hz", "°", phase, model_phase, max(0.3, 0.05 * abs(model_phase or 0.0))),
         ]  # fmt: skip
         table.append([f"{hz:g}", f"{rms:.4f}", f"{np.abs(error).max():.4f}", f"{abs(gain.gain):.5f}",
                       f"{20 * np.log10(abs(gain.gain)):.3f}", f"{phase:.3f}", f"{gain.coherence:.6f}"])  # fmt: skip
-        step = max(1, wanted.size // POINTS)
-        cycles = hz * np.arange(wanted.size)[::step] / taken.rate_hz
-        shown = cycles <= SHOWN_CYCLES
-        traces.append((hz, cycles[shown], wanted[::step][shown], there[::step][shown]))
+        step = max(1, setpoint.size // POINTS)
+        cycles = hz * np.arange(setpoint.size)[::step] / run.rate_hz
+        is_shown = cycles <= SHOWN_CYCLES
+        traces.append((hz, cycles[is_shown], setpoint[::step][is_shown], measured[::step][is_shown]))
     headings = ("f / Hz", "rms error / µm", "largest error / µm", "|x/x_d|", "dB", "phase / °", "coherence")
     notes = ["The model is the loop of [axis.controller] and [axis.model] as it runs, without hysteresis; what that "
              "adds shows at low frequencies."]  # fmt: skip
@@ -82,20 +82,20 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     columns = min(3, len(traces))
     rows = -(-len(traces) // columns)
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=(2, 1) * rows)
-    for number, (hz, cycles, wanted, there) in enumerate(traces):
+    for number, (hz, cycles, setpoint, measured) in enumerate(traces):
         row, column = divmod(number, columns)
-        above, below = figure.add_subplot(grid[2 * row, column]), figure.add_subplot(grid[2 * row + 1, column])
-        above.plot(cycles, there, color=ink.measured, linewidth=2.4, alpha=0.6, label="position x")
-        above.plot(cycles, wanted, color=ink.model, linewidth=0.9, label="reference")
-        below.plot(cycles, wanted - there, color=ink.error, linewidth=0.9, label="error")
-        above.tick_params(labelbottom=False)
-        for panel in (above, below):
+        signal_panel, error_panel = figure.add_subplot(grid[2 * row, column]), figure.add_subplot(grid[2 * row + 1, column])
+        signal_panel.plot(cycles, measured, color=ink.measured, linewidth=2.4, alpha=0.6, label="position x")
+        signal_panel.plot(cycles, setpoint, color=ink.model, linewidth=0.9, label="reference")
+        error_panel.plot(cycles, setpoint - measured, color=ink.error, linewidth=0.9, label="error")
+        signal_panel.tick_params(labelbottom=False)
+        for panel in (signal_panel, error_panel):
             panel.set_xlim(0, SHOWN_CYCLES)
             panel.set_xticks(np.arange(0, SHOWN_CYCLES + 0.1, 0.5))
-        ink.label(above, "", "x / µm" if column == 0 else "", f"{hz:g} Hz")
-        ink.label(below, "cycles" if row == rows - 1 else "", "e / µm" if column == 0 else "")
+        ink.label(signal_panel, "", "x / µm" if column == 0 else "", f"{hz:g} Hz")
+        ink.label(error_panel, "cycles" if row == rows - 1 else "", "e / µm" if column == 0 else "")
         if number == 0:
-            handles = [line for panel in (above, below) for line in panel.get_lines()]
+            handles = [line for panel in (signal_panel, error_panel) for line in panel.get_lines()]
             figure.legend(handles=handles, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
 
 

@@ -64,39 +64,39 @@ def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
 
 def analyse(recordings: Sequence[Taken], options: StepResponseOptions) -> Analysis:
     """Overshoot of the final value, frequency and damping of the ringing, beside those of the model's own answer."""
-    (taken,) = recordings
-    position = taken.signal("position_um")
-    rest, step = taken.labelled("rest")[0], taken.labelled("step")[0]
+    (run,) = recordings
+    position = run.signal("position_um")
+    rest, step = run.labelled("rest")[0], run.labelled("step")[0]
     height = position[whole(step)] - position[whole(rest)].mean()
     final = float(height[-height.size // 5 :].mean())
-    time_s = np.arange(height.size) / taken.rate_hz
-    window = ringing_window(taken.model)
-    ringing = fitted_ringing(height, taken.rate_hz, window)
+    time_s = np.arange(height.size) / run.rate_hz
+    window = ringing_window(run.model)
+    ringing = fitted_ringing(height, run.rate_hz, window)
     overshoot = 100 * (float(height.max() / final) - 1)
     modelled = Modelled(None, None, None, None, None)
-    if taken.model is not None:
-        answer = taken.model.open_answer(np.ones(height.size)) * final / taken.static_gain
-        own = fitted_ringing(answer, taken.rate_hz, window) if taken.model.resonance_hz else None
-        modelled = Modelled(answer, 100 * (float(answer.max() / final) - 1), own and own.frequency_hz,
-                            own and own.damping, 100 * float(np.abs(height - answer).max()) / final)  # fmt: skip
-    largest_v = options.part_of_drive * taken.axis_options.limits.drive_v
-    final_model = float(loading_curve(taken.actuator_model, largest_v)) * taken.static_gain if taken.model else None
+    if run.model is not None:
+        model_response = run.model.open_answer(np.ones(height.size)) * final / run.static_gain
+        model_ringing = fitted_ringing(model_response, run.rate_hz, window) if run.model.resonance_hz else None
+        modelled = Modelled(model_response, 100 * (float(model_response.max() / final) - 1), model_ringing and model_ringing.frequency_hz,
+                            model_ringing and model_ringing.damping, 100 * float(np.abs(height - model_response).max()) / final)  # fmt: skip
+    largest_v = options.part_of_drive * run.axis_options.limits.drive_v
+    final_model = float(loading_curve(run.actuator_model, largest_v)) * run.static_gain if run.model else None
     rows = [
-        taken.row("open_overshoot_percent", "overshoot", "%", overshoot, modelled.overshoot_percent, 0.5),
-        taken.row("resonance_hz", "frequency of the ringing", "Hz", ringing.frequency_hz, modelled.frequency_hz,
+        run.row("open_overshoot_percent", "overshoot", "%", overshoot, modelled.overshoot_percent, 0.5),
+        run.row("resonance_hz", "frequency of the ringing", "Hz", ringing.frequency_hz, modelled.frequency_hz,
                   NEAR * (modelled.frequency_hz or 0.0)),
-        taken.row("", "damping ratio of the ringing", "1", ringing.damping, modelled.damping,
+        run.row("", "damping ratio of the ringing", "1", ringing.damping, modelled.damping,
                   DAMPING_NEAR * (modelled.damping or 0.0)),
-        taken.row("", "final position", "µm", final, final_model, NEAR_FINAL * (final_model or 0.0)),
+        run.row("", "final position", "µm", final, final_model, NEAR_FINAL * (final_model or 0.0)),
     ]  # fmt: skip
     if modelled.difference_percent is not None:
-        off = modelled.difference_percent
-        rows.append(taken.row("open_fit", "largest difference to the model", "%", off, 0.0, 0.5))
+        difference = modelled.difference_percent
+        rows.append(run.row("open_fit", "largest difference to the model", "%", difference, 0.0, 0.5))
     notes = ["The model's answer is scaled to the final position: the height is the matter of the hysteresis. The "
-             "model is [axis.model] behind the loop's hold." if taken.model else "The axis has no model."]  # fmt: skip
-    shown = time_s <= SHOWN_S
-    curves = {"time_ms": 1e3 * time_s[shown], "measured": height[shown], "final": final,
-              "model": None if modelled.answer is None else modelled.answer[shown],
+             "model is [axis.model] behind the loop's hold." if run.model else "The axis has no model."]  # fmt: skip
+    is_shown = time_s <= SHOWN_S
+    curves = {"time_ms": 1e3 * time_s[is_shown], "measured": height[is_shown], "final": final,
+              "model": None if modelled.answer is None else modelled.answer[is_shown],
               "zoom_ms": 1e3 * SHOWN_PERIODS / ringing.frequency_hz}  # fmt: skip
     return Analysis(rows, curves, notes=notes)
 
@@ -113,21 +113,21 @@ def fitted_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] =
     """c + Re(a e^{(−σ + jω)t}) fitted to a step's answer within the window. Raises UnsuitableData."""
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
-    part = height[round(window_s[0] * rate_hz) : round(window_s[1] * rate_hz)]
-    time_s = np.arange(part.size) / rate_hz
-    spectrum = np.abs(np.fft.rfft((part - part.mean()) * np.hanning(part.size)))
-    hz = np.fft.rfftfreq(part.size, 1 / rate_hz)
+    ringing = height[round(window_s[0] * rate_hz) : round(window_s[1] * rate_hz)]
+    time_s = np.arange(ringing.size) / rate_hz
+    spectrum = np.abs(np.fft.rfft((ringing - ringing.mean()) * np.hanning(ringing.size)))
+    hz = np.fft.rfftfreq(ringing.size, 1 / rate_hz)
     spectrum[hz < LEAST_PERIODS / (window_s[1] - window_s[0])] = 0.0
-    if part.size < 50 or not spectrum.any():
-        raise UnsuitableData(f"step: {part.size} ticks of ringing; at least 50 are needed")
+    if ringing.size < 50 or not spectrum.any():
+        raise UnsuitableData(f"step: {ringing.size} ticks of ringing; at least 50 are needed")
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
 
     def residual(unknowns: Real) -> Real:
         columns = _columns(unknowns, time_s)
-        return columns @ np.linalg.lstsq(columns, part, rcond=None)[0] - part
+        return columns @ np.linalg.lstsq(columns, ringing, rcond=None)[0] - ringing
 
     sigma, omega = least_squares(residual, start, x_scale=[10.0, 10.0], method="lm").x
-    level = float(np.linalg.lstsq(_columns(np.array([sigma, omega]), time_s), part, rcond=None)[0][2])
+    level = float(np.linalg.lstsq(_columns(np.array([sigma, omega]), time_s), ringing, rcond=None)[0][2])
     size = float(np.hypot(sigma, omega))
     return Ringing(size / (2 * np.pi), float(sigma) / size, level)
 

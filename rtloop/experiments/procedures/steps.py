@@ -53,84 +53,84 @@ class Step(NamedTuple):
     @property
     def numbers(self) -> tuple[float, float, float, float]:
         """Overshoot %, settling ms, static error %, peak."""
-        of = self.metrics
-        return of.overshoot_percent, of.settling_time_ms, of.static_error_percent, self.peak
+        metrics = self.metrics
+        return metrics.overshoot_percent, metrics.settling_time_ms, metrics.static_error_percent, self.peak
 
 
 def analyse(recordings: Sequence[Taken], _: StepsOptions) -> Analysis:
     """Overshoot, settling and static error of every step; the middle one of each stands in the verdicts."""
-    (taken,) = recordings
-    reference, position, command, drive = taken.read("reference_um", "position_um", "command_um", "drive_v")
-    found = _steps(taken, reference, position, command)
-    if not found:
+    (run,) = recordings
+    reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
+    measured_steps = _steps(run, reference, position, command)
+    if not measured_steps:
         raise UnsuitableData("no level differs from the one before, or none is held for long enough")
-    middle = np.median([one.numbers for one in found], axis=0)
-    start = taken.labelled("rest")[0].start_tick
-    answer = taken.model.closed_answer(reference[start:]) if taken.model else None
-    modelled: list[Step] = []
-    if answer is not None:
-        answer = np.concatenate([np.zeros((2, start)), answer], axis=1)
-        modelled = _steps(taken, reference, *answer)
-    model = [float(value) for value in np.median([one.numbers for one in modelled], axis=0)] if modelled else [None] * 4
-    settling_near = max(SETTLING_NEAR_MS, SETTLING_NEAR * (model[1] or 0.0))
+    median_figures = np.median([step.numbers for step in measured_steps], axis=0)
+    start = run.labelled("rest")[0].start_tick
+    model_signals = run.model.closed_answer(reference[start:]) if run.model else None
+    model_steps: list[Step] = []
+    if model_signals is not None:
+        model_signals = np.concatenate([np.zeros((2, start)), model_signals], axis=1)
+        model_steps = _steps(run, reference, *model_signals)
+    model_figures = [float(value) for value in np.median([step.numbers for step in model_steps], axis=0)] if model_steps else [None] * 4
+    settling_tolerance = max(SETTLING_NEAR_MS, SETTLING_NEAR * (model_figures[1] or 0.0))
     rows = [
-        taken.row("overshoot_percent", "overshoot, median", "%", middle[0], model[0], OVERSHOOT_NEAR),
-        taken.row("settling_ms", "settling time to 5 %, median", "ms", middle[1], model[1], settling_near),
-        taken.row("static_error_percent", "static error, median", "%", middle[2], model[2], STATIC_NEAR),
-        taken.row("peak_command", "peak of v per step, median", "1", middle[3], model[3], PEAK_NEAR),
+        run.row("overshoot_percent", "overshoot, median", "%", median_figures[0], model_figures[0], OVERSHOOT_NEAR),
+        run.row("settling_ms", "settling time to 5 %, median", "ms", median_figures[1], model_figures[1], settling_tolerance),
+        run.row("static_error_percent", "static error, median", "%", median_figures[2], model_figures[2], STATIC_NEAR),
+        run.row("peak_command", "peak of v per step, median", "1", median_figures[3], model_figures[3], PEAK_NEAR),
     ]
-    shown = round(min(SHOWN_SETTLINGS * max(middle[1], 1.0) / 1e3, taken.shortest("level")) * taken.rate_hz)
+    shown_ticks = round(min(SHOWN_SETTLINGS * max(median_figures[1], 1.0) / 1e3, run.shortest("level")) * run.rate_hz)
     curves = {
         **{
-            name: envelope(signal, taken.rate_hz)
+            name: envelope(signal, run.rate_hz)
             for name, signal in (("reference", reference), ("position", position), ("drive", drive))
         },
-        "zoom_ms": 1e3 * np.arange(shown) / taken.rate_hz,
-        "zooms": _laid_over(taken, position, shown),
-        "model": None if answer is None else _laid_over(taken, answer[0], shown)[0],
-        "asked_ms": taken.asked.settling_ms,
-        "claimed": taken.asked.claims.get("settling_ms"),
+        "zoom_ms": 1e3 * np.arange(shown_ticks) / run.rate_hz,
+        "zooms": _laid_over(run, position, shown_ticks),
+        "model": None if model_signals is None else _laid_over(run, model_signals[0], shown_ticks)[0],
+        "asked_ms": run.asked.settling_ms,
+        "claimed": run.asked.claims.get("settling_ms"),
     }
     notes = ["The model is the loop of [axis.controller] and [axis.model] as it runs, given the recorded reference, "
              "without hysteresis: what is left of that rings longer the smaller the step.",
              "The static error is the mean of the last fifth of a level against the reference: a slow pole and the "
              "hysteresis are still moving where the level is short."]  # fmt: skip
-    return Analysis(rows, curves, (_table(found),), notes)
+    return Analysis(rows, curves, (_table(measured_steps),), notes)
 
 
 def _steps(taken: Taken, reference: Real, position: Real, command: Real) -> list[Step]:
     """Of every level that differs from the one before."""
-    found = []
-    for segment, before, level in _changes(taken):
+    steps = []
+    for segment, previous_um, level in _changes(taken):
         start, end = segment.start_tick, segment.start_tick + segment.ticks
         metrics = step_metrics(reference[start - 1 : end], position[start - 1 : end], taken.rate_hz)
         if metrics is not None:
-            moved = (command[start:end] - command[start - 1]) / (level - before)
-            found.append(Step(before, level, metrics, float(moved.max())))
-    return found
+            command_ratio = (command[start:end] - command[start - 1]) / (level - previous_um)
+            steps.append(Step(previous_um, level, metrics, float(command_ratio.max())))
+    return steps
 
 
 def _laid_over(taken: Taken, position: Real, ticks: int) -> list[Real]:
     """The first ticks of every step, divided by its height."""
     return [
-        (position[segment.start_tick : segment.start_tick + ticks] - before) / (level - before)
-        for segment, before, level in _changes(taken)
+        (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
+        for segment, previous_um, level in _changes(taken)
     ]
 
 
 def _changes(taken: Taken) -> Iterator[tuple[Segment, float, float]]:
     """Every level that differs from the one before, with both in µm."""
-    before = 0.0
+    previous_um = 0.0
     for segment in taken.labelled("level"):
         level = segment.values["level_um"]
-        if level != before:
-            yield segment, before, level
-        before = level
+        if level != previous_um:
+            yield segment, previous_um, level
+        previous_um = level
 
 
 def _table(found: Sequence[Step]) -> Table:
-    rows = [[f"{one.before_um:g} → {one.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
-             zip(one.numbers, (2, 1, 3, 2), strict=True))] for one in found]  # fmt: skip
+    rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
+             zip(step.numbers, (2, 1, 3, 2), strict=True))] for step in found]  # fmt: skip
     headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")
     return Table("Every step", headings, rows)
 
@@ -138,7 +138,7 @@ def _table(found: Sequence[Step]) -> Table:
 def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     """The series with its drive, and all steps laid over each other."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
-    series, drive, zoom = (figure.add_subplot(place) for place in (grid[0, 0], grid[1, 0], grid[:, 1]))
+    series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))
     series.plot(*curves["position"], color=ink.measured, label="position x")
     series.plot(*curves["reference"], color=ink.model, linewidth=0.8, label="reference")
     drive.plot(*curves["drive"], color=ink.drive, linewidth=0.9)
@@ -149,19 +149,19 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Ink) -> None:
     ink.legend(series)
     ink.label(drive, "time / s", "drive u / V")
     zoom.axhspan(0.95, 1.05, color=ink.faint, alpha=0.2, linewidth=0, label="±5 %")
-    if (asked_ms := curves["asked_ms"]) is not None:
+    if (limit_ms := curves["asked_ms"]) is not None:
         zoom.axvline(
-            asked_ms, color=ink.asked, linewidth=1.0, linestyle="--", label=f"asked: settled in {asked_ms:g} ms"
+            limit_ms, color=ink.asked, linewidth=1.0, linestyle="--", label=f"asked: settled in {limit_ms:g} ms"
         )
     if (claim := curves["claimed"]) is not None and claim.at_most is not None:
         zoom.axvline(claim.at_most, color=ink.asked, linewidth=1.0, linestyle=":", label=f"claimed: {claim.says}")
-    for number, one in enumerate(curves["zooms"]):
+    for number, trace in enumerate(curves["zooms"]):
         label = "each step, divided by its height" if number == 0 else None
-        zoom.plot(curves["zoom_ms"], one, color=ink.measured, linewidth=1.0, alpha=0.6, label=label)
-    if (other := curves.get("beside")) is not None:
-        for number, one in enumerate(other["zooms"]):
-            label = f"the same with {other['name']}" if number == 0 else None
-            zoom.plot(other["zoom_ms"], one, color=ink.other, linewidth=1.0, alpha=0.8, label=label)
+        zoom.plot(curves["zoom_ms"], trace, color=ink.measured, linewidth=1.0, alpha=0.6, label=label)
+    if (comparison := curves.get("beside")) is not None:
+        for number, trace in enumerate(comparison["zooms"]):
+            label = f"the same with {comparison['name']}" if number == 0 else None
+            zoom.plot(comparison["zoom_ms"], trace, color=ink.other, linewidth=1.0, alpha=0.8, label=label)
     if curves["model"] is not None:
         zoom.plot(curves["zoom_ms"], curves["model"], color=ink.model, linewidth=1.2, label="model")
     zoom.set_xlim(0, curves["zoom_ms"][-1])

@@ -56,12 +56,12 @@ class Aside:
 
 
 async def _said(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, Any]:
-    pipe, nothing = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
+    pipe, devnull = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
-        *command, stdin=pipe, stdout=pipe, stderr=nothing, env=os.environ | CALM
+        *command, stdin=pipe, stdout=pipe, stderr=devnull, env=os.environ | CALM
     )
     try:
-        out, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
+        output, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
     except TimeoutError:
         raise Failed(f"not done within {timeout_s:g} s: it takes too long for the page; use the command line") from None
     finally:
@@ -70,9 +70,9 @@ async def _said(command: list[str], stdin: bytes, timeout_s: float) -> dict[str,
                 process.kill()
             await process.wait()
     try:
-        said = json.loads(out)
+        result = json.loads(output)
     except ValueError:
         raise Failed(f"{command[2]} ended with {process.returncode}") from None
-    if "error" in said:
-        raise Failed(said["error"], said.get("exit_code"))
-    return said
+    if "error" in result:
+        raise Failed(result["error"], result.get("exit_code"))
+    return result

@@ -50,30 +50,30 @@ def sweep(path: Path, wanted: Wanted) -> bytes:
         for name, low, high in zip(wanted.signals, points.low, points.high, strict=True):
             arrays |= {f"{name}:low": low, f"{name}:high": high}
         header = {"run": -1, "first": first, "trigger": trigger, "end": end, "cause": "recording", "uncertain_ticks": 0}
-        beside = {"number": 0, "complete": True, "rate_hz": reader.header["rate_hz"], "signals": wanted.signals}
-        return pack("sweep", header | beside | {"file": shown_name(path.name)}, arrays)
+        view_fields = {"number": 0, "complete": True, "rate_hz": reader.header["rate_hz"], "signals": wanted.signals}
+        return pack("sweep", header | view_fields | {"file": shown_name(path.name)}, arrays)
 
 
 def _stretch(seeker: ChunkSeeker, wanted: Wanted) -> tuple[int, int]:
-    begin, last, cut = seeker.first_span(), seeker.last_span(), seeker.reader.header.get("cut")
-    if begin is None or last is None:
+    first_span, last_span, cut = seeker.first_span(), seeker.last_span(), seeker.reader.header.get("cut")
+    if first_span is None or last_span is None:
         raise ValueError("the recording holds no ticks")
-    first, end = (begin.first, last.last + 1) if cut is None else (cut["first"], cut["end"])
+    first, end = (first_span.first, last_span.last + 1) if cut is None else (cut["first"], cut["end"])
     first = first if wanted.first is None else wanted.first
     end = end if wanted.ticks is None else first + wanted.ticks
-    if not begin.first <= first < end <= last.last + 1:
-        raise ValueError(f"ticks {first} to {end - 1}: not in the recording; {begin.first} to {last.last} are")
+    if not first_span.first <= first < end <= last_span.last + 1:
+        raise ValueError(f"ticks {first} to {end - 1}: not in the recording; {first_span.first} to {last_span.last} are")
     if (end - first) * len(wanted.signals) > MOST_VALUES:
-        most = MOST_VALUES // len(wanted.signals)
-        raise ValueError(f"ticks: {end - first}; at most {most} of {len(wanted.signals)} signals are shown at once")
+        max_ticks = MOST_VALUES // len(wanted.signals)
+        raise ValueError(f"ticks: {end - first}; at most {max_ticks} of {len(wanted.signals)} signals are shown at once")
     return first, end
 
 
 def _values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
     """(columns, end − first); NaN for ticks that are not there."""
     values = np.full((len(columns), end - first), np.nan)
-    for place in range(seeker.find_place(first), min(seeker.find_place(end - 1) + 1, seeker.end)):
-        rows = seeker.rows(place, first, end)
+    for chunk in range(seeker.find_place(first), min(seeker.find_place(end - 1) + 1, seeker.end)):
+        rows = seeker.rows(chunk, first, end)
         if len(rows):
             values[:, rows[:, TICK].astype(np.intp) - first] = rows[:, columns].T
     return values

@@ -51,23 +51,23 @@ class Shelf:
         What is not known, or not yet, is None.
         """
         with self._lock:
-            lying = sorted(self._lying(), key=lambda one: one.changed_ns, reverse=True)[:MOST_LISTED]
-            until_s = time.monotonic() + BUDGET_S
-            seen = {}
-            for one in lying:
-                if one in self._seen:
-                    seen[one] = self._seen[one]
-                elif time.monotonic() < until_s:
-                    seen[one] = _summary(self.folder / one.name, one.bytes)
-            self._seen = seen
+            files = sorted(self._lying(), key=lambda file: file.changed_ns, reverse=True)[:MOST_LISTED]
+            deadline_s = time.monotonic() + BUDGET_S
+            summaries = {}
+            for file in files:
+                if file in self._seen:
+                    summaries[file] = self._seen[file]
+                elif time.monotonic() < deadline_s:
+                    summaries[file] = _summary(self.folder / file.name, file.bytes)
+            self._seen = summaries
             return [
                 {
-                    "file": shown_name(one.name),
-                    "bytes": one.bytes,
-                    "captured": ".capture-" in one.name,
-                    **seen.get(one, UNKNOWN),
+                    "file": shown_name(file.name),
+                    "bytes": file.bytes,
+                    "captured": ".capture-" in file.name,
+                    **summaries.get(file, UNKNOWN),
                 }
-                for one in lying
+                for file in files
             ]
 
     def path(self, name: str) -> Path | None:
@@ -75,21 +75,21 @@ class Shelf:
 
         A file of exactly this name goes before one whose name is escaped to it.
         """
-        names = [one.name for one in self._lying()]
-        match = name if name in names else next((one for one in names if shown_name(one) == name), None)
+        names = [file.name for file in self._lying()]
+        match = name if name in names else next((file for file in names if shown_name(file) == name), None)
         return None if match is None else self.folder / match
 
     def _lying(self) -> list[Lying]:
-        found = []
+        files = []
         try:
             with os.scandir(self.folder) as entries:
                 for entry in entries:
                     if entry.name.endswith(ENDINGS) and entry.is_file(follow_symlinks=False):
                         status = entry.stat(follow_symlinks=False)
-                        found.append(Lying(entry.name, status.st_size, status.st_mtime_ns))
+                        files.append(Lying(entry.name, status.st_size, status.st_mtime_ns))
         except OSError:
-            return found  # the folder is not there yet, or a file went away
-        return found
+            return files  # the folder is not there yet, or a file went away
+        return files
 
 
 def _summary(path: Path, size: int) -> dict[str, Any]:
@@ -97,14 +97,14 @@ def _summary(path: Path, size: int) -> dict[str, Any]:
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
             seeker = ChunkSeeker(reader)
-            first, last, end, ticks, span_s = seeker.first_span(), seeker.last_span(), seeker.final_totals(), 0, 0.0
-            if first is not None and last is not None:
-                ticks = last.last + 1 - first.first
-                span_s = (last.last_ns - first.first_ns) / 1e9 + 1 / reader.header["rate_hz"]
+            first_span, last_span, totals, ticks, span_s = seeker.first_span(), seeker.last_span(), seeker.final_totals(), 0, 0.0
+            if first_span is not None and last_span is not None:
+                ticks = last_span.last + 1 - first_span.first
+                span_s = (last_span.last_ns - first_span.first_ns) / 1e9 + 1 / reader.header["rate_hz"]
             events = reader.events if size <= COUNTED_BYTES else None
             return {
-                "complete": bool(end and end["complete"]),
-                "ticks": end["ticks_logged"] if end else ticks,
+                "complete": bool(totals and totals["complete"]),
+                "ticks": totals["ticks_logged"] if totals else ticks,
                 "duration_s": span_s,
                 "around": "around" in reader.header,
                 "created_unix_s": reader.header["created_unix_ns"] / 1e9,

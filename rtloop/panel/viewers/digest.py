@@ -46,9 +46,9 @@ class Digest:
         if len(rows) == 0:
             return
         low, high, count, lost = np.fmin.reduce(rows), np.fmax.reduce(rows), len(rows), stretch.lost
-        if (before := self._open) is not None:
-            low, high = np.fmin(low, before.extremes[:, 0]), np.fmax(high, before.extremes[:, 1])
-            count, lost = count + before.ticks, lost + before.lost
+        if (previous := self._open) is not None:
+            low, high = np.fmin(low, previous.extremes[:, 0]), np.fmax(high, previous.extremes[:, 1])
+            count, lost = count + previous.ticks, lost + previous.lost
         self._open = Taken(stretch.end - 1, count, lost, np.column_stack([low, high, rows[-1]]))
 
     def end_run(self, past: Past) -> None:
@@ -57,5 +57,5 @@ class Digest:
 
     def take(self) -> Taken | None:
         """What came since the last time; None where nothing did."""
-        taken, self._open = self._open, None
-        return taken
+        digest, self._open = self._open, None
+        return digest

@@ -66,19 +66,19 @@ class Foxglove:
         """Whether a request is that of a viewer with the token, from wherever its page is."""
         if scope["type"] != "websocket" or scope["path"] != PATH:
             return False
-        sent = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=8).get("token", [""])
-        return len(sent) == 1 and hmac.compare_digest(sent[0].encode(errors="replace"), self._token.encode())
+        tokens = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=8).get("token", [""])
+        return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(errors="replace"), self._token.encode())
 
     async def serve(self, socket: WebSocket) -> None:
         """Serve one viewer; refuse it where there are MAX_VIEWERS, or where it speaks none of PROTOCOLS."""
-        spoken = next((one for one in socket.scope["subprotocols"] if one in PROTOCOLS), None)
-        if spoken is None or self._viewers >= MAX_VIEWERS:
-            await socket.close(1002 if spoken is None else 1013)
+        protocol = next((offered for offered in socket.scope["subprotocols"] if offered in PROTOCOLS), None)
+        if protocol is None or self._viewers >= MAX_VIEWERS:
+            await socket.close(1002 if protocol is None else 1013)
             return
         self._viewers += 1
         viewer = _Viewer(socket, self._feed, self._name)
         try:
-            await socket.accept(spoken)
+            await socket.accept(protocol)
             await viewer.serve()
         finally:
             self._viewers -= 1
@@ -125,12 +125,12 @@ class _Viewer:
     async def _tell(self) -> None:
         due_s = self._clock()
         while True:
-            names, generation, taken = await anyio.to_thread.run_sync(self._taken)
+            names, generation, digest = await anyio.to_thread.run_sync(self._taken)
             if generation and (self._live is None or self._live.id != EVENTS.id + generation):
                 await self._other_signals(Channel(EVENTS.id + generation, "/live", cdr.LIVE, cdr.live_schema(names)))
             now_ns = time.time_ns()
-            if taken is not None and self._live is not None:
-                await self._send(self._live, now_ns, cdr.live_message(now_ns, *taken))
+            if digest is not None and self._live is not None:
+                await self._send(self._live, now_ns, cdr.live_message(now_ns, *digest))
             await self._tell_event(now_ns)
             due_s = max(due_s + 1 / RATE_HZ, self._clock())
             await asyncio.sleep(due_s - self._clock())
@@ -143,19 +143,19 @@ class _Viewer:
         """The next event, if it is time for one."""
         if self._clock() < self._event_due_s:
             return
-        if not (told := self._feed.events.after(self._told)):
+        if not (events := self._feed.events.after(self._told)):
             return
-        self._told, event = min(told, key=lambda row: row[0])
+        self._told, event = min(events, key=lambda row: row[0])
         texts = event["kind"], event["who"], event["axis"] or "", json.dumps(event["what"])
         await self._send(EVENTS, now_ns, cdr.event_message(now_ns, event["tick"], *texts))
         self._event_due_s = self._clock() + 1 / EVENTS_HZ
 
     async def _other_signals(self, live: Channel) -> None:
         """The loop that runs has other signals than the one before."""
-        before, self._live = self._live, live
-        if before is not None:
-            self._subscriptions.withdraw(before.id)
-            await self._say({"op": "unadvertise", "channelIds": [before.id]})
+        previous, self._live = self._live, live
+        if previous is not None:
+            self._subscriptions.withdraw(previous.id)
+            await self._say({"op": "unadvertise", "channelIds": [previous.id]})
         await self._advertise(live)
 
     async def _advertise(self, channel: Channel) -> None:

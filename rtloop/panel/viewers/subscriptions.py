@@ -27,7 +27,7 @@ class Subscriptions:
 
     def of(self, channel: int) -> list[int]:
         """The numbers of the subscriptions to a channel."""
-        return [number for number, at in self._channels.items() if at == channel]
+        return [number for number, subscribed_channel in self._channels.items() if subscribed_channel == channel]
 
     def withdraw(self, channel: int) -> None:
         """It is advertised no longer."""
@@ -38,16 +38,16 @@ class Subscriptions:
     def heard(self, text: str | None) -> str | None:
         """Do what a message asks for; what is wrong with it."""
         try:
-            said = json.loads(text or "")
-            match said["op"]:
+            message = json.loads(text or "")
+            match message["op"]:
                 case "subscribe":
-                    return self._subscribe([(int(one["id"]), int(one["channelId"])) for one in said["subscriptions"]])
+                    return self._subscribe([(int(item["id"]), int(item["channelId"])) for item in message["subscriptions"]])
                 case "unsubscribe":
-                    for number in said["subscriptionIds"]:
+                    for number in message["subscriptionIds"]:
                         self._channels.pop(int(number), None)
                     return None
-                case other:
-                    return f"op {str(other)[:40]!r}: viewers can subscribe and unsubscribe, and change nothing"
+                case operation:
+                    return f"op {str(operation)[:40]!r}: viewers can subscribe and unsubscribe, and change nothing"
         except (ValueError, TypeError, KeyError, RecursionError):
             return "a message that is none of the protocol's"
 

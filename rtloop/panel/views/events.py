@@ -62,19 +62,19 @@ class Events:
 
     def take(self, messages: Any, loop: Description, run: int) -> None:
         """Add records of MESSAGE, (n,), or none, of the run that is read; who asked is asked of the service."""
-        answers = self._ask()
+        is_answering = self._ask()
         if run != self._run:
-            whole = len(messages) <= KEPT  # else older events are not told, and nobody knows what they left in force
-            mode = OFF if whole and not loop.values.get("schedule") else None
-            self._run, self._in_force = run, InForce(loop.axes if whole else {}, mode)
+            is_complete = len(messages) <= KEPT  # else older events are not told, and nobody knows what they left in force
+            mode = OFF if is_complete and not loop.values.get("schedule") else None
+            self._run, self._in_force = run, InForce(loop.axes if is_complete else {}, mode)
         for message in messages[-KEPT:]:
             answer, identity = Answer(), int(message["identity"])
-            asked = int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR
-            if asked and answers:
+            is_from_operator = int(message["kind"]) < Kind.REFUSED and int(message["origin"]) == Origin.OPERATOR
+            if is_from_operator and is_answering:
                 try:
                     answer = self._answer(identity)
                 except RtloopError:
-                    answers = False
+                    is_answering = False
             time_ns = round(int(message["tick"]) / loop.rate_hz * 1e9)
             event = {**event_from_message(message, tuple(loop.axes), time_ns, name=answer.name), "run": run}
             if answer.change:
@@ -84,7 +84,7 @@ class Events:
             with self._lock:
                 self.newest += 1
                 self._add(event, loop.rate_hz)
-            if asked and not answers:
+            if is_from_operator and not is_answering:
                 self._unasked.append((self._kept[-1], identity))
 
     def _ask(self) -> bool:
@@ -111,8 +111,8 @@ class Events:
         if event["kind"] not in (BEGINS, OVER):
             self._kept.append(Row(self.newest, event))
             return
-        if (grown := self._grown_by(event)) is not None:
-            row, lateness = grown
+        if (late_row := self._grown_by(event)) is not None:
+            row, lateness = late_row
             lateness.add(event)
             row.number, row.event = self.newest, told(lateness.row())
             return
@@ -129,8 +129,8 @@ class Events:
     def _answer(self, identity: int) -> Answer:
         """Answer of the service about a command. Raises UnavailableError, HostRefused."""
         status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, ASK_S)
-        said = json.loads(data) if status == 200 else {}
-        return Answer(said.get("name"), said.get("change"))
+        response = json.loads(data) if status == 200 else {}
+        return Answer(response.get("name"), response.get("change"))
 
 
 def told(event: Event, text: str | None = None) -> Event:

@@ -151,11 +151,11 @@ class Feed:
 
     def _begin(self, loop: Description) -> None:
         """Another run."""
-        before = self.loop
+        previous_loop = self.loop
         if self.past is not None:
             for viewer in self._viewers:
                 viewer.end_run(self.past)
-        if self.past is None or before is None or (before.names, before.rate_hz) != (loop.names, loop.rate_hz):
+        if self.past is None or previous_loop is None or (previous_loop.names, previous_loop.rate_hz) != (loop.names, loop.rate_hz):
             self.past = Past(loop.names, ticks_kept(len(loop.names), loop.rate_hz))
         self.loop, self.timing = loop, Timing(loop)
         for viewer in self._viewers:

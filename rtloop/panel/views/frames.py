@@ -15,8 +15,8 @@ ALIGNMENT = 8
 def pack(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]] | None = None) -> bytes:
     """A message of `kind`; `header` is finite JSON, the arrays (n,) go as Float32, NaN for what is not there."""
     arrays = arrays or {}
-    told = {"kind": kind, **header, "arrays": [[name, len(values)] for name, values in arrays.items()]}
-    text = json.dumps(told, allow_nan=False, ensure_ascii=False).encode()
+    message_header = {"kind": kind, **header, "arrays": [[name, len(values)] for name, values in arrays.items()]}
+    text = json.dumps(message_header, allow_nan=False, ensure_ascii=False).encode()
     text += b" " * (-(4 + len(text)) % ALIGNMENT)
     numbers = (values.astype("<f4").tobytes() for values in arrays.values())
     return b"".join([struct.pack("<I", len(text)), text, *numbers])

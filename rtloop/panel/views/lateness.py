@@ -34,11 +34,11 @@ class Lateness:
 
     def add(self, event: Event) -> None:
         """The beginning of an episode, or the whole of the last one."""
-        what = event["what"]
+        details = event["what"]
         if event["kind"] == OVER:
-            self._last = Episode(*(int(what[name] or 0) for name in Episode._fields))
+            self._last = Episode(*(int(details[name] or 0) for name in Episode._fields))
             return
-        periods = int(what["periods"] or 0)
+        periods = int(details["periods"] or 0)
         self._over = [self.whole]
         self._last = Episode(periods, 1, periods)
 
@@ -50,5 +50,5 @@ class Lateness:
 
     def row(self) -> Event:
         """As an event of its first tick."""
-        what = {**self.whole._asdict(), "worst_ms": 1e3 * self.whole.largest / self._rate_hz}
-        return {**self._first, "kind": BEGINS, "what": what}
+        details = {**self.whole._asdict(), "worst_ms": 1e3 * self.whole.largest / self._rate_hz}
+        return {**self._first, "kind": BEGINS, "what": details}

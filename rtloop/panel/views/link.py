@@ -53,29 +53,29 @@ class Service:
 
     def describe(self) -> Description:
         """As it runs now, at most KEPT_S old. Raises UnavailableError where no loop runs."""
-        kept = self._kept
-        if kept is not None and time.monotonic() - kept[0] < KEPT_S:
-            return kept[1]
+        cached = self._kept
+        if cached is not None and time.monotonic() - cached[0] < KEPT_S:
+            return cached[1]
         return self.describe_anew()
 
     def describe_anew(self) -> Description:
         """As `describe`, asked for now."""
         try:
-            said = self.client.get("/configuration")
+            configuration = self.client.get("/configuration")
             description = Description(
-                name=said["name"],
-                rate_hz=float(said["rate_hz"]),
-                columns=tuple(Signal(**column) for column in said["columns"]),
-                block=Path(said["block"]),
-                recordings=Path(said["recordings"]),
-                values=said["values"],
+                name=configuration["name"],
+                rate_hz=float(configuration["rate_hz"]),
+                columns=tuple(Signal(**column) for column in configuration["columns"]),
+                block=Path(configuration["block"]),
+                recordings=Path(configuration["recordings"]),
+                values=configuration["values"],
             )
         except UnavailableError:
             raise
         except RtloopError as error:
             raise UnavailableError(str(error)) from None
         except (KeyError, TypeError):
-            said = "a service of another version, which does not say where its ticks are"
-            raise UnavailableError(f"{self.client.path}: {said}") from None
+            configuration = "a service of another version, which does not say where its ticks are"
+            raise UnavailableError(f"{self.client.path}: {configuration}") from None
         self._kept = time.monotonic(), description
         return description

@@ -32,8 +32,8 @@ class Points(NamedTuple):
 
 def ticks_kept(columns: int, rate_hz: float) -> int:
     """So many as a screen of LONGEST_S needs, or as MOST_BYTES hold."""
-    most = int(MOST_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
-    return BLOCK * max(min(most, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
+    memory_ticks = int(MOST_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
+    return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
 
 
 def longest_s(columns: int, rate_hz: float) -> float:
@@ -68,13 +68,13 @@ class Past:
     def take(self, stretch: Stretch) -> None:
         """Add what was read. Raises ValueError, of an unknown signal."""
         history = self.history
-        begun = history.end if stretch.run == history.run else stretch.first
+        previous_end = history.end if stretch.run == history.run else stretch.first
         history.take(stretch)
-        first, end = begun // BLOCK, -(-history.end // BLOCK)
+        first, end = previous_end // BLOCK, -(-history.end // BLOCK)
         first = max(first, end - self._blocks)
         values = history.between(first * BLOCK, end * BLOCK).reshape(len(history.signals), -1, BLOCK)
-        places = np.arange(first, end) % self._blocks
-        self._low[:, places], self._high[:, places] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
+        block_indices = np.arange(first, end) % self._blocks
+        self._low[:, block_indices], self._high[:, block_indices] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
 
     def values(self, signals: Sequence[str], first: int, end: int) -> Real:
         """Every tick (signals, end − first); NaN for those that are not there. Raises ValueError."""
@@ -88,13 +88,13 @@ class Past:
         """
         rows = [index_of(name, self.history.signals) for name in signals]
         if end - first < FINEST_BLOCKS * BLOCK * pixels:
-            seen = envelope(self.history.between(first, end, rows), pixels)
-            return Points(first + seen.sample, seen.low, seen.high)
+            screen = envelope(self.history.between(first, end, rows), pixels)
+            return Points(first + screen.sample, screen.low, screen.high)
         begin, count = first // BLOCK, -(-end // BLOCK) - first // BLOCK
-        newest = -(-self.end // BLOCK)
-        there = np.arange(max(begin, newest - self._blocks), min(begin + count, newest))
+        newest_end = -(-self.end // BLOCK)
+        available = np.arange(max(begin, newest_end - self._blocks), min(begin + count, newest_end))
         low, high = np.full((2, len(rows), count), np.nan)
-        places = there % self._blocks
-        low[:, there - begin], high[:, there - begin] = self._low[rows][:, places], self._high[rows][:, places]
+        block_indices = available % self._blocks
+        low[:, available - begin], high[:, available - begin] = self._low[rows][:, block_indices], self._high[rows][:, block_indices]
         lows, highs = envelope(low, pixels), envelope(high, pixels)
         return Points((begin + lows.sample) * BLOCK, lows.low, highs.high)

@@ -27,9 +27,9 @@ class Scope:
     """What `wish` shows of the loop that is described. Raises ValueError for signals and times that it cannot show."""
 
     def __init__(self, wish: ViewWish, loop: Description) -> None:
-        most_s = longest_s(len(loop.columns), loop.rate_hz)
-        if wish.seconds > most_s:
-            raise ValueError(f"view.seconds: {wish.seconds:g}; at most {most_s:g} s are kept at {loop.rate_hz:g} Hz")
+        limit_s = longest_s(len(loop.columns), loop.rate_hz)
+        if wish.seconds > limit_s:
+            raise ValueError(f"view.seconds: {wish.seconds:g}; at most {limit_s:g} s are kept at {loop.rate_hz:g} Hz")
         for name in wish.signals:
             index_of(name, loop.names)
         self.wish, self._names, self._rate_hz = wish, loop.names, loop.rate_hz
@@ -78,11 +78,11 @@ class Scope:
         if self._trigger is None:
             return []
         self._commands.extend(commands)
-        ended = self._trigger.feed(stretch)
-        if ended:
-            self.number += len(ended)
-            self._newest = ended[-1]
-        return ended
+        sweeps = self._trigger.feed(stretch)
+        if sweeps:
+            self.number += len(sweeps)
+            self._newest = sweeps[-1]
+        return sweeps
 
     def end_run(self, past: Past) -> None:
         """The run is over: keep what is still to be shown of it, before the past is of another one."""
@@ -96,18 +96,18 @@ class Scope:
     def frame(self, past: Past) -> bytes | None:
         """What has not been shown yet; None where there is nothing."""
         if self._ready is not None:
-            ready, self._ready = self._ready, None
-            return ready
-        sweep, complete = self._newest, True
+            frame, self._ready = self._ready, None
+            return frame
+        sweep, is_complete = self._newest, True
         if self._trigger is None and past.end > 0:
             sweep = Sweep(past.run, past.end - self._ticks, past.end, past.end, Cause.AUTO)
-        elif (growing := self._growing) is not None:
-            sweep, complete = growing, False
-        newest = sweep, self.number, None if complete else past.end
-        if sweep is None or sweep.run != past.run or newest == self._shown:
+        elif (growing_sweep := self._growing) is not None:
+            sweep, is_complete = growing_sweep, False
+        shown = sweep, self.number, None if is_complete else past.end
+        if sweep is None or sweep.run != past.run or shown == self._shown:
             return None
-        self._shown = newest
-        return self._packed(sweep, past, complete)
+        self._shown = shown
+        return self._packed(sweep, past, is_complete)
 
     @property
     def _growing(self) -> Sweep | None:

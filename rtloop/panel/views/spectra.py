@@ -48,16 +48,16 @@ class Analyser:
     def frame(self) -> bytes:
         """As it is now."""
         self._average(self._batch.take())
-        density, wish = self._spectrum.density(), self._wish
+        density, subscription = self._spectrum.density(), self._wish
         averages = density.averages
         return pack(
             "spectrum",
             {
-                "signal": wish.signal,
+                "signal": subscription.signal,
                 "unit": density.unit,
-                "rms": density.rms(wish.low_hz, wish.high_hz),
-                "low_hz": wish.low_hz,
-                "high_hz": wish.high_hz,
+                "rms": density.rms(subscription.low_hz, subscription.high_hz),
+                "low_hz": subscription.low_hz,
+                "high_hz": subscription.high_hz,
                 "averages_least": int(np.min(averages, initial=averages.max(initial=0))),
                 "averages_most": int(averages.max(initial=0)),
                 "bridged": self._spectrum.bridged,

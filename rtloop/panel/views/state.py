@@ -41,8 +41,8 @@ class State:
     def _listen(self) -> None:
         while True:
             try:
-                for said in self._client.watch():
-                    self._said, self._heard_s = said, time.monotonic()
+                for status in self._client.watch():
+                    self._said, self._heard_s = status, time.monotonic()
             except Unanswered as error:
                 self._lose(f"{NO_ANSWER}: {error.reason}")
             except RtloopError as error:

@@ -56,36 +56,36 @@ class Timing:
         ends = np.append(np.flatnonzero(np.diff(seconds)) + 1, seconds.size)
         first = 0
         for end in ends.tolist():
-            part = slice(first, end)
+            rows = slice(first, end)
             second = self._second(int(seconds[first]))
-            late_us = stretch[_LATENESS][part]
+            late_us = stretch[_LATENESS][rows]
             second.late += _counted(late_us)
-            second.executed += _counted(stretch[_EXEC][part])
+            second.executed += _counted(stretch[_EXEC][rows])
             second.worst_us = max(second.worst_us, float(np.nan_to_num(late_us).max()))
             second.beyond += float(np.count_nonzero(late_us > self._period_us))
-            second.missed += float(stretch[_MISSED][part].sum())
+            second.missed += float(stretch[_MISSED][rows].sum())
             first = end
 
     def frame(self) -> bytes:
         """The last minute."""
         self._count(self._batch.take())
-        kept = [one for one in self._seconds if one.number > self._seconds[-1].number - WINDOW_S]
-        late, executed = (sum((getattr(one, name) for one in kept), _none()) for name in ("late", "executed"))
+        seconds = [second for second in self._seconds if second.number > self._seconds[-1].number - WINDOW_S]
+        lateness_counts, exec_counts = (sum((getattr(second, name) for second in seconds), _none()) for name in ("late", "executed"))
         step = FINE_PER_DECADE // SHOWN_PER_DECADE
         return pack(
             "timing",
             {
-                "window_s": len(kept),
-                "ticks": int(late.sum()),
-                "worst_us": max((one.worst_us for one in kept), default=0.0),
-                "periods_missed": int(sum(one.missed for one in kept)),
-                "p50_us": quantile_us(late, 0.5),
-                "p99_us": quantile_us(late, 0.99),
-                "exec_p50_us": quantile_us(executed, 0.5),
-                "exec_p99_us": quantile_us(executed, 0.99),
-                "advice": self._advice(kept, late),
+                "window_s": len(seconds),
+                "ticks": int(lateness_counts.sum()),
+                "worst_us": max((second.worst_us for second in seconds), default=0.0),
+                "periods_missed": int(sum(second.missed for second in seconds)),
+                "p50_us": quantile_us(lateness_counts, 0.5),
+                "p99_us": quantile_us(lateness_counts, 0.99),
+                "exec_p50_us": quantile_us(exec_counts, 0.5),
+                "exec_p99_us": quantile_us(exec_counts, 0.99),
+                "advice": self._advice(seconds, lateness_counts),
             },
-            {"edges_us": EDGES_US[::step], "counts": late.reshape(-1, step).sum(axis=1)},
+            {"edges_us": EDGES_US[::step], "counts": lateness_counts.reshape(-1, step).sum(axis=1)},
         )
 
     def _second(self, number: int) -> Second:
@@ -97,14 +97,14 @@ class Timing:
 
     def _advice(self, kept: list[Second], late: Real) -> list[str]:
         """What `rtloop doctor` would say of these ticks; empty where nothing speaks against the host."""
-        ticks, found = late.sum(), []
-        worst_us = max((one.worst_us for one in kept), default=0.0)
-        beyond, missed = sum(one.beyond for one in kept), int(sum(one.missed for one in kept))
-        if ticks and beyond / ticks >= LATE_SHARE:
-            found.append(f"{100 * beyond / ticks:.2f} % of the ticks were late by more than a period")
+        ticks, advice = late.sum(), []
+        worst_us = max((second.worst_us for second in kept), default=0.0)
+        beyond_count, missed_periods = sum(second.beyond for second in kept), int(sum(second.missed for second in kept))
+        if ticks and beyond_count / ticks >= LATE_SHARE:
+            advice.append(f"{100 * beyond_count / ticks:.2f} % of the ticks were late by more than a period")
         elif worst_us > self._period_us:
-            found.append(f"a tick was {worst_us:.0f} µs late, and {missed} periods were missed")
-        recent = sum((one.late for one in kept[-RECENT_S:]), _none())
+            advice.append(f"a tick was {worst_us:.0f} µs late, and {missed_periods} periods were missed")
+        recent = sum((second.late for second in kept[-RECENT_S:]), _none())
         now_us, all_us = quantile_us(recent, 0.99), quantile_us(late, 0.99)
         if (
             len(kept) > 2 * RECENT_S
@@ -113,22 +113,22 @@ class Timing:
             and now_us > WORSE * all_us
             and now_us > MATTERS * self._period_us
         ):
-            found.append(f"it gets worse: one tick in a hundred of the last {RECENT_S} s was {now_us:.0f} µs late")
-        if found:
-            found.append("`rtloop doctor CONFIG` looks for the cause on this host, and says what mends it")
-        return found
+            advice.append(f"it gets worse: one tick in a hundred of the last {RECENT_S} s was {now_us:.0f} µs late")
+        if advice:
+            advice.append("`rtloop doctor CONFIG` looks for the cause on this host, and says what mends it")
+        return advice
 
 
 def quantile_us(counts: Real, part: float) -> float | None:
     """Within the bin by a straight line; None without ticks, as in virtual time."""
-    below = np.concatenate([[0.0], np.cumsum(counts)])
-    return float(np.interp(part * below[-1], below, EDGES_US)) if below[-1] else None
+    cumulative = np.concatenate([[0.0], np.cumsum(counts)])
+    return float(np.interp(part * cumulative[-1], cumulative, EDGES_US)) if cumulative[-1] else None
 
 
 def _counted(values_us: Real) -> Real:
     values_us = values_us[np.isfinite(values_us)]
-    places = np.searchsorted(EDGES_US, values_us, side="right") - 1
-    return np.bincount(np.clip(places, 0, EDGES_US.size - 2), minlength=EDGES_US.size - 1).astype(float)
+    bins = np.searchsorted(EDGES_US, values_us, side="right") - 1
+    return np.bincount(np.clip(bins, 0, EDGES_US.size - 2), minlength=EDGES_US.size - 1).astype(float)
 
 
 def _none() -> Real:

@@ -50,11 +50,11 @@ class Viewer:
 
     def begin(self, loop: Description) -> None:
         """A run of a loop begins: what was wished is judged for it."""
-        for name, wish in self._wishes.items():
+        for name, subscription in self._wishes.items():
             if name == "view" and self._scope is not None and self._scope.suits(loop):
                 continue  # its trigger goes on
             try:
-                self._build(name, wish, loop)
+                self._build(name, subscription, loop)
             except ValueError as error:
                 self._build(name, None, loop)
                 self._refuse(name, str(error))
@@ -76,15 +76,15 @@ class Viewer:
     def wish(self, text: str) -> None:
         """Take over what a message wishes; what cannot be granted is refused by a frame, and the old one goes on."""
         try:
-            wishes = read_wishes(text)
+            fields = read_wishes(text)
         except ValueError as error:
             self._refuse("message", str(error))
             return
-        for name, value in wishes.items():
+        for name, value in fields.items():
             try:
-                wished = wish_of(name, value)
+                subscription = wish_of(name, value)
                 with self._feed.lock:
-                    self._grant(name, wished)
+                    self._grant(name, subscription)
             except ValueError as error:
                 self._refuse(name, str(error))
 
@@ -92,11 +92,11 @@ class Viewer:
         """The frames that are to be sent now."""
         now_s = time.monotonic()
         frames, self._refusals = self._refusals, []
-        for kind, make in self._makers.items():
+        for kind, make_frame in self._makers.items():
             if now_s < self._due_s[kind]:
                 continue
             with self._feed.lock:
-                frame = make()
+                frame = make_frame()
             if frame is not None:
                 frames.append(frame)
                 self._due_s[kind] = max(self._due_s[kind] + PERIODS_S[kind], now_s - FRAME_S)
@@ -124,9 +124,9 @@ class Viewer:
         """What shows `wish`, or nothing; raises ValueError, and the old one goes on."""
         match wish:
             case ViewWish():
-                asked = Scope(wish, loop)
+                scope = Scope(wish, loop)
                 if self._scope is None or not self._scope.redrawn(wish, loop):
-                    self._scope = asked
+                    self._scope = scope
             case SpectrumWish():
                 if self._analyser is None or not self._analyser.rewished(wish, loop):
                     self._analyser = Analyser(wish, loop)
@@ -137,8 +137,8 @@ class Viewer:
 
     def _state_frame(self) -> bytes:
         feed = self._feed
-        beside = {"unix_s": time.time(), "age_s": feed.age_s, "lost": feed.lost, "run": feed.run, "fault": feed.fault}
-        return pack("state", self._state.now | beside)
+        feed_fields = {"unix_s": time.time(), "age_s": feed.age_s, "lost": feed.lost, "run": feed.run, "fault": feed.fault}
+        return pack("state", self._state.now | feed_fields)
 
     def _sweep_frame(self) -> bytes | None:
         past = self._feed.past
@@ -151,11 +151,11 @@ class Viewer:
         return None if self._drawn is None or past is None else self._drawn.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        told = self._feed.events.after(self._told)
-        if not told:
+        events = self._feed.events.after(self._told)
+        if not events:
             return None
-        self._told = max(number for number, _ in told)
-        return pack("events", {"events": [event for _, event in told]})
+        self._told = max(number for number, _ in events)
+        return pack("events", {"events": [event for _, event in events]})
 
     def _refuse(self, name: str, error: str) -> None:
         frame = pack("refused", {"wish": name[:100], "error": error[:2000]})

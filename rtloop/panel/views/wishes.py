@@ -76,10 +76,10 @@ WISHES: dict[str, TypeAdapter[Any]] = {
 
 def read_wishes(text: str) -> dict[str, Any]:
     """By their names, as they came; `wish_of` judges each. Raises ValueError for what is no JSON object."""
-    wishes = from_json(text, allow_inf_nan=False)
-    if not isinstance(wishes, dict):
+    fields = from_json(text, allow_inf_nan=False)
+    if not isinstance(fields, dict):
         raise ValueError("a message is a JSON object of wishes")
-    return wishes
+    return fields
 
 
 def wish_of(name: str, value: Any) -> Any:

@@ -28,19 +28,19 @@ class InForce:
         if kind == "set_reference":
             return self._reference(event["axis"], text)
         if kind == "set_mode":
-            before, self._mode = self._mode, text
-            if RAW in (before, text):
+            previous_mode, self._mode = self._mode, text
+            if RAW in (previous_mode, text):
                 self._references.clear()  # the loop holds what was in force, which no event says
-            return f"{before} → {text}" if before not in (None, text) else text
+            return f"{previous_mode} → {text}" if previous_mode not in (None, text) else text
         if kind == "tripped":
             self._mode = OFF
         return text
 
     def _reference(self, axis: str, text: str) -> str:
         """The reference before, as far as it is known, and the one that takes over."""
-        before, self._references[axis] = self._references.get(axis), text
+        previous_reference, self._references[axis] = self._references.get(axis), text
         unit = "V" if self._mode == RAW else "µm"
-        return f"{before} → {text} {unit}" if before else f"{text} {unit}"
+        return f"{previous_reference} → {text} {unit}" if previous_reference else f"{text} {unit}"
 
 
 def configured(reference: dict[str, Any]) -> str:
@@ -56,18 +56,18 @@ def configured(reference: dict[str, Any]) -> str:
 
 def words(event: Event) -> str:
     """Of an event as `event_from_message` makes it, of late ticks as `Lateness` does; empty where its kind says all."""
-    what = event["what"]
+    details = event["what"]
     match event["kind"]:
         case "set_reference":
-            return _reference([float(value or 0.0) for value in what["values"]])
+            return _reference([float(value or 0.0) for value in details["values"]])
         case "set_mode":
-            return what["mode"].replace("_", " ")
+            return details["mode"].replace("_", " ")
         case "load_law":
-            return what.get("change") or ("another controller" if what["values"][0] else "other numbers")
+            return details.get("change") or ("another controller" if details["values"][0] else "other numbers")
         case "tripped":
-            return what["reason"] or ", ".join(what["causes"])
+            return details["reason"] or ", ".join(details["causes"])
         case "periods_missed":
-            return f"{count_text(what['late_ticks'], 'late tick')}, worst {what['worst_ms']:.3g} ms"
+            return f"{count_text(details['late_ticks'], 'late tick')}, worst {details['worst_ms']:.3g} ms"
     return ""
 
 
@@ -78,8 +78,8 @@ def _reference(values: list[float]) -> str:
         case Generator.HOLD:
             return f"{first:.6g}"
         case Generator.SINE | Generator.TRIANGLE:
-            about = f" about {third:.6g}" if third else ""
-            return f"{Generator(int(kind)).name.lower()} of {first:.6g} at {second:.6g} Hz{about}"
+            offset_text = f" about {third:.6g}" if third else ""
+            return f"{Generator(int(kind)).name.lower()} of {first:.6g} at {second:.6g} Hz{offset_text}"
         case Generator.CHIRP:
             return f"chirp of {first:.6g} from {second:.6g} to {third:.6g} Hz in {fourth:.6g} s"
         case Generator.TABLE:

@@ -49,9 +49,9 @@ class Drawn:
         self._shown = past.run, end
         drive, position = past.values(self._signals, first, end)
         at_rest = is_at_rest(*past.values(self._rest, first, end))
-        good = np.isfinite(drive) & np.isfinite(position)
-        drive, position = drive[good], position[good]
-        shown = extremes([drive, position], BINS)
+        valid = np.isfinite(drive) & np.isfinite(position)
+        drive, position = drive[valid], position[valid]
+        indices = extremes([drive, position], BINS)
         header: dict[str, Any] = {
             "axis": self._wish.axis,
             "run": past.run,
@@ -59,7 +59,7 @@ class Drawn:
             "at_rest": at_rest,
             "loop_percent": None,
         }
-        arrays = {"drive_v": drive[shown], "position_um": position[shown]}
+        arrays = {"drive_v": drive[indices], "position_um": position[indices]}
         if drive.size and np.ptp(drive) > 0 and not at_rest:
             percent = loop_shape(means(drive, SHAPE_BINS), means(position, SHAPE_BINS)).percent
             header["loop_percent"] = percent if np.isfinite(percent) else None
@@ -70,31 +70,31 @@ class Drawn:
     def _modelled(self, past: Past, first: int, drive: Real, position: Real, header: dict[str, Any]) -> dict[str, Real]:
         """The model's loop, moved to where the measured one lies; `offset_um` says by how much."""
         assert self._model is not None
-        turns = extremes([drive], MODEL_BINS)
-        warm = self._remembered(past, first)
-        whole = model_output(self._model, np.concatenate([warm, drive[turns]]))[warm.size :]
-        offset_um = float(np.mean(position[turns]) - np.mean(whole))
+        indices = extremes([drive], MODEL_BINS)
+        earlier_drive = self._remembered(past, first)
+        model_position = model_output(self._model, np.concatenate([earlier_drive, drive[indices]]))[earlier_drive.size :]
+        offset_um = float(np.mean(position[indices]) - np.mean(model_position))
         header["offset_um"] = offset_um
-        return {"model_drive_v": drive[turns], "model_position_um": whole + offset_um}
+        return {"model_drive_v": drive[indices], "model_position_um": model_position + offset_um}
 
     def _remembered(self, past: Past, first: int) -> Real:
         """The drive before tick `first`: coarsely, and every tick from where points, which are whole blocks, end."""
         if first <= 0:
             return np.zeros(0)
-        whole = first // BLOCK * BLOCK
-        before = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), whole, WARM_BINS)
-        (latest,) = past.values(self._signals[:1], whole, first)
-        return np.concatenate([in_turn(before.low[0], before.high[0]), latest[np.isfinite(latest)]])
+        block_tick = first // BLOCK * BLOCK
+        earlier_points = past.points(self._signals[:1], max(first - 4 * self._ticks, 0), block_tick, WARM_BINS)
+        (latest,) = past.values(self._signals[:1], block_tick, first)
+        return np.concatenate([in_turn(earlier_points.low[0], earlier_points.high[0]), latest[np.isfinite(latest)]])
 
 
 def in_turn(low: Real, high: Real) -> Real:
     """Extremes (points,) of a signal in the order in which it went through them, (2 points,), without what is NaN."""
-    there = np.isfinite(low) & np.isfinite(high)
-    low, high = low[there], high[there]
+    valid = np.isfinite(low) & np.isfinite(high)
+    low, high = low[valid], high[valid]
     if low.size < 2:
         return np.concatenate([low, high])
-    rises = np.gradient(low + high) >= 0
-    return np.where(rises, [low, high], [high, low]).T.ravel()
+    is_rising = np.gradient(low + high) >= 0
+    return np.where(is_rising, [low, high], [high, low]).T.ravel()
 
 
 def play_model(axis: dict[str, Any]) -> PlayModel | None:
@@ -112,8 +112,8 @@ def means(signal: Real, bins: int) -> Real:
     """Of a signal (n,) in each of `bins` stretches; of few samples, themselves."""
     if signal.size <= bins:
         return signal
-    first = -(-np.arange(bins) * signal.size // bins)
-    return np.add.reduceat(signal, first) / np.diff(first, append=signal.size)
+    first_samples = -(-np.arange(bins) * signal.size // bins)
+    return np.add.reduceat(signal, first_samples) / np.diff(first_samples, append=signal.size)
 
 
 def extremes(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:
@@ -123,7 +123,7 @@ def extremes(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp
         return np.arange(count)
     first = -(-np.arange(bins + 1) * count // bins)
     lengths = np.diff(first)
-    places = first[:-1, None] + np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
+    indices = first[:-1, None] + np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
     rows = np.arange(bins)
-    found = [places[rows, pick(signal[places], axis=-1)] for signal in signals for pick in (np.argmin, np.argmax)]
-    return np.unique(np.concatenate(found))
+    extreme_indices = [indices[rows, find_extreme(signal[indices], axis=-1)] for signal in signals for find_extreme in (np.argmin, np.argmax)]
+    return np.unique(np.concatenate(extreme_indices))

@@ -47,7 +47,7 @@ class Pages(StaticFiles):
 
 def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
     """The panel of a service; with a token for them, viewers of the Foxglove protocol are served as well."""
-    feed, state, tries = Feed(service), State(service.client), Rates(per_s=5.0, burst=20)
+    feed, state, login_rates = Feed(service), State(service.client), Rates(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
     @asynccontextmanager
@@ -61,22 +61,22 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
     async def session(request: Request) -> Response:
-        if not tries.allows(client_of(request.scope)):
-            return JSONResponse({"error": f"more than {tries} tries; try again"}, status_code=429)
+        if not login_rates.allows(client_of(request.scope)):
+            return JSONResponse({"error": f"more than {login_rates} tries; try again"}, status_code=429)
         try:
             body = await limited_body(request, MOST_TOKEN_BYTES)
-            said = decoded(body or b"")
+            message = decoded(body or b"")
         except ClientDisconnect:
             return Response()
         except ValueError:
-            said = None
-        token = said.get("token") if isinstance(said, dict) else None
+            message = None
+        token = message.get("token") if isinstance(message, dict) else None
         secret = sessions.begin(token) if isinstance(token, str) else None
         if secret is None:
             return JSONResponse({"error": "this is not the token of the panel that runs"}, status_code=401)
-        answer = Response(status_code=204)
-        answer.set_cookie(**session_cookie(sessions, secret))
-        return answer
+        response = Response(status_code=204)
+        response.set_cookie(**session_cookie(sessions, secret))
+        return response
 
     def panel(_: Request) -> Response:
         try:

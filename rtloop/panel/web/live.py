@@ -66,9 +66,9 @@ class Live:
             await socket.accept()
             self._feed.join(viewer)
             try:
-                async with anyio.create_task_group() as both:
+                async with anyio.create_task_group() as tasks:
                     for work in (self._listen, self._tell):
-                        both.start_soon(self._until_its_end, work, socket, viewer, both.cancel_scope)
+                        tasks.start_soon(self._until_its_end, work, socket, viewer, tasks.cancel_scope)
             finally:
                 self._feed.leave(viewer)
             with suppress(*ENDS), anyio.move_on_after(CLOSE_S):

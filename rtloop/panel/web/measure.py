@@ -28,21 +28,21 @@ def figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> d
         if past is None or past.run != run or first < past.begin or end > past.end:
             raise Gone("these ticks are not kept any more")
         values = past.values(signals, first, end)
-    found = {}
+    results = {}
     for name, row in zip(signals, values, strict=True):
-        there = row[np.isfinite(row)]
-        if there.size == 0:
+        samples = row[np.isfinite(row)]
+        if samples.size == 0:
             raise Gone("these ticks are lost")
-        low, high = float(there.min()), float(there.max())
-        found[name] = {
-            "rms": float(np.sqrt(np.mean(there**2))),
-            "mean": float(there.mean()),
-            "std": float(there.std()),
+        low, high = float(samples.min()), float(samples.max())
+        results[name] = {
+            "rms": float(np.sqrt(np.mean(samples**2))),
+            "mean": float(samples.mean()),
+            "std": float(samples.std()),
             "low": low,
             "high": high,
             "peak_to_peak": high - low,
         }
-    return found
+    return results
 
 
 async def measure(feed: Feed, request: Request) -> Response:

@@ -58,13 +58,13 @@ class Proxy:
         lane = COMMANDS[name]
         if lane is not Lane.SAFETY and not self._rate.allows():
             return JSONResponse({"error": f"more than {self._rate} commands; try again"}, status_code=429)
-        most = LARGE.get(name, SMALL_BYTES)
+        max_bytes = LARGE.get(name, SMALL_BYTES)
         try:
-            body = await limited_body(request, most)
+            body = await limited_body(request, max_bytes)
         except ClientDisconnect:
             return Response()
         if body is None:
-            return JSONResponse({"error": f"request body: more than {most} bytes"}, status_code=413)
+            return JSONResponse({"error": f"request body: more than {max_bytes} bytes"}, status_code=413)
         return await self._hand_on(request, lane, body)
 
     async def _hand_on(self, request: Request, lane: Lane, body: bytes) -> Response:

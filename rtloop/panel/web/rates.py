@@ -73,9 +73,9 @@ def client_of(scope: Scope) -> tuple[str, int | None]:
     if not client or not server:
         return "", None
     try:
-        ends = [f"{int.from_bytes(inet_aton(host), byteorder):08X}:{port:04X}" for host, port in (client, server)]
+        addresses = [f"{int.from_bytes(inet_aton(host), byteorder):08X}:{port:04X}" for host, port in (client, server)]
         with os.fdopen(open_user_file(CONNECTIONS), encoding="ascii") as file:
-            line = next((line for line in file if f" {ends[0]} {ends[1]} {ESTABLISHED} " in line), None)
+            line = next((line for line in file if f" {addresses[0]} {addresses[1]} {ESTABLISHED} " in line), None)
     except OSError:
         line = None
     return client[0], None if line is None else int(line.split()[USER])

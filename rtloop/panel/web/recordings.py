@@ -87,13 +87,13 @@ class Recordings:
 
     def routes(self) -> Sequence[BaseRoute]:
         """Of all of them."""
-        one = "/api/recordings/{file}"
+        file_route = "/api/recordings/{file}"
         return [
             Route("/api/recordings", self.listing),
-            Route(one, self.download),
-            Route(f"{one}/info", self.info),
-            Route(f"{one}/plot.png", self.plot),
-            Route(f"{one}/sweep", self.sweep),
+            Route(file_route, self.download),
+            Route(f"{file_route}/info", self.info),
+            Route(f"{file_route}/plot.png", self.plot),
+            Route(f"{file_route}/sweep", self.sweep),
             Route("/api/capture", self.capture, methods=["POST"]),
         ]
 
@@ -126,8 +126,8 @@ class Recordings:
     async def plot(self, request: Request) -> Response:
         """What `rtloop plot` draws; `from` and `until` in s."""
         path = await self._path(request)
-        asked = checked(Span, dict(request.query_params))
-        span = [f"--{name}={value}" for name, value in asked.model_dump(by_alias=True, exclude_none=True).items()]
+        span_request = checked(Span, dict(request.query_params))
+        span = [f"--{name}={value}" for name, value in span_request.model_dump(by_alias=True, exclude_none=True).items()]
         with tempfile.TemporaryDirectory(prefix="rtloop-panel-") as folder:
             picture = Path(folder) / "plot.png"
             await self._aside.run("rtloop", "plot", path, "--out", picture, "--json", *span)
@@ -137,9 +137,9 @@ class Recordings:
     @_answers
     async def sweep(self, request: Request) -> Response:
         """A stretch as the scope shows it."""
-        path, asked = await self._path(request), dict(request.query_params)
-        wanted = checked(Wanted, asked | {"signals": tuple(asked.get("signals", "").split(","))})
-        return Response(await self._read(lambda: sweep(path, wanted)), media_type="application/octet-stream")
+        path, query = await self._path(request), dict(request.query_params)
+        sweep_request = checked(Wanted, query | {"signals": tuple(query.get("signals", "").split(","))})
+        return Response(await self._read(lambda: sweep(path, sweep_request)), media_type="application/octet-stream")
 
     @_answers
     async def capture(self, request: Request) -> Response:

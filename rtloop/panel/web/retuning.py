@@ -103,8 +103,8 @@ class Retuning:
         if isinstance(body, SwapBody):
             return await self._aside.run("rtloop", *ctl, "--swap=-", "--", body.axis, stdin=body.model_dump_json())
         options = body.model_dump(exclude={"axis"}, exclude_none=True)
-        words = [f"--{key.replace('_', '-')}={value!r}" for key, value in options.items()]
-        return await self._aside.run("rtloop", *ctl, *words, "--", body.axis)
+        options_text = [f"--{key.replace('_', '-')}={value!r}" for key, value in options.items()]
+        return await self._aside.run("rtloop", *ctl, *options_text, "--", body.axis)
 
 
 def _refused(code: int, error: str) -> Response:

@@ -53,10 +53,10 @@ class Sessions:
     def knows(self, headers: Headers) -> bool:
         """Whether a request belongs to a session."""
         try:
-            sent = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
+            cookie = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
             return False
-        return sent is not None and sent.value in self._open
+        return cookie is not None and cookie.value in self._open
 
 
 class Guard:
@@ -84,8 +84,8 @@ class Guard:
         if refusal := self._refusal(scope):
             if scope["type"] == "websocket":
                 return await send({"type": "websocket.close", "code": 1008})
-            code, why = refusal
-            return await JSONResponse({"error": why}, status_code=code)(scope, receive, send_guarded)
+            code, reason = refusal
+            return await JSONResponse({"error": reason}, status_code=code)(scope, receive, send_guarded)
         return await self._app(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
@@ -98,8 +98,8 @@ class Guard:
         if len(headers.getlist("origin")) > 1 or (origin is not None and origin.lower() != f"http://{host.lower()}"):
             return 403, f"origin {str(origin)[:100]!r}: http://{host} is allowed"
         if origin is None:
-            same = headers.get("sec-fetch-site") == "same-origin"
-            if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not same):
+            is_same_origin = headers.get("sec-fetch-site") == "same-origin"
+            if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not is_same_origin):
                 return 403, "origin: none is said; that of the page is needed"
         if is_public(path) or self._sessions.knows(headers):
             return None

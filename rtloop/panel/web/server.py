@@ -98,8 +98,8 @@ def _token_in(file: Path) -> str:
     except OSError as error:
         raise OutputError(f"{file}: cannot make the panel's token: {error.strerror}") from None
     try:
-        with os.fdopen(open_file(file, os.O_RDONLY), encoding="ascii") as opened:
-            mode, token = os.fstat(opened.fileno()).st_mode, opened.read(MOST_TOKEN_BYTES).strip()
+        with os.fdopen(open_file(file, os.O_RDONLY), encoding="ascii") as token_file:
+            mode, token = os.fstat(token_file.fileno()).st_mode, token_file.read(MOST_TOKEN_BYTES).strip()
     except UntrustedPath:
         raise
     except (OSError, ValueError) as error:
